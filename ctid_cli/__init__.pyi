@@ -32,7 +32,7 @@ from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
 from .estimators.delay_profile import DelayProfile as DelayProfile
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
-from .estimation.fixed import Fixed as Fixed
+from .estimation.common import Fixed as Fixed
 from .estimators.order_search import FittedOrder as FittedOrder, OrderSearch as OrderSearch
 from .estimators.order_search import search_orders as search_orders
 from .estimators.identification import Identification as Identification, identify as identify

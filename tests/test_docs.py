@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.kinds import KINDS, classes
-from ctid_cli.models.pid import ContinuousPid
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.specification.option_docs import option_docs
 

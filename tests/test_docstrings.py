@@ -13,8 +13,7 @@ import pytest
 import ctid_cli
 from ctid_cli.frequency.tracking import BatchEstimator
 from ctid_cli.kinds import KINDS, classes
-from ctid_cli.models.pid import ContinuousPid
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.transfer_function import ContinuousModel
 from ctid_cli.signals.drifts import ContinuousNoise
 from ctid_cli.signals.excitation import Excitation

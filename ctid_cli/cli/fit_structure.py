@@ -11,8 +11,8 @@ from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import Hold, InitialState, LossKind, Offset
 
 if TYPE_CHECKING:
-    from ctid_cli.estimation.fixed import Fixed
-    from ctid_cli.estimators.judging import Options
+    from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimators.measured_submodels import Options
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
@@ -152,7 +152,7 @@ def _terms(text: str, integrators: int) -> "list[Term]":
 
 
 def _fixed(given: Sequence[str]) -> "tuple[Fixed, ...] | None":
-    from ctid_cli.estimation.fixed import Fixed
+    from ctid_cli.estimation.common import Fixed
 
     found = []
     for text in given:

@@ -1,26 +1,33 @@
-"""The estimation problem of a sum of submodels, in open or closed loop."""
+"""The estimation problem of a sum of submodels, in open or closed loop, and the iteration that solves it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.iteration import Equations, inadmissible
-from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable
+from ctid_cli.estimation.common import assessed, history_entry
+from ctid_cli.estimation.iteration import GUARDED, Equations, Iterated, Steps, inadmissible, iterate
+from ctid_cli.estimation.sampled_problem import is_hurwitz, reflect_unstable
 from ctid_cli.filtering.filter_data import FilterData, plain_array
+from ctid_cli.filtering.loop import loop_radius
 from ctid_cli.filtering.submodels import OPEN_LOOP, InitialState, LoopData, SubmodelFilter
+from ctid_cli.inference.fit import IterationRecord, Status
+from ctid_cli.inference.uncertainty import Covariance
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record, named
+
+#: An unstable loop is simulated over a record unless it would grow beyond this factor.
+LARGEST_GROWTH = 1e20
 
 #: Where instruments come from: the measured input, or the noise-free loop of the model.
 Instruments = Literal["open_loop", "closed_loop"]
@@ -158,6 +165,18 @@ class AdditiveProblem:
         found: Equations = inadmissible(theta.size) if moments is None else Equations(**vars(moments))
         return self._without_fixed(found) if self.fixed else found
 
+    def rows(self, theta: Array) -> tuple[Array, Array] | None:
+        """Sensitivities and output error at the used samples; in closed loop instruments in place of the former."""
+        rows = self.filter.rows(theta)
+        return None if rows is None else (rows[0], rows[2])
+
+    def loop_radius(self, model: AdditiveModel) -> float:
+        """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
+        loop, interval = self.loop, self.data.interval
+        if not loop.closed or interval == 0.0:
+            return math.nan
+        return loop_radius(model, DiscreteController(loop.numerator, loop.denominator), interval)
+
     def _without_fixed(self, found: Equations) -> Equations:
         """Equations in which a known parameter has a row and a column of its own, and nothing moves it."""
         matrices = [found.instrument_regressor.copy(), found.hessian.copy()]
@@ -167,3 +186,107 @@ class AdditiveProblem:
             matrix[known, known] = 1.0
         error[known] = 0.0
         return found._replace(instrument_regressor=matrices[0], hessian=matrices[1], instrument_error=error)
+
+
+class History(Sequence[IterationRecord]):
+    """Accepted iterations, each multiplied out to a transfer function only when it is looked at."""
+
+    def __init__(self, problem: AdditiveProblem) -> None:
+        self._problem = problem
+        self._entries: list[tuple[str, int, Array]] = []
+
+    def add(self, stage: str, result: Iterated | None) -> None:
+        """Append the start and the accepted steps of an iteration."""
+        if result is not None:
+            self._entries += [(stage, k, row) for k, row in enumerate(result.path)]
+
+    @property
+    def steps(self) -> int:
+        """Number of accepted steps, starts not counted."""
+        return sum(number > 0 for _, number, _ in self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return tuple(self[k] for k in range(*index.indices(len(self))))
+        stage, iteration, row = self._entries[index]
+        return history_entry(stage, iteration, self._problem, row[:-1], float(row[-1]))
+
+
+class SubmodelEstimate(NamedTuple):
+    """Where the iteration for a sum of submodels ended."""
+
+    problem: AdditiveProblem
+    #: Parameters of the model in the order of the problem's terms, then those of the free response.
+    theta: Array
+    equations: Equations
+    status: Status
+    history: History
+
+    @property
+    def order(self) -> IndexArray:
+        """Places of all parameters with submodels by rising natural frequency, where none of them is known by name."""
+        problem = self.problem
+        if problem.fixed:
+            return np.arange(self.theta.size)
+        sorting, places = problem.model(self.theta).order_of_sorting, np.arange(self.theta.size)
+        parts = np.split(places[: problem.size], np.cumsum([term.size for term in problem.terms])[:-1])
+        states = np.split(places[problem.size :], np.cumsum([term.order for term in problem.terms])[:-1])
+        own = [parts[k] for k in sorting] + [states[k] for k in sorting] * (problem.filter.free > 0)
+        return np.concatenate(own)
+
+    def described(self, covariance: Covariance, draws: int, jacobian: Array) -> dict[str, Any]:
+        """What a `Fit` says of parameters with these derivatives by those of the model."""
+        problem, diverged = self.problem, self.status is Status.DIVERGED
+        tangent = problem.tangent[:, :0] if diverged else problem.tangent
+        values = assessed(problem, self.theta, self.equations, self.status, covariance, draws, tangent)
+        values |= {"iterations": self.history.steps, "history": self.history}
+        law = values.get("law")
+        if law is None:
+            return {**values, "covariance": np.full((len(jacobian),) * 2, np.nan)}
+        # Covariances of a free response are not reported.
+        law = law.transformed(jacobian @ np.eye(problem.size, problem.free))
+        return {**values, "law": law, "covariance": law.covariance}
+
+
+def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> SubmodelEstimate:
+    """Iterate from a start.
+
+    Where the iteration does not converge it is run once more with the other interpolation of the output; and in open
+    loop, if that does not help, goes on with guarded steps.
+    """
+    whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
+    radius = problem.loop_radius(problem.model(whole)) if problem.loop.closed else 0.0
+    if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
+        raise DataError(
+            "the start makes an unstable loop with the controller: its poles reach the magnitude "
+            f"{radius:.4g}, and must stay below 1; start closer, or with instruments 'open_loop'"
+        )
+    history = History(problem)
+
+    def run(stage: str, problem: AdditiveProblem, start: Array, steps: Steps) -> Iterated | None:
+        result = iterate(problem, start, steps)
+        history.add(stage, result)
+        return result
+
+    result = run("refine", problem, whole, steps)
+    if result is None or result.status is not Status.CONVERGED:
+        otherwise_held = replace(problem, data=problem.data._replace(y_foh=not problem.data.y_foh))
+        result = _better(result, run("refine_again", otherwise_held, whole, steps))
+    if result is not None and result.status is Status.MAX_ITERATIONS and not problem.loop.closed:
+        # Slow on its way to a minimum: near it the cost may guard the steps, and Gauss-Newton is faster.
+        result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
+    if result is None:
+        return SubmodelEstimate(problem, whole, inadmissible(whole.size), Status.DIVERGED, history)
+    return SubmodelEstimate(problem, result.theta, result.equations, result.status, history)
+
+
+def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
+    """The one that converged; of two that did not, that with the smaller output error."""
+    if one is None or other is None:
+        return other if one is None else one
+    if other.status is Status.CONVERGED:
+        return other
+    return one if one.equations.squared_error <= other.equations.squared_error else other

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Generic, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -14,7 +14,6 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.delay_search import Descent
 from ctid_cli.estimation.iteration import Equations, Iterated, Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
-from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.criteria import percent_from_r_squared
@@ -22,8 +21,57 @@ from ctid_cli.inference.fit import Fit, IterationRecord, Status
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import (
+    require_choice,
+    require_finite,
+    require_integer,
+    require_not_negative,
+    require_positive,
+)
 from ctid_cli.signals.record import Record, named
+from ctid_cli.text import listed
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A parameter that is known.
+
+    Parameters
+    ----------
+    name : str
+        Its name in the table of parameters, for example a1 or g1_b0.
+    value : float
+        Its value, in the unit of that table.
+
+    Raises
+    ------
+    ValueError
+        If the value is not a finite number.
+    """
+
+    name: str
+    value: float
+
+    def __post_init__(self) -> None:
+        require_finite("value", self.value, "unit of the parameter", label=f"the value of {self.name}")
+
+
+def places_of(fixed: Iterable[Fixed] | None, names: Sequence[str]) -> dict[int, float]:
+    """Values of known parameters by their places among the names; unknown names and repetitions are refused."""
+    found: dict[int, float] = {}
+    for one in fixed or ():
+        if one.name == "delay":
+            raise OptionError("fixed", "the delay is no parameter to fix: a known delay is given as such")
+        if one.name not in names:
+            raise OptionError("fixed", f"there is no parameter {one.name!r} to fix; there are {listed(names)}")
+        place = names.index(one.name)
+        if place in found:
+            raise OptionError("fixed", f"parameter {one.name} is fixed twice")
+        found[place] = float(one.value)
+    if len(found) == len(names):
+        raise OptionError("fixed", "every parameter is fixed, so that there is nothing to estimate")
+    return found
+
 
 #: Draws without which the 95 % quantile of a bootstrap means nothing.
 LEAST_DRAWS = 40
@@ -236,6 +284,47 @@ def diverged(size: int, count: int) -> dict[str, Any]:
     return {"covariance": np.full((size, size), np.nan), "status": Status.DIVERGED, "count": count, **nothing}
 
 
+def assessed(
+    problem: Problem,
+    theta: Array,
+    equations: Equations,
+    status: Status,
+    kind: Covariance,
+    draws: int,
+    tangent: Array,
+) -> dict[str, Any]:
+    """Uncertainty, status, cost and agreement by the names of `Fit`; the tangent has the free directions as columns."""
+    y = problem.data.y_used
+    if not np.isfinite(equations.squared_error):
+        return diverged(len(tangent), y.size)
+    law = _uncertainty(problem, theta, equations, kind, draws, tangent) if tangent.shape[1] else None
+    if status is Status.CONVERGED and law is not None and not np.isfinite(law.free_covariance).all():
+        status = Status.SINGULAR
+    covariance = np.full((len(tangent),) * 2, np.nan) if law is None else law.covariance
+    spread = float(np.sum((y - y.mean()) ** 2))
+    return {"covariance": covariance, "law": law, "status": status, **quality(equations, spread, y.size)}
+
+
+def _uncertainty(
+    problem: Problem,
+    theta: Array,
+    equations: Equations,
+    kind: Covariance,
+    draws: int,
+    tangent: Array,
+) -> Uncertainty | None:
+    """Uncertainty of all parameters; None where the response is not finite."""
+    if kind == "white":
+        hessian = tangent.T @ equations.hessian @ tangent
+        covariance = white_noise_covariance(hessian, equations.squared_error, problem.samples)
+        return Uncertainty("white", tangent, covariance, problem.samples)
+    rows = problem.rows(theta)
+    if rows is None:
+        return None
+    psi, error = rows
+    return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
+
+
 def finish(
     problem: SampledProblem,
     theta: Array,
@@ -247,33 +336,16 @@ def finish(
 ) -> Fit:
     """Assemble the result of an estimation, with standard errors for a kind of noise."""
     a, b, delay = problem.split(theta)
-    size, y = problem.free, problem.data.y_used
+    size = problem.free
+    # A delay that is held is no parameter of the result. One at its bound is no minimum: it has no standard error, and
+    # the others hold for that delay.
+    accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
     found = problem.equations(theta)
-    if np.isfinite(found.squared_error):
-        # A delay that is held is no parameter of the result.
-        found = found._replace(hessian=found.hessian[:size, :size])
-        # A delay at its bound is no minimum: it has no standard error, and the others hold for that delay.
-        accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
-        law, tangent = None, np.eye(size)[:, :accurate]
-        if accurate:
-            white = white_noise_covariance(found.hessian[:accurate, :accurate], found.squared_error, y.size)
-            law = Uncertainty("white", tangent, white, y.size)
-            if status is Status.CONVERGED and np.isnan(white).any():
-                status = Status.SINGULAR
-        if kind != "white" and accurate:
-            rows = standard_rows(problem.data, a, b, delay)
-            psi = (rows[:, problem.structure.sensitivity_rows] * problem.structure.signs)[:, :size]
-            errors, regular = rows[:, problem.structure.error_row], problem.data.interval > 0.0
-            law = estimate_uncertainty([psi], [errors], kind, draws, regular=regular, tangent=tangent)
-        covariance = np.full((size, size), np.nan) if law is None else law.covariance
-        spread = float(np.sum((y - y.mean()) ** 2))
-        values = {"covariance": covariance, "law": law, "status": status, **quality(found, spread, y.size)}
-    else:
-        values = diverged(size, y.size)
+    found = found._replace(hessian=found.hessian[:size, :size])
     return Fit(
         model=TransferFunction(b, a, delay),
         parameter_names=problem.structure.names,
         iterations=iterations,
         history=tuple(history),
-        **values,
+        **assessed(problem, theta, found, status, kind, draws, np.eye(size)[:, :accurate]),
     )

@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_search import Limits, descend
+from ctid_cli.estimation.delay_search import Descent, Limits, descend
 from ctid_cli.estimation.filtered_costs import FilteredCosts, percents
-from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, Visit, minimise_redundantly
+from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, minimise_redundantly
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.inference.fit import IterationRecord
 
@@ -31,13 +32,37 @@ class FilterPath:
 
     round: int
     filter: int
-    #: Accepted trial delays [s], where it started first: the incumbent, or a period of the filter away from it, shape
-    #: (K,).
-    delays: Array
-    #: ``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%], shape (K,).
-    costs: Array
-    #: ``(a_1 … a_n, b_0 … b_m)`` there, shape (K, n + m + 1).
-    coefficients: Array
+    #: From the incumbent, or a period of the filter away from it.
+    descent: Descent
+    #: Mean square of the filtered output less its mean, or the sum of these squares.
+    spread: float
+    #: The candidate that the end of the path became [s].
+    end: float
+
+    @cached_property
+    def delays(self) -> Array:
+        """Accepted trial delays [s], where it started first, shape (K,)."""
+        return self.descent.path[:, -2]
+
+    @cached_property
+    def costs(self) -> Array:
+        """``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%], shape (K,)."""
+        return percents(self.descent.path[:, -1], self.spread)
+
+
+def path_history(
+    stage: str, search: RedundantMinimum[float], paths: Sequence[FilterPath], poles: int, samples: int = 1
+) -> list[IterationRecord]:
+    """The steps of the paths that led from incumbent to incumbent."""
+    led = {(path.round, path.filter, path.end): path for path in reversed(paths)}
+    return [
+        IterationRecord(
+            *(stage.format(visit.path + 1), k, row[-2], row[-1] / samples),
+            *((1.0, *row[:poles]), tuple(row[poles:-2])),
+        )
+        for visit in search.trajectory[1:]
+        for k, row in enumerate(led[visit.round, visit.path, visit.point].descent.path.tolist())
+    ]
 
 
 class Minima(NamedTuple):
@@ -69,7 +94,7 @@ class FilterSearch:
         shortest = SMALLEST_STEP * self.period
         self.limits = Limits(*bounds, max_iterations, tolerance, shortest, max_delay_step, reflect=True)
         self._known: dict[float, Minima] = {}
-        self._paths: dict[tuple[int, float, bool], list[Array]] = {}
+        self._descended: dict[tuple[int, float, bool], list[Descent]] = {}
 
     def on_lattice(self, delay: float) -> float:
         """The nearest point of the lattice within the bounds."""
@@ -112,24 +137,6 @@ class FilterSearch:
             found = _joined(found, rounds_from(found.point, found.rounds, False))
         return found
 
-    def led_here(self, visit: Visit[float], paths: Sequence[FilterPath]) -> FilterPath:
-        """The solver path whose end was a candidate."""
-        place = visit.round, visit.path, visit.point
-        return next(path for path in paths if (path.round, path.filter, self.on_lattice(path.delays[-1])) == place)
-
-    def history(self, search: RedundantMinimum[float], paths: Sequence[FilterPath]) -> list[IterationRecord]:
-        """The steps of the paths that led from incumbent to incumbent."""
-        history: list[IterationRecord] = []
-        n = self.costs.poles
-        for visit in search.trajectory[1:]:
-            path = self.led_here(visit, paths)
-            squares = (path.costs / 100.0) ** 2 * self.costs.spreads[path.filter]
-            stage = f"filter {path.filter + 1}"
-            for i, (delay, square) in enumerate(zip(path.delays.tolist(), squares.tolist(), strict=True)):
-                theta = path.coefficients[i].tolist()
-                history.append(IterationRecord(stage, i, delay, square, (1.0, *theta[:n]), tuple(theta[n:])))
-        return history
-
     def _path(self, k: int, paths: list[FilterPath], done: int, hop: bool) -> Path[float]:
         """Solver path of one filter after a number of rounds; what it does goes to ``paths``."""
         rounds = done
@@ -137,18 +144,15 @@ class FilterSearch:
         def follow(delay: float) -> list[float]:
             nonlocal rounds
             rounds += 1
-            if (k, delay, hop) not in self._paths:
-                self._paths[k, delay, hop] = self._descents(k, delay, hop)
-            taken = [
-                FilterPath(rounds, k, path[:, -2], percents(path[:, -1], self.costs.spreads[k]), path[:, :-2])
-                for path in self._paths[k, delay, hop]
-            ]
-            paths.extend(taken)
-            return [self.on_lattice(path.delays[-1]) for path in taken]
+            if (k, delay, hop) not in self._descended:
+                self._descended[k, delay, hop] = self._descents(k, delay, hop)
+            ends = [(found, self.on_lattice(found.minimum.delay)) for found in self._descended[k, delay, hop]]
+            paths.extend(FilterPath(rounds, k, found, self.costs.spreads[k], end) for found, end in ends)
+            return [end for _, end in ends]
 
         return follow
 
-    def _descents(self, k: int, delay: float, hop: bool) -> list[Array]:
+    def _descents(self, k: int, delay: float, hop: bool) -> list[Descent]:
         """Descents of one filter's cost from a point of the lattice, or from a period of the filter away from it."""
         none = np.empty((0, self.costs.size))
         if hop:
@@ -159,8 +163,8 @@ class FilterSearch:
             here = self.at(delay)
             starts = [(delay, here.thetas[k : k + 1])] if np.isfinite(here.squared_errors[k]) else []
             starts.append((delay, none))
-        found = [descend(self.costs.behind(k), start, theta, self.limits).path for start, theta in starts]
-        return [path for path in found if path.size]
+        found = [descend(self.costs.behind(k), start, theta, self.limits) for start, theta in starts]
+        return [descent for descent in found if descent.path.size]
 
 
 def _joined(first: RedundantMinimum[float], then: RedundantMinimum[float]) -> RedundantMinimum[float]:

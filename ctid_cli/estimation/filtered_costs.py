@@ -9,7 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.estimation.delay_search import Minimum
 from ctid_cli.estimation.iteration import Steps, solve_scaled
-from ctid_cli.estimation.stability import reflect_unstable
+from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra
 from ctid_cli.filtering.spectral_kernels import least_cost, projected_moments

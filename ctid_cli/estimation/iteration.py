@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.fit import Status
 
 #: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
@@ -73,6 +74,10 @@ class Problem(Protocol):
         """Number of parameters to iterate on, from the first; the others are held."""
 
     @property
+    def data(self) -> FilterData:
+        """The record."""
+
+    @property
     def samples(self) -> int:
         """Number of samples in the sums."""
 
@@ -81,6 +86,9 @@ class Problem(Protocol):
 
     def equations(self, theta: Array) -> Equations:
         """Second moments of sensitivities, regressors and output error."""
+
+    def rows(self, theta: Array) -> tuple[Array, Array] | None:
+        """Sensitivities and output error at the used samples; None where the response is not finite."""
 
     def admissible(self, theta: Array) -> Array:
         """Bring parameters into the admissible set: unstable models are reflected."""

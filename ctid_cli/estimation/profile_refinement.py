@@ -1,4 +1,13 @@
-"""The least output error of measured records from the minima of a profile, and what may be asked of it later."""
+r"""The least output error of measured records from the minima of a profile, and the least loss with outliers.
+
+With x the simulated outputs, a loss is minimised by fitting ``x + psi(r)`` instead of ``y = x + r``: the squared errors
+touch twice the loss from above, so that every fit lowers the loss, and where nothing moves any more
+``sum s psi(r) = 0`` [1]_. All starts, bounds and kinds of minima of least squares serve the loss too.
+
+References
+----------
+.. [1] P. J. Huber and E. M. Ronchetti, *Robust Statistics*, 2nd ed. (Wiley 2009), section 7.8.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -11,11 +20,12 @@ from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.optimum.search import local_minimum
+from ctid_cli.estimation.optimum.search import ROUNDING, local_minimum
 from ctid_cli.estimation.output_error import Layout, sensitivities
-from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.inference.robust_loss import Loss, RobustKind, Weighting, scale_of
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.record import Record
 
 #: Random starts, so many and so many for each pole.
 RANDOM_STARTS = 2
@@ -45,6 +55,11 @@ class Refinement:
         self.measured, self.known = measured, known
         self.structure = measured.structure
         self.problem = problem or measured.problem
+
+    @property
+    def records(self) -> list[Record]:
+        """The records, without the means that were subtracted."""
+        return self.measured.records
 
     def with_outputs(self, outputs: Sequence[Array]) -> "Refinement":
         """The same with other outputs at the used samples of each record."""
@@ -154,3 +169,77 @@ class Refinement:
         own = [layout.own_of(theta, k) for k in range(layout.experiments)]
         offsets = tuple(y0 + c for y0, (_, c) in zip(self.measured.offsets, own, strict=True))
         return tuple(state for state, _ in own), offsets
+
+
+#: Most fits in one descent, and most of them after which the scale is taken anew.
+MOST_FITS, MOST_SCALES = 60, 20
+#: The scale has settled where it changes by less than this fraction, the descent where the loss falls by less.
+SETTLED, DONE = 1e-4, 1e-11
+#: Most searches, and the fraction by which the next one must lower the loss.
+MOST_SEARCHES, WORTHWHILE = 5, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    """A local minimum of the loss."""
+
+    found: Optimum
+    losses: tuple[Loss, ...]
+    #: Simulated outputs and output errors at the used samples of each record.
+    simulated: list[Array]
+    errors: list[Array]
+
+    def cost(self, losses: Sequence[Loss]) -> float:
+        """Twice the sum of losses of given scales."""
+        return sum(loss.cost(r) for loss, r in zip(losses, self.errors, strict=True))
+
+    def modified(self) -> list[Array]:
+        """Outputs whose least squares are taken next."""
+        each = zip(self.simulated, self.losses, self.errors, strict=True)
+        return [x + loss.weight(r) * r for x, loss, r in each]
+
+
+def robust_fit(
+    refinement: Refinement, kind: RobustKind, starts: Sequence[tuple[Array, float]], nested: bool
+) -> RobustFit:
+    """Search for the least Huber loss, and from there for Tukey's.
+
+    The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.
+    """
+    best = _descend(refinement, refinement.best(starts, nested), "huber")
+    for _ in range(MOST_SEARCHES):
+        at = [(best.found.denominator, best.found.delay), *starts]
+        trial = _descend(refinement, refinement.with_outputs(best.modified()).best(at, nested), "huber")
+        smaller = [min(pair, key=lambda loss: loss.scale) for pair in zip(best.losses, trial.losses, strict=True)]
+        if trial.cost(smaller) > best.cost(smaller) * (1.0 - WORTHWHILE):
+            break
+        best = trial
+    if kind == "tukey":
+        best = _descend(refinement, best.found, kind, tuple(replace(loss, kind=kind) for loss in best.losses))
+    return best
+
+
+def _descend(
+    refinement: Refinement, found: Optimum, kind: RobustKind, losses: tuple[Loss, ...] | None = None
+) -> RobustFit:
+    """Local minimum of the loss, at given scales or at those of the errors, which are fixed when they have settled."""
+    here = _at(refinement, found, kind, losses)
+    settled = losses is not None
+    for k in range(MOST_FITS):
+        there = refinement.with_outputs(here.modified()).local(here.found)
+        there = replace(there, tried=found.tried, agree=found.agree, poles_at_infinity=found.poles_at_infinity)
+        following = _at(refinement, there, kind, here.losses if settled else None)
+        if settled and following.cost(here.losses) >= here.cost(here.losses) * (1.0 - DONE):
+            break
+        changes = [new.scale / old.scale - 1.0 for new, old in zip(following.losses, here.losses, strict=True)]
+        settled = settled or k >= MOST_SCALES or float(np.abs(changes).max()) < SETTLED
+        here = following
+    return following
+
+
+def _at(refinement: Refinement, found: Optimum, kind: RobustKind, losses: tuple[Loss, ...] | None) -> RobustFit:
+    simulated, outputs = refinement.simulated(found), refinement.measured.outputs
+    errors = [y - x for y, x in zip(outputs, simulated, strict=True)]
+    least = [ROUNDING * float(np.sqrt(np.mean(y**2))) for y in outputs]
+    losses = losses or tuple(Loss(kind, scale_of(*pair)) for pair in zip(errors, least, strict=True))
+    return RobustFit(found, losses, simulated, errors)

@@ -1,19 +1,64 @@
-"""The estimation problem of a single transfer function on the samples of one record."""
+"""The estimation problem of a single transfer function on the samples of one record, and its stable denominators."""
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IntArray
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.iteration import Equations, inadmissible, solve_scaled, with_best
-from ctid_cli.estimation.stability import reflect_unstable, with_stable_denominator
-from ctid_cli.filtering.bank import second_moments
+from ctid_cli.filtering.bank import second_moments, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.realisation import scaled_roots
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
+
+#: A root on the axis is moved off it by this fraction of the largest root: filters need strict stability.
+OFF_THE_AXIS = 1e-6
+
+
+def is_hurwitz(a: Array) -> bool:
+    """Return whether every root of a monic polynomial lies in the open left half-plane (Routh's criterion)."""
+    coefficients = a.tolist()
+    # All coefficients positive: necessary, for n <= 2 sufficient too; refuses NaN as well.
+    if not all(c > 0.0 for c in coefficients):
+        return False
+    # The first two rows of Routh's array hold the even and the odd coefficients.
+    upper, lower = coefficients[0::2], coefficients[1::2]
+    # Each new row replaces the older of its two predecessors; a first column of one sign means no unstable root.
+    while len(lower) > 0 and len(upper) > 1:
+        ratio = upper[0] / lower[0]
+        padded = [*lower, 0.0]
+        upper, lower = lower, [upper[k] - ratio * padded[k] for k in range(1, len(upper))]
+        if not lower[0] > 0.0:
+            return False
+    return True
+
+
+def reflect_unstable(a: Array) -> Array:
+    """Return a monic polynomial with its right-half-plane roots mirrored into the left half-plane."""
+    if is_hurwitz(a):
+        return a
+    # In the polynomial's own unit of time, where its coefficients neither overflow nor vanish.
+    w0, roots = scaled_roots(a)
+    least = OFF_THE_AXIS * (float(np.abs(roots).max()) or 1.0)
+    mirrored = -np.maximum(np.abs(roots.real), least) + 1j * roots.imag
+    return np.asarray(np.poly(mirrored).real * w0 ** np.arange(a.size))
+
+
+def with_stable_denominator(theta: Array, poles: int) -> Array:
+    """Return a parameter vector with the denominator at its head reflected if it is unstable."""
+    if not np.isfinite(theta).all():
+        return theta
+    a = np.concatenate(([1.0], theta[:poles]))
+    if is_hurwitz(a):
+        return theta
+    stable = theta.copy()
+    stable[:poles] = reflect_unstable(a)[1:]
+    return stable
+
 
 #: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.
 CUTOFFS = (1.0, 0.2, 5.0, 0.04)
@@ -60,29 +105,26 @@ class SampledProblem(NamedTuple):
             moments = second_moments(self.data, np.concatenate(([1.0], theta[:n])), b, delay)
         if not np.isfinite(moments).all():
             return inadmissible(theta.size)
-        psi, phi, signs, error = _rows_of(n, m)
-        mixed, hessian = moments[psi[:, None], phi] * signs, moments[psi[:, None], psi] * signs
+        whole = _with_delay(n, m)
+        psi, phi, signs, error = whole.sensitivity_rows, whole.regressor_rows, whole.signs, whole.error_row
+        mixed, hessian = (moments[psi[:, None], rows] * (signs[:, None] * signs) for rows in (phi, psi))
         # x = sum b_j p^(m-j)/A u.
         rising = b[::-1]
         power = float(rising @ moments[: m + 1, : m + 1] @ rising)
-        return Equations(mixed, moments[psi, error] * signs[-2], hessian, float(moments[error, error]), power)
+        return Equations(mixed, moments[psi, error] * signs, hessian, float(moments[error, error]), power)
+
+    def rows(self, theta: Array) -> tuple[Array, Array]:
+        """Sensitivities of the simulated output, and the output error, at the used samples."""
+        rows, structure = standard_rows(self.data, *self.split(theta)), self.structure
+        return rows[:, structure.sensitivity_rows] * structure.signs, rows[:, structure.error_row]
 
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable denominators."""
         return with_stable_denominator(theta, self.poles)
 
 
-@lru_cache
-def _rows_of(poles: int, zeros: int) -> tuple[IntArray, IntArray, Array, int]:
-    """Return the standard rows of the sensitivities and of the regressors, signs of their products, and of the error.
-
-    ``dx/da_i = -p^(n-i)/A x`` (of y in the regressor), ``dx/db_j = p^(m-j)/A u`` and ``dx/dtau = -p x``.
-    """
-    n, m = poles, zeros
-    of_b, tau = np.arange(m, -1, -1), 3 * n + 2
-    psi, phi = (np.concatenate((np.arange(last, last - n, -1), of_b, [tau])) for last in (2 * n, 3 * n))
-    sign = np.concatenate((-np.ones(n), np.ones(m + 1), [-1.0]))
-    return psi, phi, np.outer(sign, sign), 3 * n + 1
+#: Rows of the sensitivities, the delay among them, in the second moments.
+_with_delay = lru_cache(partial(Structure, delay=True))
 
 
 def at_known_delay(data: FilterData, structure: Structure) -> SampledProblem:

@@ -12,10 +12,15 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_estimate import SubmodelEstimate, estimate_submodels, radius_in_loop
-from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
-from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_record
-from ctid_cli.estimation.fixed import Fixed, places_of
+from ctid_cli.estimation.additive_problem import (
+    AdditiveProblem,
+    Instruments,
+    SubmodelEstimate,
+    check_closed_loop,
+    estimate_submodels,
+    loop_data,
+)
+from ctid_cli.estimation.common import Estimator, Fixed, Start, StartFrom, check_record, places_of
 from ctid_cli.estimation.iteration import StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data
@@ -211,19 +216,39 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         else:
             model, method = laid_out.start
         problem, model = in_one_order(laid_out.problem, model)
-        return _fit(problem, self._iterate(problem, model), model, method)
+        return self._fit(self._iterate(problem, model), model, method)
 
     def _iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
         """Estimate from a start."""
         steps = Steps(self.max_iterations, self.tolerance, self.variant)
-        noise = self.covariance, self.bootstrap_draws
         if not problem.fixed:
-            return estimate_submodels(problem, start.theta, steps, *noise)
+            return estimate_submodels(problem, start.theta, steps)
         # From the start, and from what all parameters together would be.
-        free = estimate_submodels(replace(problem, fixed={}), start.theta, steps, "white", 0)
-        near = [_nearest(theta, self.terms, problem.fixed) for theta in (free.theta, start.theta)]
-        found = [estimate_submodels(problem, theta, steps, *noise) for theta in near]
-        return min(found, key=lambda one: np.nan_to_num(one.values["cost"], nan=np.inf))
+        free = estimate_submodels(replace(problem, fixed={}), start.theta, steps).theta[: problem.size]
+        near = [_nearest(theta, self.terms, problem.fixed) for theta in (free, start.theta)]
+        found = [estimate_submodels(problem, theta, steps) for theta in near]
+        return min(found, key=lambda one: one.equations.squared_error)
+
+    def _fit(self, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
+        """The result, with submodels by rising natural frequency."""
+        problem = estimate.problem
+        try:
+            model = problem.model(estimate.theta)
+        except DataError as error:
+            text = "the iterations ended where the terms cannot be told apart"
+            raise DataError(f"{text}: {error} Start closer.") from None
+        # Known parameters have names, so that submodels stay where they are.
+        ordered = model if problem.fixed else model.sorted()
+        order = estimate.order[: problem.size]
+        return AdditiveFit(
+            model=unfactored(ordered),
+            parameter_names=ordered.names,
+            additive=ordered,
+            start=start,
+            start_method=method,
+            loop_radius=problem.loop_radius(model),
+            **estimate.described(self.covariance, self.bootstrap_draws, np.eye(problem.size)[order]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,26 +299,3 @@ def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) 
         if away < least:
             best, least = trial, away
     return best
-
-
-def _fit(problem: AdditiveProblem, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
-    """The result, with submodels by rising natural frequency."""
-    try:
-        model = problem.model(estimate.theta)
-    except DataError as error:
-        raise DataError(f"the iterations ended where the terms cannot be told apart: {error} Start closer.") from None
-    places = np.split(np.arange(problem.size), np.cumsum([term.size for term in problem.terms])[:-1])
-    # Known parameters have names, so that submodels stay where they are.
-    order = (
-        np.concatenate([places[k] for k in model.order_of_sorting]) if not problem.fixed else np.arange(problem.size)
-    )
-    ordered = model if problem.fixed else model.sorted()
-    return AdditiveFit(
-        model=unfactored(ordered),
-        parameter_names=ordered.names,
-        additive=ordered,
-        start=start,
-        start_method=method,
-        loop_radius=radius_in_loop(problem, model),
-        **estimate.values_in(np.eye(problem.size)[order]),
-    )

@@ -2,23 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.common import Estimator, Start, checked_bounds, quality
-from ctid_cli.estimation.fixed import Fixed, places_of
+from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.iteration import Equations
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.output_error import Layout, sensitivities
-from ctid_cli.estimation.profile_refinement import Refinement
+from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement, RobustFit, robust_fit
 from ctid_cli.estimation.profile_search import Profile, search_delay
-from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
@@ -129,6 +127,12 @@ class MeasuredFit(DeferredFields, Fit):
         found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, **noise)
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
+    def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
+        """The fit with errors for a kind of noise, singular where it converged to parameters that have none."""
+        law = self.uncertainty(kind, draws)
+        singular = self.status is Status.CONVERGED and not np.isfinite(law.free_covariance).all()
+        return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
+
     @property
     def linear(self) -> "MeasuredFit":
         """The fit by least squares that has the same law: itself, or with the pseudo-errors of its loss."""
@@ -143,6 +147,28 @@ class MeasuredFit(DeferredFields, Fit):
     def parameters(self) -> dict[str, float]:
         """Free parameters by name."""
         return dict(zip(self.parameter_names, self.theta.tolist(), strict=True))
+
+
+class FittedSamples(NamedTuple):
+    """What a fit says of each used sample of each record."""
+
+    residuals: tuple[Array, ...]
+    sensitivities: tuple[Array, ...]
+    used: tuple[BoolArray, ...]
+    weighting: Weighting | None
+
+    @property
+    def linear(self) -> "FittedSamples":
+        """Least squares of the same law: pseudo-errors, and samples that count for nothing as if they were missing."""
+        if self.weighting is None:
+            return self
+        kept = [weights > 0.0 for weights in self.weighting.weights]
+        left = [use.copy() for use in self.used]
+        for use, keep in zip(left, kept, strict=True):
+            use[use] = keep
+        errors = tuple(e[keep] for e, keep in zip(self.weighting.pseudo_errors, kept, strict=True))
+        slopes = tuple(psi[keep] for psi, keep in zip(self.sensitivities, kept, strict=True))
+        return FittedSamples(errors, slopes, tuple(left), None)
 
 
 @dataclass(frozen=True)
@@ -281,11 +307,28 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 else:
                     robust = robust_fit(refinement, self.loss, starts, self.nested)
                     fit = fitted(refinement, robust.found, profile, robust)
-                uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
-                singular = fit.status is Status.CONVERGED and not np.isfinite(uncertainty.free_covariance).all()
-                status = Status.SINGULAR if singular else fit.status
-                return replace(fit, covariance=uncertainty.covariance, law=uncertainty, status=status)
+                return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
+
+    # --- what a fit is judged by -----------------------------------------------------------------------
+
+    def _acting(self, record: Record) -> Record:
+        """The record with what acts on the output from outside."""
+        return record
+
+    def _samples(self, fit: MeasuredFit, refinement: Any) -> FittedSamples:
+        """What a fit says of each used sample, from its parameters."""
+        return samples_at(refinement, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
+
+    def _applied(self, fit: MeasuredFit, refinement: Any) -> AppliedModel:
+        """The model on another record."""
+        found: AppliedModel = refinement.errors_of(fit.model)
+        return found
+
+    def _lowered(self, fit: MeasuredFit, refinement: Any) -> dict[str, float]:
+        """Sums of squared errors if an initial state or an offset that were taken as zero were estimated too."""
+        tried = {"initial_state": self.initial_state == "rest", "offset": self.offset == "none"}
+        return {name: refinement.squared_error_with(fit.model, **{name: True}) for name in tried if tried[name]}
 
 
 def fitted(
@@ -333,28 +376,6 @@ def fitted(
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )
-
-
-class FittedSamples(NamedTuple):
-    """What a fit says of each used sample of each record."""
-
-    residuals: tuple[Array, ...]
-    sensitivities: tuple[Array, ...]
-    used: tuple[BoolArray, ...]
-    weighting: Weighting | None
-
-    @property
-    def linear(self) -> "FittedSamples":
-        """Least squares of the same law: pseudo-errors, and samples that count for nothing as if they were missing."""
-        if self.weighting is None:
-            return self
-        kept = [weights > 0.0 for weights in self.weighting.weights]
-        left = [use.copy() for use in self.used]
-        for use, keep in zip(left, kept, strict=True):
-            use[use] = keep
-        errors = tuple(e[keep] for e, keep in zip(self.weighting.pseudo_errors, kept, strict=True))
-        slopes = tuple(psi[keep] for psi, keep in zip(self.sensitivities, kept, strict=True))
-        return FittedSamples(errors, slopes, tuple(left), None)
 
 
 def samples_at(

@@ -9,18 +9,20 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators import identification_warnings as warnings
-from ctid_cli.estimators import judging
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
+from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
+from ctid_cli.estimators.measured_submodels import LaidOut, MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.estimators.residual_causes import another_delay, another_order
 from ctid_cli.estimators.second_look import SecondLook, look_again
 from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
+from ctid_cli.inference.derived import additive_derived, derived_parameters
 from ctid_cli.inference.fit import DeferredFields, FittedModel, Status
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
@@ -170,7 +172,7 @@ def identify(
     against noise of the outputs' colour, the search over poles and delays included.
     """
     # Before the fit takes its time.
-    checked = None if validation is None else judging.laid_out_validation(options, validation)
+    checked = None if validation is None else laid_out_validation(options, validation)
     # Errors for coloured noise are computed once, below, where a bootstrap can tell how far it is.
     prepared = replace(options, covariance="white").prepare(records)
     fit: MeasuredFit | SubmodelsFit = prepared.fit()
@@ -182,7 +184,7 @@ def identify(
         laid_out = laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
-    answering = judging.answering(options, prepared.laid_out)
+    answering = [options._acting(record) for record in prepared.laid_out.records]
     answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     tests = tests_of(options, linear, records, answer)
@@ -200,14 +202,14 @@ def identify(
         interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
-        judged = validated(judging.applied(fit, options, checked), validation)
+        judged = validated(options._applied(fit, checked), validation)
     found = Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
         estimates=_estimates(fit, uncertainty, unclear, interval),
         delay_interval=interval,
-        derived=judging.derived(fit, uncertainty, answer.seen and not singular),
+        derived=_derived(fit, uncertainty, answer.seen and not singular),
         tests=tests,
         criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size - len(fit.known)),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
@@ -216,17 +218,17 @@ def identify(
         validation=judged,
         records=tuple(records),
     )
-    acting = [judging.acting(options, record) for record in records]
+    acting = [options._acting(record) for record in records]
     tried = laid_out, linear, options
     failed = answer.seen and not all(test.white and test.uncorrelated for test in tests)
     look = look_again(
         linear,
         acting,
-        judging.other_hold(options, laid_out, linear, records),
+        _other_hold(options, laid_out, linear, records),
         another_order(*tried) if failed else None,
         another_delay(*tried) if failed else None,
     )
-    gains = _gains(linear, judging.lowered(options, laid_out, linear))
+    gains = _gains(linear, options._lowered(linear, laid_out))
     unsafe = _unsafe(found, prepared.laid_out)
     return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains, unsafe))))
 
@@ -262,7 +264,7 @@ def tests_of(
     found = []
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
-            delayed = judging.acting(options, record).input.at(record.t[use] - fit.model.delay)
+            delayed = options._acting(record).input.at(record.t[use] - fit.model.delay)
             tested = residual_tests(eps, delayed, level=level, sensitivities=psi)
             found.append(replace(tested, answered=answer.seen))
     return tuple(found)
@@ -283,13 +285,13 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     return set(np.flatnonzero(unclear | moving).tolist())
 
 
-def _unsafe(found: Identification, laid_out: judging.LaidOut) -> list[str]:
+def _unsafe(found: Identification, laid_out: LaidOut) -> list[str]:
     """Parameters whose intervals reach as far as the output is not linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
     if not shown or (isinstance(options, MeasuredSubmodels) and options.closed):
         return []
-    records, linear = judging.answering(options, laid_out), fit.linear
+    records, linear = [options._acting(record) for record in laid_out.records], fit.linear
     model = Parametric(fit.parametrised, fit.parameter_names)
     shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities)
     return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
@@ -299,6 +301,22 @@ def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
     """Indices of the parameters that are not held at a bound, and ``sum psi psi'`` along the free directions."""
     hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
     return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
+
+
+def _other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
+    """The best other hold of the input; None where the holds cannot be compared."""
+    if isinstance(laid_out, Refinement):
+        return best_other_hold(laid_out, fit, records) if options.loss == "squares" else None
+    assert isinstance(options, MeasuredSubmodels)
+    if options.closed:
+        # A discrete controller holds its input.
+        return None
+    try:
+        held = otherwise_held(records[0])
+        other = options.prepare(held).fit(Start(model=options._factors(fit)))
+    except DataError:
+        return None
+    return OtherHold(held.input.hold, decisive(fit.cost, other.cost, fit, records))
 
 
 # --- the delay -------------------------------------------------------------------------------------
@@ -402,6 +420,27 @@ def _estimates(
     found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
     order = {"b": 0, "a": 1, "g": 1, "d": 2}
     return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))
+
+
+def laid_out_validation(options: Options, validation: Record) -> LaidOut:
+    """A record that the model is to be judged on."""
+    try:
+        return options.prepare(validation).laid_out
+    except DataError as error:
+        raise DataError(f"validation record: {error}") from None
+
+
+def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[UncertainValue, ...]:
+    """Poles, time constants, frequencies, damping and gain; without errors where no response is seen."""
+    covariance = uncertainty.covariance if seen else np.full_like(uncertainty.covariance, np.nan)
+    # What is known has no variance.
+    known = np.isin(fit.parameter_names, fit.known)
+    covariance[known] = covariance[:, known] = 0.0
+    if isinstance(fit, SubmodelsFit) and fit.additive is not None:
+        return additive_derived(fit.additive, covariance, uncertainty.quantile)
+    size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
+    held = fit.tangent[:size] if fit.held_poles else None
+    return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
 
 
 def validated(applied: AppliedModel, record: Record) -> Validation:

@@ -6,8 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import DelayInterval

@@ -8,23 +8,22 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_estimate import radius_in_loop
-from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments
-from ctid_cli.estimation.common import Estimator, Start
-from ctid_cli.estimation.fixed import Fixed
+from ctid_cli.estimation.additive_problem import Instruments
+from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import without_means
-from ctid_cli.estimation.profile_refinement import AppliedModel
+from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels, in_one_order
-from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP, free_response
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
-from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, LossKind, Offset
 
@@ -66,6 +65,11 @@ class LaidOutSubmodels(Submodels):
     #: Means that were subtracted.
     input_offset: float
     offset: float
+
+    @property
+    def records(self) -> list[Record]:
+        """The record, without the means that were subtracted."""
+        return [self.record]
 
     def free_columns(self, theta: Array) -> Array:
         """Free responses of a model at the used samples, a column for each of their coefficients."""
@@ -189,28 +193,28 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             model, method = start.model, "The start was given."
         problem, model = in_one_order(laid_out.problem, model)
         found = self.estimator._iterate(problem, model)
-        rows = problem.filter.rows(found.whole)
-        if rows is None or not np.isfinite(rows[2]).all():
+        y, equations = problem.data.y_used, found.equations
+        if not np.isfinite(equations.squared_error):
             raise DataError(
                 f"{named(laid_out.record)}the iterations for these terms diverged; use fewer or other terms, another "
                 "delay, or a longer record"
             )
-        order = _order(problem, found.whole, sort=self.factored and not self.fixed)
-        theta = found.whole[order]
-        ordered = problem.model(found.whole) if self.fixed else problem.model(found.whole).sorted()
+        order = found.order if self.factored else np.arange(found.theta.size)
+        theta = found.theta[order]
+        ordered = problem.model(found.theta) if self.fixed else problem.model(found.theta).sorted()
         names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
         if not self.factored:
             size, structure = problem.size, Structure(self.poles, self.zeros)
             whole = unfactored(ordered)
             theta = np.concatenate((whole.denominator[1:], _padded(whole.numerator, self.zeros + 1), theta[size:]))
             names = (*structure.names, *names[size:])
-        values: dict[str, Any] = {name: found.values[name] for name in ("status", "iterations", "cost", "count", "r2")}
-        values |= {name: found.values[name] for name in ("fit_percent", "condition_number")}
         fixed = np.isin(order, list(problem.fixed))
         fit = SubmodelsFit(
             model=unfactored(ordered),
             parameter_names=names,
             covariance=np.full((theta.size, theta.size), np.nan),
+            status=found.status,
+            iterations=found.history.steps,
             theta=theta,
             initial_states=(theta[problem.size :],),
             offsets=(laid_out.offset,),
@@ -220,21 +224,29 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             known=tuple(names[k] for k in np.flatnonzero(fixed)),
             additive=ordered if self.factored else None,
             start_method=method,
-            loop_radius=radius_in_loop(problem, ordered),
-            **values,
+            loop_radius=problem.loop_radius(ordered),
+            **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
-        samples = self._samples_of(fit, laid_out)
+        samples = self._samples(fit, laid_out)
         fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
-        uncertainty = fit.uncertainty(self.covariance, self.bootstrap_draws)
-        return replace(fit, covariance=uncertainty.covariance, law=uncertainty)
+        return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     # --- what a fit is judged by -----------------------------------------------------------------------
 
-    def _factors(self, fit: SubmodelsFit) -> AdditiveModel:
-        """The submodels of an estimate."""
-        return fit.additive or AdditiveModel.from_theta(_single(fit), self.terms, self.delay)
+    def _factors(self, fit: MeasuredFit) -> AdditiveModel:
+        """The submodels of an estimate; the only one of a transfer function."""
+        if isinstance(fit, SubmodelsFit) and fit.additive is not None:
+            return fit.additive
+        numerator = _padded(fit.model.numerator, self.zeros + 1)
+        return AdditiveModel([Submodel(numerator, fit.model.denominator)], self.delay)
 
-    def _samples_of(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> FittedSamples:
+    def _acting(self, record: Record) -> Record:
+        """The record with what acts on the output from outside: in a loop the reference, for noise moves the input."""
+        if record.loop is None or not self.closed:
+            return record
+        return Record(record.t, record.y, HeldSignal(record.t, record.loop.reference), name=record.name)
+
+    def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """What a fit says of each used sample, from its parameters; of a monic fraction by its coefficients."""
         model, problem = self._factors(fit), laid_out.problem
         ordered = replace(problem, terms=model.terms)
@@ -246,13 +258,14 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             psi = np.column_stack((psi[:, :size] @ np.linalg.inv(jacobian), psi[:, size:]))
         return FittedSamples((rows[2],), (psi,), (used_samples(problem.data, laid_out.record),), None)
 
-    def _apply(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> AppliedModel:
+    def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """The model on another record."""
         model = self._factors(fit)
         open_loop = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP)
-        return replace(laid_out, problem=open_loop).errors_of(model.theta, self.initial_state == "estimate")
+        alone: LaidOutSubmodels = replace(laid_out, problem=open_loop)
+        return alone.errors_of(model.theta, self.initial_state == "estimate")
 
-    def _lowered(self, fit: SubmodelsFit, laid_out: LaidOutSubmodels) -> dict[str, float]:
+    def _lowered(self, fit: MeasuredFit, laid_out: Any) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
         error, psi = fit.residuals[0], fit.sensitivities[0] @ fit.tangent
 
@@ -274,25 +287,11 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 TINY = float(np.finfo(float).tiny)
 
 
-def _single(fit: SubmodelsFit) -> Array:
-    """Parameters of the only term from those of the monic fraction."""
-    whole = fit.model
-    a, b = whole.denominator / whole.denominator[-1], whole.numerator / whole.denominator[-1]
-    zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
-    return np.concatenate((a[:-1][::-1], _padded(b, zeros + 1)[::-1]))
-
-
 def _padded(b: Array, size: int) -> Array:
     """Numerator with its declared length."""
     return np.concatenate((np.zeros(size - b.size), b))
 
 
-def _order(problem: AdditiveProblem, whole: Array, *, sort: bool) -> IndexArray:
-    """Places of all parameters with submodels by rising natural frequency, those of free responses likewise."""
-    if not sort:
-        return np.arange(whole.size)
-    sorting, places = problem.model(whole).order_of_sorting, []
-    for first, widths in ((0, [term.size for term in problem.terms]), (problem.size, [t.order for t in problem.terms])):
-        own = np.split(np.arange(first, first + sum(widths)), np.cumsum(widths)[:-1])
-        places += [own[k] for k in sorting if first < whole.size]
-    return np.concatenate(places)
+#: Estimators of measured records, and records as each of them lays them out.
+Options = DelayProfile | MeasuredSubmodels
+LaidOut = Refinement | LaidOutSubmodels

@@ -9,7 +9,6 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
-from ctid_cli.estimators import judging
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import FittedModel
@@ -160,7 +159,7 @@ def _treated(
             options = replace(fit.options, initial_state=state, offset=shift)
         except ValueError as error:
             raise UsageError(str(error)) from None
-        return judging.applied(fit.fit, options, options.prepare(record).laid_out)
+        return options._applied(fit.fit, options.prepare(record).laid_out)
     model = parametric.fraction
     structure = Structure(model.order, parametric.zeros_of_fraction)
     treatment = Treatment((model.delay, model.delay), state, shift, "foh")

@@ -12,8 +12,7 @@ from ctid_cli.estimation.optimum.ladder import Ladder
 from ctid_cli.estimation.optimum.starts import Nest
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted
-from ctid_cli.estimators.identification import tests_of, validated
-from ctid_cli.estimators.judging import laid_out_validation
+from ctid_cli.estimators.identification import laid_out_validation, tests_of, validated
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.criteria import (
     cross_validated_errors,

@@ -7,22 +7,20 @@ delay estimation for continuous-time models" (arXiv:1703.09344).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import history_of
-from ctid_cli.estimation.delay_search import SMALLEST_STEP, Descent, Limits, Minimum, descend
-from ctid_cli.estimation.filter_search import FilterPath
+from ctid_cli.estimation.delay_search import SMALLEST_STEP, Limits, Minimum, descend
+from ctid_cli.estimation.filter_search import FilterPath, path_history
 from ctid_cli.estimation.filtered_costs import percents
 from ctid_cli.estimation.redundancy import START, RedundantMinimum, SearchStatus, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.td_srivc import SrivcCost, TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.inference.fit import Fit, IterationRecord, Status
+from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.signals.record import Record
 
 
@@ -45,14 +43,6 @@ class FilteredMember(SrivcCost):
         return self._known[delay]
 
 
-class Path(NamedTuple):
-    """One run of Algorithm II without its step 3."""
-
-    round: int
-    filter: int
-    descent: Descent
-
-
 @dataclass(frozen=True, eq=False)
 class PrintedRounds:
     """Step 2 of Algorithm IV on the costs of some filters."""
@@ -67,22 +57,21 @@ class PrintedRounds:
         errors = [member.minimise(delay, np.empty((0, member.size)), True).squared_error for member in self.members]
         return float(percents(np.array(errors), np.array([member.spread for member in self.members])).mean())
 
-    def run(self, delay: float) -> tuple[RedundantMinimum[float], list[Path]]:
+    def run(self, delay: float) -> tuple[RedundantMinimum[float], list[FilterPath]]:
         """From the incumbent along every path, and on from the end of least J0, lower than before or not."""
-        visits, paths = [Visit(0, START, delay, self.reference_cost(delay), True)], []
+        visits = [Visit(0, START, delay, self.reference_cost(delay), True)]
+        paths: list[FilterPath] = []
         incumbents, status = [delay], SearchStatus.MAX_ROUNDS
         for number in range(1, self.max_rounds + 1):
-            descents = [self._descend(member, delay) for member in self.members]
-            followed = [Path(number, k, descent) for k, descent in enumerate(descents) if descent.path.size]
+            followed = self._followed(number, delay)
             if not followed:
                 raise DataError(Status.SINGULAR.value)
-            ends = [path.descent.minimum.delay for path in followed]
-            costs = [self.reference_cost(end) for end in ends]
+            costs = [self.reference_cost(path.end) for path in followed]
             least = int(np.argmin(costs))
             for i, path in enumerate(followed):
-                visits.append(Visit(number, path.filter, ends[i], costs[i], i == least))
+                visits.append(Visit(number, path.filter, path.end, costs[i], i == least))
             paths += followed
-            before, delay = delay, ends[least]
+            before, delay = delay, followed[least].end
             # |(tau_i - tau_(i-1))/tau_i| < epsilon, without the division where tau_i is zero.
             if delay == before or abs(delay - before) < self.options.tolerance * abs(delay):
                 status = SearchStatus.SETTLED
@@ -94,30 +83,17 @@ class PrintedRounds:
             incumbents.append(delay)
         return RedundantMinimum(delay, costs[least], number, status, tuple(visits)), paths
 
-    def _descend(self, member: FilteredMember, delay: float) -> Descent:
-        """Algorithm II without its step 3."""
+    def _followed(self, number: int, delay: float) -> list[FilterPath]:
+        """Algorithm II without its step 3 on the cost of each filter."""
         low, high = self.options.delay_bounds
         effort = self.options.max_iterations, self.options.tolerance
         limits = Limits(low, high, *effort, SMALLEST_STEP * (high - low), self.max_delay_step)
-        return descend(member, delay, np.empty((0, member.size)), limits)
-
-    def told(self, paths: Sequence[Path]) -> list[FilterPath]:
-        """The paths as they stand in a fit."""
-        told = []
-        for number, k, (_, path, _, _) in paths:
-            costs = percents(path[:, -1], self.members[k].spread)
-            told.append(FilterPath(number, k, path[:, -2], costs, path[:, :-2]))
-        return told
-
-    def history(self, stage: str, found: RedundantMinimum[float], paths: Sequence[Path]) -> list[IterationRecord]:
-        """The steps of the paths that led from incumbent to incumbent."""
-        taken = {(visit.round, visit.path) for visit in found.trajectory}
-        return [
-            entry
-            for number, k, descent in paths
-            if (number, k) in taken
-            for entry in history_of(stage.format(k + 1), self.members[k].problem, descent)
-        ]
+        paths = []
+        for k, member in enumerate(self.members):
+            descent = descend(member, delay, np.empty((0, member.size)), limits)
+            if descent.path.size:
+                paths.append(FilterPath(number, k, descent, member.spread, descent.minimum.delay))
+        return paths
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +108,11 @@ class PrintedSearch:
         """Step 2 over all filters, then step 3: step 2 once more with ``L(p) = 1`` for the only filter."""
         found, paths = self.filtered.run(delay)
         refined, last = self.unfiltered.run(found.point)
-        history = self.filtered.history("filter {}", found, paths)
-        history += self.unfiltered.history("refine", refined, last)
-        end = last[-1].descent._replace(iterations=found.rounds + sum(path.descent.iterations for path in last))
         problem = self.unfiltered.members[0].problem._replace(free_delay=True)
-        return self.unfiltered.options._finish(problem, end, history), found, self.filtered.told(paths)
+        history = path_history("filter {}", found, paths, problem.poles, problem.samples)
+        history += path_history("refine", refined, last, problem.poles, problem.samples)
+        end = last[-1].descent._replace(iterations=found.rounds + sum(path.descent.iterations for path in last))
+        return self.unfiltered.options._finish(problem, end, history), found, paths
 
 
 def printed_search(

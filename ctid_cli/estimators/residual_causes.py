@@ -9,7 +9,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.judging import LaidOut, Options
+from ctid_cli.estimators.measured_submodels import LaidOut, Options
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.residual_tests import SideBySide, constant, dependence, normal_tail, rest_of
 from ctid_cli.signals.record import Record

@@ -6,8 +6,7 @@ from typing import NamedTuple, TypeGuard
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold
 from ctid_cli.estimators.identification_warnings import of_treatment
-from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
 from ctid_cli.estimators.second_look import RecordLook, SecondLook
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.signals.treatment import Hold

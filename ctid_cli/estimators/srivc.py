@@ -1,18 +1,28 @@
 """Simplified refined instrumental variables for continuous-time models (SRIVC) at a known delay."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.additive_estimate import estimate_submodels
-from ctid_cli.estimation.additive_problem import AdditiveProblem, Instruments, check_closed_loop, loop_data
+from ctid_cli.estimation.additive_problem import (
+    AdditiveProblem,
+    Instruments,
+    check_closed_loop,
+    estimate_submodels,
+    loop_data,
+)
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.iteration import StepRule, Steps, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_starts
-from ctid_cli.estimation.stability import with_stable_denominator
+from ctid_cli.estimation.sampled_problem import (
+    SampledProblem,
+    at_known_delay,
+    cutoffs_of,
+    least_squares_starts,
+    with_stable_denominator,
+)
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.inference.sensitivities import Structure
@@ -26,15 +36,8 @@ from ctid_cli.signals.treatment import OutputHold
 SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
 
 
-class Iteration(NamedTuple):
-    """What is iterated on, and the record, which gives it starts."""
-
-    problem: SampledProblem | AdditiveProblem
-    record: Record
-
-
 @dataclass(frozen=True)
-class Srivc(Estimator[Iteration, Fit]):
+class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
     """SRIVC: optimal instrumental variables for a transfer function with white output noise.
 
     Parameters
@@ -125,7 +128,7 @@ class Srivc(Estimator[Iteration, Fit]):
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
-    def _lay_out(self, record: Record) -> Iteration:
+    def _lay_out(self, record: Record) -> tuple[SampledProblem | AdditiveProblem, Record]:
         loop = loop_data(record, self.instruments)
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
@@ -133,11 +136,11 @@ class Srivc(Estimator[Iteration, Fit]):
         if self.step_rule == "relaxed" or self.instruments == "closed_loop":
             # In closed loop (CLSRIVC) and where steps are relaxed it is additive SRIVC with a single submodel.
             terms = (Term(self.poles, self.zeros),)
-            return Iteration(AdditiveProblem(data, terms, self.delay, loop), record)
-        return Iteration(at_known_delay(data, structure), record)
+            return AdditiveProblem(data, terms, self.delay, loop), record
+        return at_known_delay(data, structure), record
 
-    def _estimate(self, iteration: Iteration, start: Start | None) -> Fit:
-        problem, record = iteration
+    def _estimate(self, laid_out: tuple[SampledProblem | AdditiveProblem, Record], start: Start | None) -> Fit:
+        problem, record = laid_out
         structure = Structure(self.poles, self.zeros)
         if start is not None and start.model is not None:
             return self._from(problem, given_coefficients(start.model, structure, self.delay), self.covariance)
@@ -154,26 +157,20 @@ class Srivc(Estimator[Iteration, Fit]):
 
     def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array, covariance: Covariance) -> Fit:
         """Iterate from one start."""
-        structure = Structure(self.poles, self.zeros)
         steps = Steps(self.max_iterations, self.tolerance, self.step_rule)
+        noise = covariance, self.bootstrap_draws
         if isinstance(problem, AdditiveProblem):
-            return self._as_submodel(problem, theta, structure, steps, covariance)
+            # Coefficients and covariance of a sum of one submodel are converted to the monic form.
+            single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
+            estimate = estimate_submodels(problem, AdditiveModel([single]).theta, steps)
+            additive, names = problem.model(estimate.theta), Structure(self.poles, self.zeros).names
+            values = estimate.described(*noise, unfactored_jacobian(additive, self.zeros))
+            return Fit(model=unfactored(additive), parameter_names=names, **values)
         result = iterate(problem, theta, steps)
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, [])
         history = history_of("refine", problem, result)
-        noise = covariance, self.bootstrap_draws
         return finish(problem, result.theta, result.status, result.iterations, history, *noise)
-
-    def _as_submodel(
-        self, problem: AdditiveProblem, theta: Array, structure: Structure, steps: Steps, covariance: Covariance
-    ) -> Fit:
-        """Estimate a sum of one submodel; coefficients and covariance are converted to the monic form."""
-        single = Submodel(theta[self.poles : -1], np.concatenate(([1.0], theta[: self.poles])))
-        estimate = estimate_submodels(problem, AdditiveModel([single]).theta, steps, covariance, self.bootstrap_draws)
-        additive = problem.model(estimate.theta)
-        jacobian = unfactored_jacobian(additive, self.zeros)
-        return Fit(model=unfactored(additive), parameter_names=structure.names, **estimate.values_in(jacobian))
 
 
 def given_coefficients(model: AdditiveModel, structure: Structure, delay: float) -> Array:

@@ -11,7 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay
 from ctid_cli.estimation.delay_grid import scan
 from ctid_cli.estimation.delay_search import Descent, Minimum
-from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch
+from ctid_cli.estimation.filter_search import LARGEST_STEP, LATTICE, FilterPath, FilterSearch, path_history
 from ctid_cli.estimation.filtered_costs import filtered_costs
 from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
@@ -236,7 +236,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             if found.point not in laid_out.refined:
                 laid_out.refined[found.point] = self._refine(laid_out, found.point)
             fit = laid_out.refined[found.point]
-            history = (*search.history(found, paths), *fit.history)
+            history = (*path_history("filter {}", found, paths, self.poles), *fit.history)
             fit = replace(fit, iterations=found.rounds + fit.iterations, history=history)
         values = {item.name: getattr(fit, item.name) for item in fields(Fit)}
         return RedundantFit(**values, search=found, filters=filters, paths=tuple(paths))

@@ -1,8 +1,8 @@
-r"""A continuous-time model in a loop with a discrete-time controller.
+r"""A continuous-time model in a loop with a discrete-time controller or a relay.
 
 The reference r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``. The measured
-output is ``y = x + v``, and x is the response of the model to the held input u. Everything is exact at the sampling
-instants.
+output is ``y = x + v``, and x is the response of the model to the held input u. A relay looks and switches at the
+sampling instants. Everything is exact there.
 """
 
 from typing import NamedTuple, get_args
@@ -16,7 +16,7 @@ from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
 from ctid_cli.filtering.sampled import SampledModel, sampled_model
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.record import Controller, Enters
@@ -133,3 +133,22 @@ def _require_solvable(plant: SampledModel, controller: DiscreteController) -> No
             "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
             "the gain of the controller, or give the model a delay or fewer zeros"
         )
+
+
+def simulate_relay(
+    model: AdditiveModel | TransferFunction,
+    relay: Relay,
+    reference: Array,
+    noise: Array,
+    interval: float,
+    enters: Enters = "controller",
+) -> LoopSignals:
+    """Input and noise-free output of a loop with a relay that is at rest before the first sample."""
+    plant = sampled_model(model, interval)
+    if plant.shift == 0 and plant.direct != 0.0:
+        raise DataError("a relay needs a model that does not act at once: give it a delay, or fewer zeros than poles")
+    before = float(enters == "controller")
+    u, x = kernels.relay_signals((*plant,), reference, noise, before, relay.amplitude, relay.hysteresis, relay.bias)
+    if not np.isfinite(x).all():
+        raise DataError("the signals of the loop with the relay are not finite; check the system and the reference")
+    return LoopSignals(u, x)

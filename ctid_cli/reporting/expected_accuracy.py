@@ -18,9 +18,8 @@ from ctid_cli.inference.bounds import (
     require_uncorrelated_input,
 )
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
-from ctid_cli.models.relay import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.cells import Plan
 from ctid_cli.signals.excitation import Gaussian

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, sufficient_number_of_filters
-from ctid_cli.filtering.filter_theory import convergence_region
+from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, convergence_region, sufficient_number_of_filters
 from ctid_cli.reporting.layout import Report, Table, count, number
 
 

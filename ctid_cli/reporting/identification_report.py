@@ -11,8 +11,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
-from ctid_cli.estimators.judging import Options
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.models.additive import AdditiveModel

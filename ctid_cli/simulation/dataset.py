@@ -14,8 +14,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.pid import ContinuousPid
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
@@ -141,8 +140,7 @@ class SimulatedSource:
         return DataSet(record, true_model=None if isinstance(self.system, OwnSystem) else self.system)
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
-        from ctid_cli.filtering.loop import simulate_loop
-        from ctid_cli.filtering.relay_loop import simulate_relay
+        from ctid_cli.filtering.loop import simulate_loop, simulate_relay
 
         assert not isinstance(self.system, OwnSystem)
         interval = regular_interval(times)

@@ -6,8 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.table import split_header

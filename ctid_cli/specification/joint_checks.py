@@ -12,8 +12,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.controller import Relay
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.models.relay import Relay
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, located

@@ -3,9 +3,7 @@
 from collections.abc import Iterator
 from typing import Annotated, Any, ClassVar
 
-from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.pid import ContinuousPid
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.dataset import LoopOptions
 from ctid_cli.specification.fields import Number, Swept

@@ -15,8 +15,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.estimators import judging
-from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.identification import Identification, laid_out_validation
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import Hold
@@ -138,7 +137,7 @@ class StoredFit:
 
     def _samples(self) -> dict[str, Any]:
         fit, options = self.result.fit, self.result.options
-        return judging.samples(fit, options, options.prepare(self.result.records).laid_out)._asdict()
+        return options._samples(fit, options.prepare(self.result.records).laid_out)._asdict()
 
     def _weights(self) -> dict[str, Any]:
         weighting = self._samples()["weighting"]
@@ -147,8 +146,8 @@ class StoredFit:
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None
         fit, options, record = self.result.fit, self.result.options, self.validation.record
-        laid_out = judging.laid_out_validation(options, record)
-        return {"record": record, "applied": judging.applied(fit, options, laid_out)}
+        laid_out = laid_out_validation(options, record)
+        return {"record": record, "applied": options._applied(fit, laid_out)}
 
 
 def load_fit(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.kinds import KINDS
-from ctid_cli.models.pid import ContinuousPid
+from ctid_cli.models.controller import ContinuousPid
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource
 from ctid_cli.specification.load import load_spec

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.estimation.iteration import with_best
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start
-from ctid_cli.estimation.stability import reflect_unstable
+from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, least_squares_start, reflect_unstable
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.sensitivities import Structure

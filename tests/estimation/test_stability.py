@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ctid_cli.estimation.stability import is_hurwitz, reflect_unstable, with_stable_denominator
+from ctid_cli.estimation.sampled_problem import is_hurwitz, reflect_unstable, with_stable_denominator
 
 
 @st.composite

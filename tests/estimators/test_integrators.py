@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import OptionError
-from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.fixed import Fixed
+from ctid_cli.estimation.common import Fixed, Start
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.estimators.order_search import search_orders

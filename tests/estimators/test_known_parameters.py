@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ctid_cli.estimation.fixed import Fixed
+from ctid_cli.estimation.common import Fixed
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.sampled import simulate_additive

@@ -205,7 +205,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         for entry in block:
             inputs = costs.inputs(entry.delay, costs.frequencies.size)
             a, b = np.array(entry.denominator), np.array(entry.numerator)
-            gram, _ = projected_moments(costs.frequencies, costs.outputs, inputs, weight, a, b)
+            gram, _ = projected_moments(costs.frequencies, costs.outputs, inputs, weight, a, b, 0)
             # What lies beyond 1e-6 of the greatest weight is left out.
             assert entry.cost == pytest.approx(gram[-1, -1], rel=1e-4)
         assert (np.diff([entry.cost for entry in block]) < 0).all()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.relay_loop import simulate_relay
+from ctid_cli.filtering.loop import simulate_relay
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.models.relay import Relay
+from ctid_cli.models.controller import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 

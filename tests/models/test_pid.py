@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.pid import ContinuousPid
+from ctid_cli.models.controller import ContinuousPid, DiscreteController
 
 FULL = {"kp": 2.0, "ti": 5.0, "td": 0.4, "filter_time": 0.05}
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.filtering.filter_set import FilterSet, check_filters
-from ctid_cli.filtering.filter_theory import extrema, ideal_cost
+from ctid_cli.filtering.filter_set import FilterSet, check_filters, extrema, ideal_cost
 from ctid_cli.reporting.figures.search_plot import costs_svg, landscape, trajectory_svg
 from ctid_cli.reporting.figures.style import STRIPES, outline, ramp, spread
 from ctid_cli.studies import catalogue
