@@ -5,14 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from ctid_cli.estimation.filtered_costs import filtered_costs, percents
-<<<<<<< HEAD
 from ctid_cli.estimation.iteration import Steps
-from ctid_cli.estimation.stability import reflect_unstable
-=======
-from ctid_cli.estimation.iteration import Steps, iterate
-from ctid_cli.estimation.sampled_problem import at_known_delay, reflect_unstable
-from ctid_cli.filtering.filter_data import filter_data
->>>>>>> 2c8870838c406ffaa04f00149729356737a3ac78
+from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra

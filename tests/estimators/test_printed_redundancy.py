@@ -5,12 +5,7 @@ import pytest
 
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Start
-<<<<<<< HEAD
-from ctid_cli.estimation.stability import with_stable_denominator
-=======
-from ctid_cli.estimation.redundancy import SearchStatus
 from ctid_cli.estimation.sampled_problem import with_stable_denominator
->>>>>>> 2c8870838c406ffaa04f00149729356737a3ac78
 from ctid_cli.estimators.td_srivc import INNER_ITERATIONS
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet

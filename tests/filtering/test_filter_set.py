@@ -6,12 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import integrate
 
-<<<<<<< HEAD
-from ctid_cli.filtering.filter_set import FilterSet, check_filters, sufficient_number_of_filters
-from ctid_cli.filtering.filter_theory import convergence_region, extrema, ideal_cost
-=======
 from ctid_cli.filtering.filter_set import (
-    LEAST_BETA,
     FilterSet,
     check_filters,
     convergence_region,
@@ -19,7 +14,6 @@ from ctid_cli.filtering.filter_set import (
     ideal_cost,
     sufficient_number_of_filters,
 )
->>>>>>> 2c8870838c406ffaa04f00149729356737a3ac78
 from ctid_cli.filtering.lowpass import Lowpass
 
 # The ideal filter -----------------------------------------------------------------------------------------------------
