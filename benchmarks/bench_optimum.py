@@ -29,6 +29,8 @@ from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFuncti
 from ctid_cli.signals.measurement import read_measurement
 
 TOLERANCE = 1e-6
+#: Poles whose distances, as fractions of their magnitudes, have a smaller product are left out by the peer.
+CLOSE = 3e-4
 #: Slowest pole times the record's length, and least damping, of a set that bounds nothing that matters.
 NEARLY_ZERO = 1e-6
 #: Poles and zeros tried on measured records, most of their samples, and the treatment of each: state, offset, delays.
@@ -120,10 +122,11 @@ class Peer:
 
     def residual(self, poles, delay):
         t, u = self.record.t, self.record.input
+        middle = np.exp(np.mean(np.log(np.abs(poles)))) if poles.size else 1.0
+        poles = np.append(poles, np.zeros(self.options.integrators))
         v = modal_responses(poles, u.t, u.values, t, delay, self.period)[self.use]
         columns = []
         slopes = np.array([np.prod(np.delete(p - poles, k)) for k, p in enumerate(poles)])
-        middle = np.exp(np.mean(np.log(np.abs(poles))))
         for power in range(self.options.zeros + 1):
             columns.append((v @ ((poles / middle) ** power / slopes)).real)
         used = t[self.use]
@@ -134,8 +137,10 @@ class Peer:
             columns.append(np.ones(used.size))
         phi, y = np.column_stack(columns), self.record.y[self.use]
         phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
-        if not np.isfinite(phi).all():
-            # Poles that coincide have no modal responses of their own.
+        apart = np.abs(poles[:, None] - poles) / (np.abs(poles[:, None]) + np.abs(poles) + 1e-300)
+        np.fill_diagonal(apart, 1.0)
+        if not np.isfinite(phi).all() or apart.prod(axis=1).min() < CLOSE:
+            # Poles that coincide have no modal responses of their own, and those of close ones are rounding.
             return y
         return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-13)[0]
 

@@ -17,9 +17,9 @@ from _timing import least
 import numpy as np
 from bench_srivc_iteration import CASES, noisy_record
 
-from ctid_cli.filtering.bank import modal_map, second_moments
+from ctid_cli.filtering.bank import modal_form, second_moments
 from ctid_cli.filtering.filter_data import filter_data, split_delay
-from ctid_cli.filtering.step_weights import all_weights
+from ctid_cli.filtering.kernels import step_weights
 
 REPEATS = 200
 
@@ -43,7 +43,8 @@ def reference(library, data, poles, residues, delay):
     clock = [address(data.u), address(data.y), ctypes.c_long(data.y.size)]
     if data.interval:
         shift, fraction = split_delay(delay, data.interval)
-        weights = [all_weights(poles, data.interval), all_weights(poles, data.interval * fraction)]
+        lengths = data.interval, data.interval * fraction
+        weights = [np.array([step_weights(pole, length) for pole in poles]) for length in lengths]
         late = [ctypes.c_long(shift), ctypes.c_int(fraction > 0)]
         arguments = [*clock, *late, *map(address, weights), address(residues), address(gram)]
         return lambda kept=weights: library.regular(*arguments), gram
@@ -57,7 +58,11 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for name, system, samples, interval, _ in CASES:
             a, b = system.denominator, system.numerator
-            _, poles, residues, mapping = modal_map(a, b)
+            form = modal_form(a, b)
+            poles, residues = form.poles, np.ascontiguousarray(form.residues[:, 0])
+            # The reference has the error last, and the filtered output before it.
+            size = form.mapping.shape[1]
+            order = [*range(4 * poles.size + 1), size - 1, *range(4 * poles.size + 1, size - 1)]
             library = compiled(compiler, poles.size, folder) if compiler else None
             for regular, clock in ((True, "regular"), (False, "irregular")):
                 data = filter_data(noisy_record(system, samples, interval, regular))
@@ -67,8 +72,8 @@ def main():
                         call, gram = reference(library, data, poles, residues, delay)
                         calls.append(call)
                         call()
-                        both = mapping @ np.triu(gram) @ mapping.T
-                        theirs = both + both.T - mapping @ np.diag(np.diag(gram)) @ mapping.T
+                        whole = np.triu(gram) + np.triu(gram, 1).T
+                        theirs = form.mapping @ whole[np.ix_(order, order)] @ form.mapping.T
                         np.testing.assert_allclose(theirs, calls[0](), rtol=1e-6, atol=1e-9 * np.abs(theirs).max())
                     times = 1e9 * least(REPEATS, *calls) / samples
                     others = f"{times[1]:7.1f}{times[0] / times[1]:7.2f}" if library else ""

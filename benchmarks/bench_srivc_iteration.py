@@ -4,7 +4,7 @@ from _timing import cpu
 
 import numpy as np
 
-from ctid_cli.estimation.iteration import RULES, Steps, iterate
+from ctid_cli.estimation.iteration import Steps, iterate
 from ctid_cli.estimation.sampled_problem import at_known_delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
@@ -37,7 +37,7 @@ def iteration_times(problem, theta, variant):
     """Seconds per iteration, one entry per repeat; the first, which may compile, is left out."""
     times = []
     for _ in range(REPEATS + 1):
-        seconds, result = cpu(iterate, problem, theta, Steps(ITERATIONS, 1e-300, RULES[variant]))
+        seconds, result = cpu(iterate, problem, theta, Steps(ITERATIONS, 1e-300, variant))
         times.append(seconds / ITERATIONS)
         assert result.iterations == ITERATIONS
     return np.array(times[1:])

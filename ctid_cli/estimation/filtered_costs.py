@@ -6,10 +6,10 @@ Useful redundancy over the delay: solver paths on the costs of several filters, 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import comb
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, descend
@@ -106,7 +106,7 @@ class FilteredCosts(NamedTuple):
 
         ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
         """
-        svf = comb(self.poles, np.arange(self.poles + 1)) * cutoff ** np.arange(self.poles + 1)
+        svf = np.array([comb(self.poles, k) * cutoff**k for k in range(self.poles + 1)])
         gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1), self.integrators)
         lengths = np.diag(gram)
         solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)

@@ -213,7 +213,7 @@ def shifts_of_ends(
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(covariance))
     mine = model.free[0]
-    free = np.concatenate(psi) @ law.tangent
+    free = np.concatenate([slopes @ law.tangent for slopes in psi])
     here = [
         (model.simulated(r.input, r.t)[use], model.output_slopes(r.input, r.t)[use])
         for r, use in zip(records, used, strict=True)

@@ -58,79 +58,33 @@ def search(cost, delay, starts=START, *, max_iterations=50, tolerance=1e-9, larg
     return descend(cost, delay, starts, limits)
 
 
+#: Twice the distance lands as high on the other side of the minimum, which is no fall.
+OVERSHOOTING = Artificial(lambda d: (d - 3.0) ** 2 + 1.0, lambda d: 2.0 * (3.0 - d))
+CLIFF = Artificial(lambda d: math.inf if d > 4.0 else (d - 3.0) ** 2 + 1.0, lambda d: 8.0 if d < 1.0 else 3.0 - d)
+#: The slope at 9 s and at 0 s points away from the valley.
+UP_AT_9 = Artificial(lambda d: (d - 5.0) ** 2, lambda d: 4.0 if d == 9.0 else 5.0 - d)
+DOWN_AT_0 = Artificial(lambda d: (d - 5.0) ** 2, lambda d: -4.0 if d == 0.0 else 5.0 - d)
+FAR_AT_1 = Artificial(lambda d: (d - 4.0) ** 2, lambda d: -15.0 if d == 1.0 else 4.0 - d)
+BLIND_FROM_2 = Artificial(lambda d: (d - 9.0) ** 2, lambda d: 1.0 if d < 2 else math.nan)
+NEAR = 3.0 + 0.9 * SMALLEST
+MIRROR, FEW = {"reflect": True}, {"max_iterations": 3, "largest_step": 1.0}
 #: Cost, start, options; the delays that are asked for at first, and where and how the search ends.
 SEARCHES = {
-    "Newton's step on a parabola is exact": (quadratic(3.0), 7.0, {}, [7, 3], (3, Status.CONVERGED, 1)),
+    "exact on a parabola": (quadratic(3.0), 7.0, {}, [7, 3], (3, Status.CONVERGED, 1)),
     "a cost of zero is the end": (quadratic(3.0, floor=0.0), 7.0, {}, [7, 3], (3, Status.CONVERGED, 1)),
-    # Twice the distance lands as high on the other side, which is no fall.
-    "a step that does not lower the cost is halved": (
-        Artificial(lambda d: (d - 3.0) ** 2 + 1.0, lambda d: 2.0 * (3.0 - d)),
-        5.0,
-        {},
-        [5, 1, 3],
-        (3, Status.CONVERGED, 1),
-    ),
-    "a step to where nothing can be computed is halved": (
-        Artificial(lambda d: math.inf if d > 4.0 else (d - 3.0) ** 2 + 1.0, lambda d: 8.0 if d < 1.0 else 3.0 - d),
-        0.5,
-        {},
-        [0.5, 8.5, 4.5, 2.5, 3],
-        (3, Status.CONVERGED, 2),
-    ),
+    "no lower cost: halved": (OVERSHOOTING, 5.0, {}, [5, 1, 3], (3, Status.CONVERGED, 1)),
+    "nothing can be computed: halved": (CLIFF, 0.5, {}, [0.5, 8.5, 4.5, 2.5, 3], (3, Status.CONVERGED, 2)),
     # At the bound the step shrinks to nothing without another question.
-    "a step beyond the upper bound is halved": (quadratic(17.0), 9.0, {}, [9, 10], (10, Status.CONVERGED, 1)),
-    "a step beyond the lower bound is halved": (quadratic(-7.0), 1.0, {}, [1, 0], (0, Status.CONVERGED, 1)),
-    # The slope at the start points away from the valley.
-    "a step beyond the upper bound is mirrored": (
-        Artificial(lambda d: (d - 5.0) ** 2, lambda d: 4.0 if d == 9.0 else 5.0 - d),
-        9.0,
-        {"reflect": True},
-        [9, 7, 5],
-        (5, Status.CONVERGED, 2),
-    ),
-    "a step beyond the lower bound is mirrored": (
-        Artificial(lambda d: (d - 5.0) ** 2, lambda d: -4.0 if d == 0.0 else 5.0 - d),
-        0.0,
-        {"reflect": True},
-        [0, 4, 5],
-        (5, Status.CONVERGED, 2),
-    ),
+    "beyond the upper bound: halved": (quadratic(17.0), 9.0, {}, [9, 10], (10, Status.CONVERGED, 1)),
+    "beyond the lower bound: halved": (quadratic(-7.0), 1.0, {}, [1, 0], (0, Status.CONVERGED, 1)),
+    "beyond the upper bound: mirrored": (UP_AT_9, 9.0, MIRROR, [9, 7, 5], (5, Status.CONVERGED, 2)),
+    "beyond the lower bound: mirrored": (DOWN_AT_0, 0.0, MIRROR, [0, 4, 5], (5, Status.CONVERGED, 2)),
     # Mirror images of 17 and 13 s are no better, the one of 11 s is the start.
-    "mirrored steps are halved": (
-        quadratic(17.0),
-        9.0,
-        {"reflect": True},
-        [9, 3, 7, 9, 10],
-        (10, Status.CONVERGED, 1),
-    ),
-    "a mirror image beyond the other bound is halved": (
-        Artificial(lambda d: (d - 4.0) ** 2, lambda d: -15.0 if d == 1.0 else 4.0 - d),
-        1.0,
-        {"reflect": True},
-        [1, 6.5, 4],
-        (4, Status.CONVERGED, 2),
-    ),
-    "a start within the smallest step of the minimum stays": (
-        quadratic(3.0),
-        3.0 + 0.9 * SMALLEST,
-        {},
-        [3.0 + 0.9 * SMALLEST],
-        (3.0 + 0.9 * SMALLEST, Status.CONVERGED, 0),
-    ),
-    "a delay that is not determined": (
-        Artificial(lambda d: (d - 9.0) ** 2, lambda d: 1.0 if d < 2 else math.nan),
-        0.0,
-        {},
-        [0, 1, 2],
-        (2, Status.SINGULAR, 2),
-    ),
-    "too few iterations": (
-        quadratic(9.0),
-        0.0,
-        {"max_iterations": 3, "largest_step": 1.0},
-        [0, 1, 2, 3],
-        (3, Status.MAX_ITERATIONS, 3),
-    ),
+    "mirrored in vain: halved": (quadratic(17.0), 9.0, MIRROR, [9, 3, 7, 9, 10], (10, Status.CONVERGED, 1)),
+    "mirrored beyond the other bound: halved": (FAR_AT_1, 1.0, MIRROR, [1, 6.5, 4], (4, Status.CONVERGED, 2)),
+    "within the smallest step": (quadratic(3.0), NEAR, {}, [NEAR], (NEAR, Status.CONVERGED, 0)),
+    "a delay that is not determined": (BLIND_FROM_2, 0.0, {}, [0, 1, 2], (2, Status.SINGULAR, 2)),
+    "too few iterations": (quadratic(9.0), 0.0, FEW, [0, 1, 2, 3], (3, Status.MAX_ITERATIONS, 3)),
 }
 
 

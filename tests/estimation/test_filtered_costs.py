@@ -5,9 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from ctid_cli.estimation.filtered_costs import filtered_costs, percents
-from ctid_cli.estimation.iteration import Steps, iterate
-from ctid_cli.estimation.sampled_problem import at_known_delay, reflect_unstable
-from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.estimation.iteration import Steps
+from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.filtering.spectra import lowpass_weight, record_spectra
@@ -117,21 +116,6 @@ def test_noise_free_records_give_the_true_model(model, regular, tolerance):
     assert abs(step) < 10 * tolerance
     _, power = projected_moments(*data, np.append(1.0, theta[: model.order]), theta[model.order :])
     assert squared_error < (10 * tolerance) ** 2 * power
-
-
-def test_estimate_is_that_of_the_time_domain():
-    # Same data, all frequencies: they differ by less than the estimate's own uncertainty (the time domain knows that
-    # the system starts at rest, the spectra do not).
-
-    for model, n in ((CASE_1, 4000), (CASE_2, 4500)):
-        record = make_record(model, regular=False, snr_db=15, replicate=2, n=n)
-        samples = filter_data(record, GREATEST)
-        truth = np.append(theta_of(model), 8.0)
-        direct = iterate(at_known_delay(samples, DEGREES[model]), truth, Steps(50, 1e-6, "guarded"))
-        theta, _, _ = least_cost(*spectral_data(record, np.inf, 8.0), truth[:-1], model.order, 50, 1e-6, 12)
-        variance = direct.equations.squared_error / samples.count
-        errors = np.sqrt(variance * np.diag(np.linalg.inv(direct.equations.hessian[:-1, :-1])))
-        assert np.all(np.abs(theta - direct.theta[:-1]) < errors)
 
 
 def test_initial_state_is_projected_out():

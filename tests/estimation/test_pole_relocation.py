@@ -13,7 +13,6 @@ from ctid_cli.estimation.pole_relocation import (
     residual_weights,
     spectral_lines,
 )
-from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.additive_records import FOUR_MODES, TWO_MODES, coloured_record, open_record
@@ -37,12 +36,6 @@ def test_noise_free_poles_come_out_from_a_rough_start():
         lines = spectral_lines(record, 0.0)
         found = relocate(lines, [1.3 * pole for pole in upper(TWO_MODES)], 15)
         np.testing.assert_allclose(found, upper(TWO_MODES), rtol=tolerance)
-
-
-def test_a_record_cut_out_of_a_longer_one_has_the_same_poles():
-    record = open_record(TWO_MODES, 1500, 0.0, 2)
-    late = Record(record.t[500:], record.y[500:], HeldSignal(record.t[500:], record.input.values[500:]))
-    np.testing.assert_allclose(find_poles(spectral_lines(late, 0.0), 2, 0), upper(TWO_MODES), rtol=1e-3)
 
 
 def test_settled_poles_are_a_minimum_of_the_squared_error(monkeypatch):
@@ -96,24 +89,6 @@ def test_both_noise_levels_follow_the_noise():
         # Twenty-four real numbers make one level: a standard deviation of 0.14, less where neighbours are medians.
         assert np.std(ratio) < 0.25
         assert np.ptp([np.mean(part) for part in np.array_split(ratio, 4)]) < 0.25
-
-
-def test_integrators_feed_through_and_real_poles():
-    mode, lag = Submodel([1.0], [0.025, 0.01, 1.0]), Submodel([2.0], [1.0, 1.0])
-    for others, integrators, direct in (
-        ([Submodel([0.5], [1.0], 2)], 2, False),
-        ([Submodel([0.7], [1.0])], 0, True),
-        ([], 0, False),
-    ):
-        system = AdditiveModel([mode, lag, *others], 0.09)
-        lines = spectral_lines(open_record(system, 2000, 0.0, 8, interval=0.02), 0.09, integrators, direct)
-        np.testing.assert_allclose(find_poles(lines, 1, 1), upper(system), rtol=2e-2)
-
-
-def test_a_known_delay_is_taken_out():
-    system = AdditiveModel(TWO_MODES.submodels, 0.33)
-    lines = spectral_lines(open_record(system, 1500, 0.0, 9), 0.33)
-    np.testing.assert_allclose(find_poles(lines, 2, 0), upper(TWO_MODES), rtol=2e-3)
 
 
 def test_long_records_are_searched_at_their_beginning():

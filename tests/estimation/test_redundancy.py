@@ -55,38 +55,6 @@ def test_escapes_where_every_single_cost_is_trapped(choice, start):
     assert found.status.succeeded
 
 
-def test_safely_redundant_family_converges_from_everywhere():
-    # J_k(x) = x^2 + 10 (1 - cos(w_k x)); a gradient step of 1/L never passes a stationary point of a function whose
-    # gradient is L-Lipschitz: the descent ends at the next one downhill, whatever lies beyond.
-    frequencies = (0.5, 1.0, 2.0)
-
-    def member(w):
-        return lambda x: x**2 + 10 * (1 - math.cos(w * x))
-
-    def path_of(w):
-        def path(x):
-            for _ in range(400):
-                x -= (2 * x + 10 * w * math.sin(w * x)) / (2 + 10 * w**2)
-            return [x]
-
-        return path
-
-    costs, paths = [member(w) for w in frequencies], [path_of(w) for w in frequencies]
-
-    def mean(x):
-        return sum(cost(x) for cost in costs) / len(costs)
-
-    starts = np.linspace(-15, 15, 31)
-    # The definition itself: from everywhere at least one path leads to less than a tenth of the reference cost.
-    assert all(min(mean(path(x)[0]) for path in paths) <= 0.1 * mean(x) for x in starts)
-    (trapped,) = paths[2](9.0)
-    assert trapped > 8
-    assert mean(trapped) > 50
-    for choice in CHOICES:
-        for x in starts:
-            assert minimise_redundantly(x, mean, paths, choice=choice).point == pytest.approx(0, abs=1e-3)
-
-
 def test_first_stays_on_a_path_that_improves_and_goes_on_cyclically():
     halve, stuck = (lambda x: [x / 2] if x > 30 else [x]), (lambda x: [x])
     step = lambda x: [x - 1] if x in (25.0, 24.0) else [x]  # noqa: E731

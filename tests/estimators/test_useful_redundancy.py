@@ -14,8 +14,6 @@ from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectral_kernels import projected_moments
 from ctid_cli.inference.fit import Status
-from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
 BOUNDS = (0.0, 15.0)
@@ -116,25 +114,6 @@ def test_bandwidth_is_estimated_where_it_is_not_given(regular):
 # Of the costs -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", [CASE_1, CASE_2])
-def test_all_costs_have_their_minimum_at_the_true_delay(model):
-    # Without noise, on a lattice over the bounds, fine around 8 s: within a tenth of each filter's own period. They
-    # are nearly zero there, and J0 is large everywhere else.
-    record = make_record(model, n=3000)
-    prepared = UsefulRedundancy(**options(model)).prepare(record)
-    periods, shortest = prepared.laid_out.filtered.filters.periods, prepared.laid_out.filtered.period
-    coarse = np.arange(0.0, 15.1, 1.0)
-    fine = 8.0 + 0.1 * shortest * np.arange(-8, 9)
-    costs = np.array([member_costs(prepared, delay) for delay in np.concatenate((coarse, fine))])
-    delays = np.concatenate((coarse, fine))
-    assert (np.abs(delays[np.argmin(costs, axis=0)] - 8.0) <= 0.1 * periods).all()
-    mean = costs.mean(axis=1)
-    assert abs(delays[np.argmin(mean)] - 8.0) <= 0.05 * shortest
-    assert (costs[delays == 8.0] < 2.0).all()
-    assert mean[delays == 8.0].max() < 1.0
-    assert mean[np.abs(delays - 8.0) > 2.5].min() > 10 * mean.min()
-
-
 def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bounds():
     prepared = UsefulRedundancy(**options(delay_bounds=(1.0, 9.0))).prepare(make_record(snr_db=5, n=2000))
     step = LATTICE * 2 * np.pi / BANDWIDTH[CASE_1]
@@ -206,14 +185,6 @@ def test_search_tells_how_it_went():
     assert fit.switches == search.switches
 
 
-def test_some_search_does_switch():
-    # A long way, on which one filter leads into the valley and another one on from there.
-    record = make_record(CASE_2, snr_db=5, seed=5, replicate=1, n=3000)
-    fits = [UsefulRedundancy(**options(CASE_2, max_iterations=2)).fit(record, Start(start)) for start in (0.0, 3.0)]
-    assert any(fit.switches for fit in fits)
-    assert all(abs(fit.model.delay - 8.0) < 0.01 for fit in fits)
-
-
 def test_history_leads_from_incumbent_to_incumbent(prepared):
     # Along the paths that led there, each step with its coefficients and their mean squared error behind that filter.
     fit = prepared.fit(Start(3.0))
@@ -243,6 +214,18 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
     assert fit.history[-1].delay == fit.model.delay
 
 
+def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
+    # Two filters are too few for this start: J0 is above 25 % where they end, and paths start a period away from there.
+    record = make_record(snr_db=5, seed=5, replicate=2, n=2500)
+    fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(12.0))
+    away = []
+    for path in fit.paths:
+        incumbent = [visit.point for visit in fit.search.trajectory if visit.round < path.round][-1]
+        away.append(abs(path.delays[0] - incumbent) / fit.filters.periods[path.filter])
+    assert set(np.round(away, 9)) == {0.0, 1.0}
+    assert fit.model.delay == pytest.approx(8.0, abs=0.01)
+
+
 def test_too_few_rounds_end_the_search(prepared):
     record = make_record(snr_db=5, seed=5, replicate=2)
     fit = UsefulRedundancy(**options(max_rounds=1)).fit(record, Start(3.0))
@@ -251,14 +234,6 @@ def test_too_few_rounds_end_the_search(prepared):
     longer = prepared.fit(Start(3.0))
     assert longer.search.rounds > 1
     assert longer.search.visits[: len(fit.search.visits)] == fit.search.visits
-
-
-def test_coarse_tolerance_settles_early():
-    # A round that moves the incumbent by less than a share of its delay is the last.
-    record = make_record(snr_db=5, seed=5, replicate=2)
-    fit = UsefulRedundancy(**options(tolerance=0.5)).fit(record, Start(7.0))
-    assert (fit.search.status, fit.search.rounds) == (SearchStatus.SETTLED, 1)
-    assert abs(fit.search.point - 7.0) <= 0.5 * fit.search.point
 
 
 def test_without_a_start_the_middle_of_the_bounds_is_taken(prepared):
@@ -281,52 +256,6 @@ def test_true_delay_beyond_a_bound_ends_at_the_bound(bounds):
     nearest = min(max(8.0, bounds[0]), bounds[1])
     fit = UsefulRedundancy(**options(delay_bounds=bounds)).fit(make_record(snr_db=15))
     assert (fit.model.delay, fit.status) == (nearest, Status.DELAY_AT_BOUND)
-
-
-# Units ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("seconds", "gain_u", "gain_y"), [(1e-3, 1e6, -1e-3), (3600.0, -1e-9, 1e9)])
-def test_units_do_not_matter(seconds, gain_u, gain_y):
-    # Milliseconds for seconds, or hours: the same search and the same estimate.
-    record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
-    held = HeldSignal(record.input.t * seconds, gain_u * record.input.values)
-    scaled = Record(record.t * seconds, gain_y * record.y, held)
-    more = {"bandwidth": 2.02 / seconds, "svf_cutoff": 1.0 / seconds, "delay_bounds": (0.0, 15.0 * seconds)}
-    one = UsefulRedundancy(**options()).fit(record, Start(3.0))
-    two = UsefulRedundancy(**options(**more)).fit(scaled, Start(3.0 * seconds))
-    factors = {"a1": 1 / seconds, "a2": seconds**-2, "b0": seconds**-2 * gain_y / gain_u, "delay": seconds}
-    for name, value in one.parameters.items():
-        assert two.parameters[name] == pytest.approx(factors[name] * value, rel=1e-6)
-    assert two.cost == pytest.approx(gain_y**2 * one.cost, rel=1e-6)
-    assert [v.path for v in two.search.trajectory] == [v.path for v in one.search.trajectory]
-    for before, after in zip(one.search.trajectory, two.search.trajectory, strict=True):
-        assert (after.point, after.cost) == pytest.approx((before.point * seconds, before.cost), rel=1e-4)
-
-
-# Records and models of other kinds --------------------------------------------------------------------
-
-
-def test_missing_outputs_are_estimated_around():
-    # Two holes, and a tenth of the other samples: the estimate of the plain search beside the true delay.
-    record = make_record(snr_db=15)
-    y = record.y.copy()
-    y[(record.t > 50) & (record.t < 55)] = np.nan
-    y[np.random.default_rng(0).random(y.size) < 0.1] = np.nan
-    masked = Record(record.t, y, record.input)
-    fit = UsefulRedundancy(**options()).fit(masked, Start(1.0))
-    assert_same_model(fit.model, TdSrivc(2, 0, BOUNDS).fit(masked, Start(8.1)).model, 1e-6)
-    assert fit.count == int((np.isfinite(y) & (record.t >= 15 - 1e-9)).sum())
-
-
-@pytest.mark.parametrize(("poles", "zeros"), [(2, 1), (3, 0), (3, 1)])
-def test_more_coefficients_than_the_system_has(poles, zeros):
-    # Too many: the delay makes up for what the others do, and the fit is no worse than from beside the true delay.
-    record = make_record(snr_db=15)
-    fit = UsefulRedundancy(poles, zeros, BOUNDS, bandwidth=2.02).fit(record, Start(1.0))
-    assert abs(fit.model.delay - 8.0) < 0.6
-    near = TdSrivc(poles, zeros, BOUNDS).fit(record, Start(8.0))
-    assert fit.cost <= near.cost * (1 + 1e-3)
 
 
 # Options ----------------------------------------------------------------------------------------------

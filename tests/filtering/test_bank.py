@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, modal_form, second_moments, standard_rows
+from ctid_cli.filtering.bank import second_moments, standard_rows
 from ctid_cli.filtering.filter_data import filter_data, split_delay
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
@@ -167,30 +167,6 @@ def test_poles_far_slower_than_the_sampling_lose_no_accuracy(hold, regular, slow
     assert_close(rows[:, [0, 3, 5]], np.column_stack(expected), 1e-9)
 
 
-@pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize(("system", "form"), FORMS)
-def test_zero_delay_is_no_delay(system, form, regular):
-    # Bit for bit: a delay far below the resolution of the clock, and an input moved by nothing.
-    r = record(6, regular=regular)
-    without = standard_rows(filter_data(r), *system, 0.0, form)
-    assert np.array_equal(standard_rows(filter_data(r), *system, 1e-30, form), without)
-    moved = Record(r.t, r.y, r.input.delayed(0.0))
-    assert np.array_equal(standard_rows(filter_data(moved), *system, 0.0, form), without)
-
-
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
-@pytest.mark.parametrize(("system", "form"), FORMS)
-def test_whole_intervals_of_delay_shift_the_rows_of_the_input(system, form, hold):
-    # The same numbers 17 samples later, bit for bit, but for the rows that hold y.
-    n = system[0].size - 1
-    data = filter_data(record(7, hold=hold))
-    without = standard_rows(data, *system, 0.0, form)
-    later = standard_rows(data, *system, 17 * 0.1, form)
-    input_rows = [*range(2 * n + 1), 3 * n + 2]
-    assert np.array_equal(later[17:, input_rows], without[:-17, input_rows])
-    assert not later[:17, input_rows].any()
-
-
 @pytest.mark.parametrize("interval", [0.01, 0.05, 0.1, 1 / 3])
 def test_whole_delays_are_recognised_however_long(interval):
     # k * interval / interval is k up to its own rounding, which grows with k.
@@ -212,10 +188,3 @@ def test_samples_before_the_longest_delay_are_not_used():
     assert np.array_equal(data.y_used, r.y[20:])
     later_input = Record(r.t, r.y, HeldSignal(r.t + 1.0, r.input.values))
     assert filter_data(later_input, 2.0).count == 70
-
-
-def test_partial_fractions_know_when_they_fail():
-    assert modal_form(*CASE_1).condition < MODAL_CONDITION_LIMIT
-    assert modal_form(*CASE_2).condition < MODAL_CONDITION_LIMIT
-    assert modal_form(np.poly([-1.0, -1.0]), np.ones(1)).condition == np.inf
-    assert modal_form(np.array([1.0, 1.0, 0.0]), np.ones(1)).condition == np.inf

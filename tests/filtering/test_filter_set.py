@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy import integrate
 
 from ctid_cli.filtering.filter_set import (
-    LEAST_BETA,
     FilterSet,
     check_filters,
     convergence_region,
@@ -141,16 +140,6 @@ def test_second_case(exact):
     assert gap == pytest.approx((14.2961, 14.3331), abs=1e-4)
 
 
-def test_six_filters_of_ratio_two_leave_a_gap_below_fifteen_seconds():
-    check = check_filters(FilterSet(2 * np.pi, 6, 2.0).cutoffs, 15.0)
-    (gap,) = check.gaps
-    assert gap == pytest.approx((14.0974, 14.2482), abs=1e-4)
-    assert not check.passes
-    assert check.path(14.2) == []
-    assert check.path(14.0)[-1] == (0, 0.0)
-    assert check_filters(FilterSet(2 * np.pi, 6, 2.0).cutoffs, 14.09).passes
-
-
 def test_sufficient_numbers():
     assert sufficient_number_of_filters(10, 26.85, 8) == 60
     assert sufficient_number_of_filters(10, 26.85, 15) == 114
@@ -170,18 +159,6 @@ def test_the_sufficient_number_suffices(beta, ratio):
     largest = ratio * beta
     n = sufficient_number_of_filters(beta, 2 * np.pi, largest)
     assert check_filters(FilterSet(2 * np.pi, n, beta).cutoffs, largest).passes
-
-
-@given(ratio=st.floats(0.72, 8))
-def test_the_least_ratio_belongs_to_the_approximate_extrema(ratio):
-    first, second = extrema(1.0, 2)
-    assert pytest.approx(second / first, rel=1e-14) == LEAST_BETA
-    n = sufficient_number_of_filters(LEAST_BETA, 2 * np.pi, ratio * LEAST_BETA)
-    cutoffs = FilterSet(2 * np.pi, n, LEAST_BETA).cutoffs
-    assert check_filters(cutoffs, ratio * LEAST_BETA, exact=False).passes
-    # By the true ones the shortest period's first minimum lies beyond the longest one's first maximum.
-    gaps = check_filters(cutoffs, ratio * LEAST_BETA).gaps
-    assert gaps[0][0] == pytest.approx(convergence_region(cutoffs[0], exact=True))
 
 
 @given(

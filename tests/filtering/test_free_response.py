@@ -52,26 +52,6 @@ def test_response_is_that_of_the_matrix_exponential(terms, theta):
     np.testing.assert_allclose(by_free @ free, x, atol=1e-12 * np.abs(expected).max())
 
 
-@ALL_SUMS
-def test_sensitivities_are_differences(terms, theta):
-    theta, free = np.array(theta), initial(terms)
-    _, by_theta, _ = free_response(theta, free, terms, ELAPSED)
-    assert by_theta.shape == (ELAPSED.size, theta.size)
-    for k, name in enumerate(AdditiveModel.from_theta(theta, terms).names):
-        step = 1e-5 * np.abs(theta[k]) * (np.arange(theta.size) == k)
-        above, below = (by_exponentials(theta + s * step, free, terms) for s in (1, -1))
-        expected = (above - below) / (2 * step[k])
-        np.testing.assert_allclose(by_theta[:, k], expected, atol=1e-7 * max(np.abs(expected).max(), 1e-9))
-        if "_b" in name:
-            assert not by_theta[:, k].any()
-
-
-def test_gain_has_no_free_response():
-    x, by_theta, by_free = free_response(np.array([3.0]), np.zeros(0), [Term(0, 0)], ELAPSED)
-    assert not x.any()
-    assert (by_theta.shape, by_free.shape) == ((7, 1), (7, 0))
-
-
 def test_repeated_poles_are_the_limit_of_separate_ones():
     # C/A with A = (1 + p)^2 and C = 1 + p: exp(-t).
     theta, free = np.array([2.0, 1.0, 1.0]), np.ones(2)

@@ -9,7 +9,6 @@ from scipy.linalg import expm
 from ctid_cli.filtering.realisation import (
     chain,
     exponential_minus_identity,
-    held_step,
     polynomial_roots,
     time_scale,
 )
@@ -34,14 +33,6 @@ def test_roots_of_a_product_are_its_factors(poles):
     for k in range(len(roots)):
         if roots[k].imag > 0:
             assert roots[k + 1] == roots[k].conjugate()
-
-
-@given(st.integers(1, 12), st.integers(0, 2**31))
-def test_roots_multiply_to_the_polynomial(order, seed):
-    rng = np.random.default_rng(seed)
-    coefficients = np.append(1.0, rng.uniform(0.2, 2.0, order))
-    product = np.poly(polynomial_roots(coefficients))
-    np.testing.assert_allclose(product, coefficients, atol=1e-9)
 
 
 @pytest.mark.parametrize("poles", [*POLES[:-1], [-1.0, -1.0, -1.0], [-1 + 2j, -1 - 2j, -1 + 2j, -1 - 2j]])
@@ -76,16 +67,3 @@ def test_small_exponents_keep_their_digits():
     result = exponential_minus_identity(np.diag([-1e6, -1e-9]))
     assert result[1, 1] == pytest.approx(np.expm1(-1e-9), rel=1e-13)
     assert result[0, 0] == -1.0
-
-
-@pytest.mark.parametrize("step", [1e-6, 0.3, 40.0])
-def test_held_step_of_a_first_order_system(step):
-    # z' = -2 z + 3 v with v constant, and with v rising from 0 to 1 over the step.
-    transition, from_value, from_change = held_step(np.array([[-2.0]]), np.array([3.0]), step)
-    x = 2.0 * step
-    assert transition[0, 0] == pytest.approx(np.exp(-x), rel=1e-13)
-    assert from_value[0] == pytest.approx(-1.5 * np.expm1(-x), rel=1e-13)
-    if x > 0.1:
-        assert from_change[0] == pytest.approx(1.5 * (1 + np.expm1(-x) / x), rel=1e-12)
-    else:
-        assert from_change[0] == pytest.approx(1.5 * (x / 2 - x**2 / 6), rel=1e-12)

@@ -73,15 +73,6 @@ def test_response_is_the_exact_one_whatever_the_delay(name, delay):
     assert len(matrices[0]) == sum(g.order for g in parts(model)) + int(np.ceil(delay / INTERVAL - 1e-9))
 
 
-def test_states_of_the_submodels_do_not_mix():
-    transition = sampled_model(FOUR_MODES, INTERVAL).transition
-    blocks = np.kron(np.eye(4), np.ones((2, 2)))
-    assert transition.shape == (8, 8)
-    assert not transition[blocks == 0].any()
-    poles = np.exp(INTERVAL * FOUR_MODES.poles)
-    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(transition)), np.sort_complex(poles), rtol=1e-12)
-
-
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize("name", ["four modes", "integrator with a lag", "two integrators", "biproper"])

@@ -48,19 +48,6 @@ def test_delayed_input_is_integrated_exactly(regular, hold, start):
         np.testing.assert_allclose(spectra.inputs(delay), values, rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
-def test_input_with_breaks_of_its_own(hold):
-    # Long stretches between breaks, the last of them well before the window's end: the last value stays.
-    times = np.sort(np.random.default_rng(5).uniform(0.2, 25.0, 40))
-    record = noisy_record(hold, regular=False, input_times=times)
-    spectra = record_spectra(record, 5.0, 6.0, 5.0)
-    fine = np.linspace(0, 50, 2000)
-    for delay in (0.0, 1.7, 5.0):
-        breaks = np.concatenate((times + delay, fine))
-        values = quadrature(lambda t, d=delay: record.input.at(t - d), breaks, spectra.window, spectra.frequencies)
-        np.testing.assert_allclose(spectra.inputs(delay), values, rtol=0, atol=1e-11)
-
-
 @pytest.mark.parametrize("regular", [True, False])
 def test_output_is_integrated_as_straight_lines_and_undamped(regular):
     # Ends of the window in value and slope are as they are; the rest is divided by the mean of sinc^2.
@@ -124,12 +111,6 @@ def test_without_the_mean_an_offset_has_no_effect():
     assert np.array_equal(without.outputs, full.outputs[1:])
     assert np.array_equal(without.inputs(1.1), full.inputs(1.1)[1:])
     np.testing.assert_allclose(moved.outputs, without.outputs, rtol=0, atol=1e-11)
-
-
-def test_nothing_above_half_the_sampling_frequency():
-    spectra = record_spectra(noisy_record(), 1.0, 1e6, 1.0)
-    assert 62.0 < spectra.frequencies[-1] <= np.pi / 0.05
-    assert spectra.damping.min() > 0.4
 
 
 def test_weight_is_the_squared_gain():

@@ -116,18 +116,6 @@ def test_sorting_puts_slow_submodels_first():
     assert (ordered.order_of_sorting, ordered.delay) == ((0, 1, 2, 3), 0.4)
 
 
-def test_models_never_change():
-    numerator = np.array([2.0])
-    submodel = Submodel(numerator, [1.0, 2.0])
-    numerator[0] = 9.0
-    assert submodel.numerator.tolist() == [1.0]
-    for array in (submodel.numerator, submodel.denominator):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 3.0
-    with pytest.raises(AttributeError):
-        AdditiveModel([SLOW]).delay = 1.0
-
-
 @pytest.mark.parametrize(
     ("numerator", "denominator", "message"),
     [
