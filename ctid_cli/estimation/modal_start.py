@@ -19,7 +19,7 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation import pole_relocation
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
-from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_start
+from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_starts
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.submodels import SubmodelFilter, free_response, free_response_size
 from ctid_cli.inference.sensitivities import Structure
@@ -134,20 +134,14 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
     problem = at_known_delay(data, structure)
     duration = float(data.t[-1] - data.t[0])
     fastest = 0.5 * np.pi / float(np.median(np.diff(data.t)))
-    starts: list[tuple[float, Array]] = []
-    for cutoff in np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS):
-        theta = least_squares_start(data, structure, delay, float(cutoff), refit=True)
-        if theta is not None:
-            starts.append((problem.equations(theta).squared_error, theta))
-    refined: list[tuple[float, Array]] = []
-    for _, theta in sorted(starts, key=lambda start: start[0])[:REFINED]:
-        result = iterate(problem, theta, REFINEMENT)
-        if result is not None:
-            refined.append((result.equations.squared_error, result.theta))
+    cutoffs = np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS).tolist()
+    starts = least_squares_starts(data, structure, delay, cutoffs, refit=True)
+    starts.sort(key=lambda theta: problem.equations(theta).squared_error)
+    refined = [end for theta in starts[:REFINED] if (end := iterate(problem, theta, REFINEMENT)) is not None]
     if not refined:
         return None
-    theta = min(refined, key=lambda found: found[0])[1]
-    roots = np.roots(np.concatenate(([1.0], theta[:order])))
+    best = min(refined, key=lambda end: end.equations.squared_error)
+    roots = np.roots(problem.split(best.theta)[0])
     return [complex(root) for root in roots if root.imag >= 0 and root.real < 0]
 
 
