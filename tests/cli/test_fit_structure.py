@@ -93,7 +93,7 @@ def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
 def test_an_integrator_beside_poles_needs_no_other_words(ctid, tmp_path):
     file = record(tmp_path / "one.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
     content = fitted(ctid, file, "--poles", 1, "--integrators", 1, "--out", tmp_path)
-    near(content, {"g1_a1": 0.5, "g1_b0": 1.0})
+    near(content, {"a1": 2.0, "b0": 2.0})
 
 
 @pytest.mark.parametrize(
@@ -163,10 +163,14 @@ REFUSED = {
     "a searched delay": ((*ADDITIVE, "--delay", "0:2"), "give one value, --delay VALUE"),
     "a robust loss": ((*ADDITIVE, "--loss", "huber"), "drop --loss"),
     "an estimated offset": ((*ADDITIVE, "--offset", "estimate"), "use --offset remove"),
-    "negative integrators": (("--poles", 1, "--integrators", -1), "--integrators must be 0 or more"),
+    "negative integrators": (("--poles", 1, "--integrators", -1), "--integrators must be 0 to 3"),
     "a fixed delay": (("--poles", 1, "--fix", "delay=1"), "--delay VALUE"),
     "a fixed word": (("--poles", 1, "--fix", "a1"), "NAME=VALUE"),
     "an unknown name": (("--poles", 1, "--fix", "a2=1"), "there are a1 and b0"),
+    "a mean of an integrating output": (
+        ("--poles", 1, "--integrators", 1, "--offset", "remove"),
+        "use --offset estimate",
+    ),
     "nothing left": (("--poles", 1, "--fix", "a1=1", "--fix", "b0=1"), "nothing to estimate"),
     "half a loop": (("--poles", 1, "--reference", "u"), "add --loop FILE"),
     "the other half": (("--poles", 1, "--loop", "loop.yaml"), "add --reference COLUMN"),

@@ -67,7 +67,7 @@ def test_moments_are_products_of_projected_columns(model, lowpass, keep_mean):
     data = spectral_data(make_record(model, snr_db=10, n=3000), HIGHEST[model], 7.9, lowpass, keep_mean)
     theta, n = disturbed(model), model.order
     columns, x = columns_of(data, theta, n)
-    gram, power = projected_moments(*data, np.append(1.0, theta[:n]), theta[n:])
+    gram, power = projected_moments(*data, np.append(1.0, theta[:n]), theta[n:], 0)
     scale = np.linalg.norm(columns, axis=0)
     # The lowest frequencies alone carry what lies beyond 1e-6 of the greatest weight.
     tolerance = 1e-9 if lowpass is None else 1e-5
@@ -83,7 +83,7 @@ def test_fit_is_where_scipy_ends(model, lowpass):
     # of the error on what the coefficients leave of its sensitivity.
     data = spectral_data(make_record(model, snr_db=10, regular=False, n=4000), HIGHEST[model], 8.02, lowpass)
     n, start = model.order, disturbed(model)
-    theta, squared_error, step = least_cost(*data, start, n, 100, 1e-12, 12)
+    theta, squared_error, step = least_cost(*data, start, n, 0, 100, 1e-12, 12)
     found = least_squares(
         lambda x: columns_of(data, x * start, n)[0][:, -1], np.ones(start.size), xtol=1e-15, ftol=1e-15, gtol=1e-15
     )
@@ -100,7 +100,7 @@ def test_numerator_of_the_start_is_refitted():
     theta = theta_of(CASE_2) * 1.05
     columns, _ = columns_of(data, np.append(theta[:4], [0.0, 0.0]), 4)
     expected = np.linalg.lstsq(columns[:, 4:6], columns[:, -1], rcond=None)[0]
-    refitted, _, _ = least_cost(*data, theta, 4, 0, 1e-9, 12)
+    refitted, _, _ = least_cost(*data, theta, 4, 0, 0, 1e-9, 12)
     np.testing.assert_allclose(refitted, np.append(theta[:4], expected), rtol=1e-5)
 
 
@@ -111,10 +111,10 @@ def test_numerator_of_the_start_is_refitted():
 def test_noise_free_records_give_the_true_model(model, regular, tolerance):
     n = 4500 if model is CASE_2 and not regular else None
     data = spectral_data(make_record(model, regular=regular, n=n), HIGHEST[model], 8.0)
-    theta, squared_error, step = least_cost(*data, disturbed(model), model.order, 50, 1e-6, 12)
+    theta, squared_error, step = least_cost(*data, disturbed(model), model.order, 0, 50, 1e-6, 12)
     np.testing.assert_allclose(theta, theta_of(model), rtol=tolerance)
     assert abs(step) < 10 * tolerance
-    _, power = projected_moments(*data, np.append(1.0, theta[: model.order]), theta[model.order :])
+    _, power = projected_moments(*data, np.append(1.0, theta[: model.order]), theta[model.order :], 0)
     assert squared_error < (10 * tolerance) ** 2 * power
 
 
@@ -125,7 +125,7 @@ def test_initial_state_is_projected_out():
     free = simulate(TransferFunction([1.0, 3.0], CASE_1.denominator), kick, record.t)
     assert np.abs(free[record.t > 12]).max() > 3 * np.abs(record.y).max()
     data = spectral_data(Record(record.t, record.y + free, record.input), 3.0, 8.0)
-    theta, squared_error, _ = least_cost(*data, disturbed(CASE_1), 2, 50, 1e-6, 12)
+    theta, squared_error, _ = least_cost(*data, disturbed(CASE_1), 2, 0, 50, 1e-6, 12)
     np.testing.assert_allclose(theta, theta_of(CASE_1), rtol=1e-4)
     assert squared_error < 1e-8 * np.sum(np.abs(data[1]) ** 2)
 
@@ -135,7 +135,7 @@ def test_record_cut_from_a_running_experiment():
     record = make_record(CASE_1, regular=False)
     later, edge = record.t > 60.0, record.input.t > 60.0
     cut = Record(record.t[later], record.y[later], HeldSignal(record.input.t[edge], record.input.values[edge]))
-    theta, _, _ = least_cost(*spectral_data(cut, 3.0, 8.0), disturbed(CASE_1), 2, 50, 1e-6, 12)
+    theta, _, _ = least_cost(*spectral_data(cut, 3.0, 8.0), disturbed(CASE_1), 2, 0, 50, 1e-6, 12)
     np.testing.assert_allclose(theta, theta_of(CASE_1), rtol=5e-4)
 
 
@@ -145,9 +145,9 @@ def test_units_do_not_matter(model):
     frequencies, outputs, inputs, weights = spectral_data(make_record(model, snr_db=10), HIGHEST[model], 8.0)
     n, m = model.order, model.numerator.size - 1
     scale = np.concatenate((1024.0 ** -np.arange(1.0, n + 1), 1024.0 ** -np.arange(n - m, n + 1.0) * 8.0 / 0.25))
-    theta, squared_error, step = least_cost(frequencies, outputs, inputs, weights, disturbed(model), n, 50, 1e-9, 12)
+    theta, squared_error, step = least_cost(frequencies, outputs, inputs, weights, disturbed(model), n, 0, 50, 1e-9, 12)
     scaled = frequencies / 1024, 8.0 * outputs, 0.25 * inputs, weights
-    other, its_error, its_step = least_cost(*scaled, disturbed(model) * scale, n, 50, 1e-9, 12)
+    other, its_error, its_step = least_cost(*scaled, disturbed(model) * scale, n, 0, 50, 1e-9, 12)
     np.testing.assert_allclose(other, theta * scale, rtol=1e-8)
     assert its_error == pytest.approx(64 * squared_error, rel=1e-9)
     assert its_step == pytest.approx(1024 * step, rel=1e-6)
@@ -162,7 +162,7 @@ def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
     for order in (3, 5):
         a = np.poly(np.full(order, -1.0))
         gram, power = projected_moments(
-            spectra.frequencies, spectra.outputs, spectra.inputs(1.0), np.ones(2), a, np.ones(1)
+            spectra.frequencies, spectra.outputs, spectra.inputs(1.0), np.ones(2), a, np.ones(1), 0
         )
         assert np.abs(gram).max() < 1e-12 * power
 
@@ -171,7 +171,7 @@ def test_start_that_cannot_be_computed_has_no_cost():
     data = spectral_data(make_record(CASE_1, n=1000), 3.0, 1.0)
     on_a_bin = np.array([0.0, data[0][-1] ** 2, 1.0])
     for start in (on_a_bin, theta_of(CASE_1) * np.nan, theta_of(CASE_1) * np.inf):
-        _, squared_error, step = least_cost(*data, start, 2, 50, 1e-9, 12)
+        _, squared_error, step = least_cost(*data, start, 2, 0, 50, 1e-9, 12)
         assert squared_error == np.inf
         assert np.isnan(step)
 
@@ -197,7 +197,7 @@ def test_least_cost_is_that_of_all_frequencies(model, cutoffs):
     costs = costs_of(record, model, cutoffs)
     for k, cutoff in enumerate(cutoffs):
         data = spectral_data(record, 1.5 * cutoffs[-1], 7.9, Lowpass(cutoff, 10))
-        _, expected, _ = least_cost(*data, theta_of(model), model.order, *costs.effort)
+        _, expected, _ = least_cost(*data, theta_of(model), model.order, 0, *costs.effort)
         found = costs.behind(k).minimise(7.9, np.append(theta_of(model), 0.0)[None], False)
         assert found.squared_error == pytest.approx(expected, rel=1e-5)
         assert found.delay == 7.9
