@@ -9,8 +9,8 @@ out saves. ``--costs`` keeps the least costs in a file, so that later runs with 
 
 Random systems have a regular or an irregular clock, an input of random steps or of one narrow band, and a delay that
 is known, or searched within 12 or 100 sampling intervals. The three ways to an estimate take turns: with smaller models
-and random starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to 6
-poles), and as the search for orders does (``orders``, 1 to 6). A part is left out only where it can be met.
+and random starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to
+6 poles), and as the search for orders does (``orders``, 1 to 6). A part is left out only where it can be met.
 ``--records`` adds measured records (see bench_optimum.py), ``--configs`` data sets of the useful-redundancy study.
 """
 
@@ -29,8 +29,8 @@ from scipy.optimize import least_squares
 
 from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
 from ctid_cli.estimation import profile_search
-from ctid_cli.estimation.optimum import best_model, box, ladder, search, starts
-from ctid_cli.estimation.optimum.ladder import Ladder
+from ctid_cli.estimation.optimum import best_model, box, search, starts
+from ctid_cli.estimation.optimum.best_model import Ladder
 from ctid_cli.estimation.optimum.search import Descent
 from ctid_cli.estimation.optimum.starts import Nest
 from ctid_cli.estimation.profile_refinement import Refinement
@@ -41,7 +41,7 @@ from ctid_cli.specification.load import load_spec
 CONFIGS = Path(__file__).resolve().parents[1] / "configs" / "useful_redundancy"
 TOLERANCE = 1e-6
 #: Most samples of a measured record.
-MOST = 800
+MOST = 500
 
 
 # --- problems ----------------------------------------------------------------------------------------
@@ -61,8 +61,8 @@ def random_poles(rng, count, slowest, fastest):
 
 def random_problem(rng, way):
     """An estimator and a record that it is to fit."""
-    most = 3 if way == "nested" else 6
-    n, samples, latest = int(rng.integers(1, most + 1)), int(rng.integers(300, 600)), int(rng.choice([0, 12, 100]))
+    most = int(rng.integers(1, 4)) if way == "nested" else 6
+    n, samples, latest = int(rng.integers(1, most + 1)), int(rng.integers(200, 400)), int(rng.choice([0, 12, 100]))
     m = int(rng.integers(0, min(n, 4)))
     before = 100
     steps = np.ones(samples + before) if rng.random() < 0.6 else rng.uniform(0.3, 1.7, samples + before)
@@ -105,9 +105,8 @@ def study_problems(count):
 
 def problems(asked):
     """Names, estimators, records and ways to the estimate."""
-    for number in range(asked.systems):
-        way = ("nested", "profile", "orders")[number % 3]
-        yield f"{asked.seed} {number}", *random_problem(np.random.default_rng([asked.seed, number]), way), way
+    if asked.configs:
+        yield from study_problems(2)
     for name, record in measured(asked.records) if asked.records else ():
         state, offset, delays = TREATMENTS.get(name, OTHERWISE)
         t, u, y = record.t[:MOST], record.input.values[:MOST], record.y[:MOST]
@@ -115,8 +114,9 @@ def problems(asked):
             options = DelayProfile(n, m, delays, initial_state=state, offset=offset, covariance="white")
             way = ("nested", "nested", "orders", "orders")[number]
             yield f"{name} {n}/{m}", options, Record.from_arrays(t, u, y), way
-    if asked.configs:
-        yield from study_problems(2)
+    for number in range(asked.systems):
+        way = ("nested", "profile", "orders")[number % 3]
+        yield f"{asked.seed} {number}", *random_problem(np.random.default_rng([asked.seed, number]), way), way
 
 
 def solved(options, record, way):
@@ -227,10 +227,7 @@ def variants():
         "random points": (set(), [patch.object(Nest, "random_points", nothing)]),
         "fewer poles": (
             set(),
-            [
-                otherwise(each, "least", lambda f, nest, n, m, *_, **__: f(nest, n, m, False))
-                for each in (best_model, ladder)
-            ],
+            [otherwise(best_model, "least", lambda f, nest, n, m, *_, **__: f(nest, n, m, False))],
         ),
         "coordinates at Nyquist": ({"regular"}, without_edges()),
         "stop of a crawl": ({"delay", "irregular"}, [patch.object(search, "CRAWLING", 1e300)]),
@@ -273,6 +270,7 @@ def main():
     parser.add_argument("--configs", action="store_true", help="data sets of the useful-redundancy study")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="leave out only these")
     parser.add_argument("--costs", metavar="FILE", type=Path, help="least costs of earlier runs, and of this one")
+    parser.add_argument("--seconds", type=float, default=600.0, help="CPU time after which no problem is begun")
     asked = parser.parse_args()
     chosen = {
         name: patches for name, patches in variants().items() if not asked.only or name in ["nothing", *asked.only]
@@ -280,6 +278,8 @@ def main():
     known = json.loads(asked.costs.read_text()) if asked.costs and asked.costs.exists() else {}
     costs, spent, ways, times = {}, dict.fromkeys(chosen, 0.0), {}, {}
     for name, options, record, way in problems(asked):
+        if sum(spent.values()) > asked.seconds:
+            break
         costs[name], ways[name], has = {}, way, properties(options, record, way)
         for variant, (needs, patches) in chosen.items():
             if not needs <= has:
