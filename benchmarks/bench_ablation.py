@@ -10,7 +10,8 @@ out saves. ``--costs`` keeps the least costs in a file, so that later runs with 
 Random systems have a regular or an irregular clock, an input of random steps or of one narrow band, and a delay that
 is known, or searched within 12 or 100 sampling intervals. The three ways to an estimate take turns: with smaller models
 and random starts (``nested``, 1 to 3 poles), from the minima of the profile over the delay (``profile``, at rest, 1 to
-6 poles), and as the search for orders does (``orders``, 1 to 6). A part is left out only where it can be met.
+6 poles), and as the search for orders does (``orders``, 1 to 6). A part is left out only where it can be met, and
+problems that none of the parts of ``--only`` can meet are left out.
 ``--records`` adds measured records (see bench_optimum.py), ``--configs`` data sets of the useful-redundancy study.
 """
 
@@ -280,10 +281,12 @@ def main():
     for name, options, record, way in problems(asked):
         if sum(spent.values()) > asked.seconds:
             break
-        costs[name], ways[name], has = {}, way, properties(options, record, way)
-        for variant, (needs, patches) in chosen.items():
-            if not needs <= has:
-                continue
+        has = properties(options, record, way)
+        met = {variant: patches for variant, (needs, patches) in chosen.items() if needs <= has}
+        if len(met) == 1:
+            continue
+        costs[name], ways[name] = {}, way
+        for variant, patches in met.items():
             with ExitStack() as stack:
                 for each in patches:
                     stack.enter_context(each)
