@@ -143,16 +143,6 @@ def otherwise(owner, name, changed):
     return patch.object(owner, name, lambda *given, **named: changed(original, *given, **named))
 
 
-def with_effort(**changes):
-    """Every nest with another effort."""
-
-    def built(original, nest, *given, **named):
-        original(nest, *given, **named)
-        nest.effort = nest.effort._replace(**changes)
-
-    return [otherwise(Nest, "__init__", built)]
-
-
 def without_edges():
     """Pairs at the greatest imaginary part keep the coordinates of the others."""
 
@@ -218,7 +208,6 @@ def variants():
     """What is left out: what a problem must have for that to matter, and the patches that do so."""
     return {
         "nothing": (set(), []),
-        "spine": ({"nested"}, with_effort(spine=False)),
         "poles by themselves": (set(), [otherwise(Nest, "_alone", lambda f, s, m, n: f(s, m, n) if n == 1 else [])]),
         "poles added": (set(), [patch.object(Nest, "_grown", nothing)]),
         "delays of the best start": ({"delay"}, [patch.object(Nest, "_along_delay", lambda _, __, points: points)]),
