@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.optimum.best_model import Ladder
 from ctid_cli.estimation.optimum.box import box_of
-from ctid_cli.estimation.optimum.ladder import Ladder
 from ctid_cli.estimation.optimum.starts import Nest
 from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted

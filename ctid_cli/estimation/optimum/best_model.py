@@ -14,7 +14,7 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_s
 from ctid_cli.estimation.optimum.pilot import part_of
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Judged
-from ctid_cli.estimation.optimum.starts import SAME, Nest
+from ctid_cli.estimation.optimum.starts import QUICK, SAME, Nest
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -173,6 +173,17 @@ def least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     level = max(min(errors), float(ends.min()))
     agree = int(np.count_nonzero(ends <= level * (1 + SAME) + nest.descent(zeros).floor))
     return _optimum(found[lost], lost, ends.size, agree, nest)
+
+
+class Ladder(Nest):
+    """The optima of a range of structures, each from those below it, with few starts and none at random."""
+
+    def __init__(self, nest: Nest) -> None:
+        super().__init__(nest.problem, nest.box, 0, nest.seed, effort=QUICK)
+
+    def best(self, poles: int, zeros: int) -> Optimum:
+        """The least squared error of a structure and of those with fewer poles that are in its closure."""
+        return least(self, poles, zeros, fewer_poles=True)
 
 
 def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions) -> Problem:

@@ -43,16 +43,13 @@ class Effort(NamedTuple):
     #: peak of the noise.
     alone: int
     denser: int
-    #: Whether a pole and a zero are also added at a time, from a single pole on, and whether models with as many zeros
-    #: as poles are starts although the delay is free.
-    spine: bool
     #: Up to so many poles the whole range of the delay is looked at.
     along_delay: float
 
 
 #: For one structure; and for a range of them, where each has been found from many others.
-THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, spine=True, along_delay=np.inf)
-QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, spine=False, along_delay=2)
+THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf)
+QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2)
 
 
 class Nest:
@@ -77,7 +74,6 @@ class Nest:
         self.evaluations = 0
         self._found: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
-        self._spines: dict[int, Local] = {}
         self._judged: dict[Local, Judged] = {}
 
     def descent(self, zeros: int) -> Descent:
@@ -107,23 +103,10 @@ class Nest:
             points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
         return points
 
-    def _spine(self, poles: int) -> Local:
-        """A minimum with one zero less than poles, by adding both: with a free numerator every added pole helps."""
-        if poles not in self._spines:
-            points = [] if poles > 1 else self._alone(0, 1)
-            for added in range(1, min(poles - 1, 2) + 1):
-                before = self._spine(poles - added).point
-                points += self._extended(poles - 1, before.poles, before.delay.seconds, added, self.effort.looked_at)
-            points = self._along_delay(poles - 1, points)
-            descent = self.descent(poles - 1)
-            self._spines[poles] = min(map(descent.descend, points), key=lambda local: local.squared_error)
-            self.evaluations += descent.evaluations
-        return self._spines[poles]
-
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """The best single poles, or single pairs."""
         middle = 0.5 * sum(self.box.delays)
-        if poles > 1 and not self.effort.spine:
+        if poles > 1:
             middle = self.optima(1, 0)[0].point.delay.seconds
         return self._extended(zeros, np.zeros(0, dtype=complex), middle, poles, self.effort.alone, self.effort.denser)
 
@@ -185,17 +168,15 @@ class Nest:
             return self._along_delay(
                 zeros, [point_of(np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays), self.box)]
             )
-        contained = [self._spine(poles).point] if effort.spine else []
+        contained = self._alone(zeros, poles) if poles <= 2 else []
         others: list[Point] = []
-        if poles == 2 or (poles == 1 and not effort.spine):
-            contained += self._alone(zeros, poles)
         if zeros > 0:
             contained.append(self.optima(poles, zeros - 1)[0].point)
         if poles > 1 and zeros > 0:
             # Contained in this structure whatever the added pole is, as is the one before.
             grown = self._grown(poles - 1, zeros - 1, zeros, 1)
             contained, others = contained + grown[:1], grown[1:]
-        most_zeros = int(effort.spine or not self.box.delay_free) + self.problem.integrators
+        most_zeros = int(not self.box.delay_free) + self.problem.integrators
         for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
             if n > 0 and 0 <= m < n + most_zeros:
                 others += self._grown(n, m, zeros, poles - n)
