@@ -178,7 +178,7 @@ def by_scipy(descent, start, known=(), near=search.NEAR, most_steps=search.MOST_
         low, high = [], []
         for w, alone, zeta in zip(speed, real, begin.point.damping, strict=True):
             low += [np.log(descent.box.slowest / w)] + ([] if alone else [np.log(descent.box.least_damping / zeta)])
-            high += [np.log(descent.box.fastest / w)] + ([] if alone else [np.inf])
+            high += [np.log(descent.box.fastest / w)] + ([] if alone else [10.0])
         if descent.box.delay_free:
             tau, bounds = begin.point.delay.seconds, np.array(descent.box.delays)
             low, high = (
