@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
-#: More integrators are not told apart in records.
-MOST_INTEGRATORS = 3
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
 
@@ -109,6 +107,8 @@ def _refuse_strangers(asked: Asked) -> None:
 
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
     """Refuse numbers of integrators, and what they make of a mean; a constant is estimated by another option."""
+    from ctid_cli.estimation.common import MOST_INTEGRATORS
+
     if not 0 <= integrators <= MOST_INTEGRATORS:
         raise UsageError(f"--integrators must be 0 to {MOST_INTEGRATORS}; got {integrators}")
     if integrators and offset == "remove":

@@ -74,6 +74,8 @@ def places_of(fixed: Iterable[Fixed] | None, names: Sequence[str]) -> dict[int, 
     return found
 
 
+#: More integrators are not told apart in records.
+MOST_INTEGRATORS = 3
 #: Draws without which the 95 % quantile of a bootstrap means nothing.
 LEAST_DRAWS = 40
 #: What an estimator takes from a start: an initial delay, or initial parameters.
@@ -164,7 +166,7 @@ def _require_fraction(name: str, value: float) -> None:
 
 #: Checks of the options that several estimators share, by name; None stands for an option that was not given.
 CHECKS: Mapping[str, Callable[[str, Any], None]] = {
-    "integrators": lambda name, value: require_integer(name, value, 0, 3),
+    "integrators": lambda name, value: require_integer(name, value, 0, MOST_INTEGRATORS),
     "zeros": lambda name, value: require_integer(name, value, 0),
     "delay": lambda name, value: require_not_negative(name, value, "s"),
     "svf_cutoff": lambda name, value: require_positive(name, value, "rad/s"),

@@ -28,6 +28,16 @@ from ctid_cli.signals.record import Record
 HIGHEST = 1.5
 #: Frequencies above the last one whose weight exceeds this fraction of the greatest are left out.
 NEGLIGIBLE_WEIGHT = 1e-6
+#: The search moves on a lattice of delays of this fraction of the shortest period: candidates that agree are one, and
+#: searches of the same data from different initial delays share costs and paths.
+LATTICE = 0.1
+#: The shortest Gauss-Newton step of the search, as a fraction of the shortest period.
+SMALLEST_STEP = 0.01
+#: The longest Gauss-Newton step, as a fraction of the range of the delay: from a fifth to four fifths all serve, with a
+#: tenth the paths end in small bumps far from the minimum.
+LARGEST_STEP = 1 / 3
+#: Where no path leads lower and J0 exceeds this [%], the paths start once more a period of their filter away.
+POOR = 25.0
 
 
 class FilteredCosts(NamedTuple):
@@ -164,18 +174,6 @@ def filtered_costs(
     return FilteredCosts(w, spectra.outputs, spectra.input, weights, reach, svf_cutoffs, spreads, *sizes, steps)
 
 
-#: The search moves on a lattice of delays of this fraction of the shortest period: candidates that agree are one, and
-#: searches of the same data from different initial delays share costs and paths.
-LATTICE = 0.1
-#: The shortest Gauss-Newton step of the search, as a fraction of the shortest period.
-SMALLEST_STEP = 0.01
-#: The longest Gauss-Newton step, as a fraction of the range of the delay: from a fifth to four fifths all serve, with a
-#: tenth the paths end in small bumps far from the minimum.
-LARGEST_STEP = 1 / 3
-#: Where no path leads lower and J0 exceeds this [%], the paths start once more a period of their filter away.
-POOR = 25.0
-
-
 @dataclass(frozen=True, eq=False)
 class FilterPath:
     """One solver path: Gauss-Newton on the delay with one filter."""
@@ -215,7 +213,7 @@ def path_history(
     ]
 
 
-class Minima(NamedTuple):
+class ReferenceCost(NamedTuple):
     """J0 at one delay and what it is made of."""
 
     #: Mean of the costs of all filters [%].
@@ -243,7 +241,7 @@ class FilterSearch:
         self.period = float(filters.periods[-1])
         shortest = SMALLEST_STEP * self.period
         self.limits = Limits(*bounds, max_iterations, tolerance, shortest, max_delay_step, reflect=True)
-        self._known: dict[float, Minima] = {}
+        self._known: dict[float, ReferenceCost] = {}
         self._descended: dict[tuple[int, float, bool], list[Descent]] = {}
 
     def on_lattice(self, delay: float) -> float:
@@ -251,11 +249,11 @@ class FilterSearch:
         step = LATTICE * self.period
         return min(max(round(delay / step) * step, self.limits.low), self.limits.high)
 
-    def at(self, delay: float) -> Minima:
+    def at(self, delay: float) -> ReferenceCost:
         """J0 and the minima of all filters at a point of the lattice."""
         if delay not in self._known:
             thetas, squared_errors = self.costs.minima_behind_all(delay)
-            self._known[delay] = Minima(
+            self._known[delay] = ReferenceCost(
                 float(percents(squared_errors, self.costs.spreads).mean()), thetas, squared_errors
             )
         return self._known[delay]

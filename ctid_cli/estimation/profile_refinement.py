@@ -28,6 +28,12 @@ from ctid_cli.signals.record import Record
 
 #: Random starts, so many and so many for each pole.
 RANDOM_STARTS = 2
+#: Most fits in one descent, and most of them after which the scale is taken anew.
+MOST_FITS, MOST_SCALES = 60, 20
+#: The scale has settled where it changes by less than this fraction, the descent where the loss falls by less.
+SETTLED, DONE = 1e-4, 1e-11
+#: Most searches, and the fraction by which the next one must lower the loss.
+MOST_SEARCHES, WORTHWHILE = 5, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +166,7 @@ class Refinement:
         return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
 
     def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Which numbers stand where for so many poles, integrators among them."""
+        """Layout of the parameters for a number of poles, integrators among them."""
         return replace(self.measured.layout, structure=Structure(poles, self.structure.zeros, delay))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
@@ -168,14 +174,6 @@ class Refinement:
         own = [layout.own_of(theta, k) for k in range(layout.experiments)]
         offsets = tuple(y0 + c for y0, (_, c) in zip(self.measured.offsets, own, strict=True))
         return tuple(state for state, _ in own), offsets
-
-
-#: Most fits in one descent, and most of them after which the scale is taken anew.
-MOST_FITS, MOST_SCALES = 60, 20
-#: The scale has settled where it changes by less than this fraction, the descent where the loss falls by less.
-SETTLED, DONE = 1e-4, 1e-11
-#: Most searches, and the fraction by which the next one must lower the loss.
-MOST_SEARCHES, WORTHWHILE = 5, 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,8 @@ from ctid_cli.signals.record import Record
 
 #: A root on the axis is moved off it by this fraction of the largest root: filters need strict stability.
 OFF_THE_AXIS = 1e-6
+#: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.
+CUTOFFS = (1.0, 0.2, 5.0, 0.04)
 
 
 def is_hurwitz(a: Array) -> bool:
@@ -58,10 +60,6 @@ def with_stable_denominator(theta: Array, poles: int) -> Array:
     stable = theta.copy()
     stable[:poles] = reflect_unstable(a)[1:]
     return stable
-
-
-#: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.
-CUTOFFS = (1.0, 0.2, 5.0, 0.04)
 
 
 class SampledProblem(NamedTuple):

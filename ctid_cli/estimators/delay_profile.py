@@ -351,6 +351,7 @@ def fitted(
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
     states, offsets = refinement.own(layout, theta)
+    given = _given(layout, refinement)
     return MeasuredFit(
         model=found.model,
         parameter_names=layout.names,
@@ -370,8 +371,8 @@ def fitted(
         box=found.box,
         weighting=samples.weighting,
         held_poles=tuple(found.held_poles.tolist()),
-        tangent=_tangent(layout, found, _given(layout, refinement)),
-        known=tuple(np.array(layout.names)[_given(layout, refinement)].tolist()),
+        tangent=_tangent(layout, found, given),
+        known=tuple(np.array(layout.names)[given].tolist()),
         regular=all(nearly_regular(data.t) for data in refinement.problem.records),
         **values,
     )

@@ -126,6 +126,14 @@ def modal_pass(
     return found if rows else gram
 
 
+def to_steady_state(poles: ComplexArray, period: float, states: ComplexArray) -> None:
+    """Turn what one period adds to z and w from rest into the states at both ends of a periodic input, in place."""
+    # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+    missing = -np.expm1(poles * period)
+    states[:, 0] /= missing
+    states[:, 1] = (states[:, 1] + period * (1.0 - missing) * states[:, 0]) / missing
+
+
 def modal_output(data: FilterData, modes: Modes, delay: float) -> Array:
     """Return the output of a model at all samples of a clock, shape (N,)."""
     n, x = modes.width, np.zeros(data.t.size)

@@ -486,6 +486,19 @@ def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, row
     return written + kept
 
 
+@njit(inline="always")
+def _error_row(outputs: Array, y: Array, start: int, count: int, row: Array, simulated: Array) -> None:
+    """Write the output less that of all submodels, and where it is wanted theirs."""
+    for k in range(count):
+        total = y[start + k]
+        for i in range(outputs.shape[0]):
+            total -= outputs[i, k]
+        row[k] = total
+    if simulated.size:
+        for k in range(count):
+            simulated[start + k] = y[start + k] - row[k]
+
+
 @njit(cache=True, nogil=True)
 def regular_pass(
     poles: ComplexArray,
@@ -566,14 +579,7 @@ def regular_pass(
                 double, re = source + (n if closed else w_row), residues[i, 1].real
                 for k in range(count):
                     outputs[target, k] += re * block[double, k]
-        for k in range(count):
-            total = y[start + k]
-            for i in range(submodels):
-                total -= outputs[i, k]
-            block[v_row + 1, k] = total
-        if simulated.size:
-            for k in range(count):
-                simulated[start + k] = y[start + k] - block[v_row + 1, k]
+        _error_row(outputs, y, start, count, block[v_row + 1], simulated)
         if e_row > 0:
             # What the other submodels leave of the output drives e.
             for i in range(submodels):
@@ -780,14 +786,7 @@ def irregular_pass(
             if double != 0.0:
                 for k in range(count):
                     own[k] += double * square_re[k]
-        for k in range(count):
-            total = y[start + k]
-            for i in range(submodels):
-                total -= outputs[i, k]
-            block[v_row + 1, k] = total
-        if simulated.size:
-            for k in range(count):
-                simulated[start + k] = y[start + k] - block[v_row + 1, k]
+        _error_row(outputs, y, start, count, block[v_row + 1], simulated)
         if e_row > 0:
             for i in range(submodels):
                 for k in range(count):

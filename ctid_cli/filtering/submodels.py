@@ -31,6 +31,7 @@ from ctid_cli.filtering.bank import (
     modal_form,
     modal_pass,
     standard_rows,
+    to_steady_state,
 )
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.loop import simulate_loop
@@ -237,18 +238,16 @@ class SubmodelFilter:
         # Two samples more: the last interval leads back to the first sample, where the next slope begins.
         data, delay = data._replace(u=np.concatenate((rolled, rolled[:2]))), -fraction * interval
         nothing = data._replace(use=np.zeros(count, dtype=bool))
-        decay, initial = np.exp(modes.poles * period), np.zeros((modes.poles.size, 5), np.complex128)
-        states = initial.copy()
-        modal_pass(nothing, modes, delay, states=states)
-        # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
-        initial[:, 0] = states[:, 0] / (1.0 - decay)
-        initial[:, 1] = (states[:, 1] + period * decay * initial[:, 0]) / (1.0 - decay)
+        initial = np.zeros((modes.poles.size, 5), np.complex128)
+        modal_pass(nothing, modes, delay, states=initial)
+        initial[:, 2:] = 0.0
+        to_steady_state(modes.poles, period, initial)
         # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
         # the first sample.
         states, once_round = initial.copy(), np.append(data.y, data.y[0])
         whole = nothing._replace(y=once_round, use=np.zeros(count + 1, dtype=bool))
         modal_pass(whole, modes, delay, states=states)
-        initial[:, 2] = states[:, 2] / (1.0 - decay)
+        initial[:, 2] = states[:, 2] / -np.expm1(modes.poles * period)
         return data, delay, initial
 
     def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering import kernels
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass
+from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass, to_steady_state
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
 
@@ -165,10 +165,7 @@ class Fractions:
         modes, states = self.modes, np.zeros((self.modes.poles.size, 5), complex)
         if record.once is not None:
             modal_pass(record.once, modes, record.undelayed, filter_output=False, states=states)
-            # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
-            missing = -np.expm1(modes.poles * record.period)
-            states[:, 0] /= missing
-            states[:, 1] = (states[:, 1] + record.period * (1.0 - missing) * states[:, 0]) / missing
+            to_steady_state(modes.poles, record.period, states)
         for data, delay in pieces(record.data, record.delay):
             yield modal_pass(data, modes, delay, rows=True, double=second, filter_output=False, states=states)
 

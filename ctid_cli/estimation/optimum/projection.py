@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, polynomial
+from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, order_of, polynomial
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
 
@@ -242,7 +242,7 @@ def slopes(
         forms = [triangles.form.driving(output, direct, free) for free in projected.free]
         span = Span(problem, _triangles(problem, forms, delay, True), weights_of(problem, speed, damping))
     form, columns, _, rows = span.triangles
-    n = speed.size + int(np.count_nonzero(damping >= 0.0))
+    n = order_of(damping)
     psi = np.zeros((*rows.shape[:2], n + delay_free))
     states = 2 * columns.n
     psi[:, :, :n] = rows[:, :, :states] @ form.slopes(output, direct)[:, :n]

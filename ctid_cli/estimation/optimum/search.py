@@ -26,7 +26,7 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
-#: The same for what so many steps have fallen: between the kinks of an irregular clock steps promise more than they do.
+#: The same for the fall over the last few steps: between kinks, on an irregular clock, steps promise more than they do.
 CRAWLING, REMEMBERED = 300.0, 7
 #: A step of the greatest length is another one if it differs by more than this.
 ANOTHER = 0.01

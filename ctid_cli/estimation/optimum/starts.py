@@ -39,11 +39,11 @@ class Effort(NamedTuple):
     #: How many of these are looked at, and how many of all are refined beside what the structure contains.
     looked_at: int
     refined: int
-    #: How many poles by themselves are looked at, and at so many times more frequencies: a pair has a minimum at every
-    #: peak of the noise.
+    #: How many poles by themselves are looked at, and how many times more frequencies these have: a pair has a minimum
+    #: at every peak of the noise.
     alone: int
     denser: int
-    #: Up to so many poles the whole range of the delay is looked at.
+    #: Greatest number of poles for which the whole range of the delay is looked at.
     along_delay: float
 
 
