@@ -227,8 +227,18 @@ class SubmodelEstimate(NamedTuple):
     history: History
 
     @property
+    def model(self) -> AdditiveModel:
+        """The estimate, its submodels by rising natural frequency where none of its parameters is known by name."""
+        try:
+            found = self.problem.model(self.theta)
+        except DataError as error:
+            text = "the iterations ended where the terms cannot be told apart"
+            raise DataError(f"{text}: {error} Start closer.") from None
+        return found if self.problem.fixed else found.sorted()
+
+    @property
     def order(self) -> IndexArray:
-        """Places of all parameters with submodels by rising natural frequency, where none of them is known by name."""
+        """Places of all parameters in the order of those of the model, the free response's last."""
         problem = self.problem
         if problem.fixed:
             return np.arange(self.theta.size)

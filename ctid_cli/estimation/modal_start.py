@@ -1,38 +1,45 @@
 r"""A start for the estimation of a sum of submodels, from the record alone.
 
-Several sets of poles are found in two ways: mode by mode in the spectra of the record
-(:mod:`ctid_cli.estimation.pole_relocation`), and as those of one transfer function with some poles to spare. Each set
-is shared out among the terms. For given poles the output is linear in the numerators, which least squares on the output
-error supplies; the set whose output errors are least, each band of frequencies compared with its own noise level, wins.
+Two sets of poles are found: those of one transfer function to which poles are added pair by pair, and those of a larger
+one that is fitted at once. Each set is shared out among the terms. For given poles the output is linear in the
+numerators, which least squares on the output error supplies; the set whose output errors are least, each band of
+frequencies compared with its own noise level, wins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import combinations, islice
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation import pole_relocation
+from ctid_cli.estimation.additive_problem import AdditiveProblem
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
+from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
+from ctid_cli.estimation.optimum.box import Point, box_of, point_of
+from ctid_cli.estimation.optimum.search import Descent, Local
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_starts
 from ctid_cli.filtering.filter_data import FilterData, filter_data
-from ctid_cli.filtering.submodels import SubmodelFilter, free_response, free_response_size
+from ctid_cli.filtering.submodels import OPEN_LOOP
+from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.signals.record import Record, named
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.signals.record import Record, beginning, named
 
-#: Noise levels within this factor of each other are not worth a second search with other weights.
-NEARLY_WHITE = 2.0
-#: Moves of the poles found, with the noise levels of what they leave.
-WEIGHTED_MOVES = 6
-#: Poles of the transfer function beyond those of the terms, for noise and modes that were not asked for.
+#: Of longer records these first samples are used, unless they are one period: poles need not be exact.
+LONGEST = 20_000
+#: Frequencies of an added pole or pair, and the dampings of a pair, that are tried.
+FREQUENCIES = 20
+DAMPINGS = (0.03, 0.3)
+#: They move until a step promises less than this fraction of the squared error.
+NEAR = 1e-2
+#: Poles of the larger transfer function beyond those of the terms, for noise and modes that were not asked for.
 SPARE_POLES = 2
-#: The greatest order of a transfer function that is fitted.
+#: Its greatest order.
 HIGHEST_ORDER = 12
 #: Cut-offs of the state-variable filter, how many of their estimates are refined, and steps of the refinement.
 CUTOFFS = 6
@@ -42,8 +49,6 @@ REFINEMENT = Steps(max_iterations=10, tolerance=1e-4, rule=GUARDED, halvings=4)
 MOST_ARRANGEMENTS = 24
 #: Frequencies of a periodogram that share one noise level.
 BAND = 16
-#: A free response must lower the criterion by this many times what its parameters cost in Schwarz's criterion.
-DECISIVE = 2.0
 #: A complex pair that must give two real poles gives them this factor below and above its magnitude.
 SPLIT = 1.25
 
@@ -55,7 +60,7 @@ class ModalStart(NamedTuple):
     method: str
 
 
-def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -> ModalStart:
+def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
     r"""Find a start for a sum of submodels.
 
     Sets of poles are compared by
@@ -66,64 +71,110 @@ def automatic_start(record: Record, terms: Sequence[Term], delay: float = 0.0) -
     frequencies: twice the negative logarithm of the likelihood for noise of an unknown level in each band. The plain
     output error would prefer a mode that follows a few lines of strong coloured noise to a weak one where noise is low.
 
-    Where the record clearly does not start at rest the numerators are fitted together with a free response. In closed
-    loop the measured input is taken as it is: that biases the numbers a little, which a start may be.
+    In closed loop the measured input is taken as it is: that biases the numbers a little, which a start may be.
 
     It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
     """
-    data = filter_data(record, delay)
-    fitter = _NumeratorFit(data, terms, delay)
-    best: tuple[AdditiveModel, _Fitted] | None = None
-    method = ""
-    sets = list(_pole_sets(record, fitter))
-    for way, poles in sets:
-        for groups in islice(_arrangements(poles, terms), MOST_ARRANGEMENTS):
-            fitted = fitter.fit(groups)
-            if fitted is not None and (best is None or fitted[1].criterion < best[1].criterion):
-                best, method = fitted, way
+    data = filter_data(beginning(record, LONGEST), problem.delay)
+    # One period cannot be cut.
+    own = problem.data if problem.initial_state == "periodic" else data
+    problem = replace(problem, data=own, loop=OPEN_LOOP, fixed={})
+    sets = _pole_sets(problem, data)
+    best = _best(problem, sets)
+    if best is not None and (white := _whitened(data, best.error)) is not None:
+        sets += [(f"{way}, of the record with white noise", poles) for way, poles in _pole_sets(problem, white)]
+        best = _best(problem, sets)
     if best is None:
         raise DataError(
             f"{named(record)}no start was found: {data.count} samples show no modes of the structure asked for; give "
             "the start, or take a longer record or fewer poles"
         )
-    text = f"{method}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
-    if best[1].free:
-        text += " The record does not start at rest: a free response was fitted along with the numerators."
-    return ModalStart(best[0], text)
+    text = f"{best.way}; numerators by least squares on the output error; the best of {len(sets)} sets of poles."
+    return ModalStart(best.model, text)
 
 
-def _pole_sets(record: Record, fitter: _NumeratorFit) -> Iterator[tuple[str, list[complex]]]:
+def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[tuple[str, list[complex]]]:
     """Candidates for all poles but the integrators, one of each conjugate pair, and how they were found."""
-    terms, delay = fitter.terms, fitter.delay
-    pairs, reals = sum(term.poles // 2 for term in terms), sum(term.poles % 2 for term in terms)
-    integrators = sum(term.integrators for term in terms)
-    n = 2 * pairs + reals
+    n, integrators = (sum(getattr(term, name) for term in problem.terms) for name in ("poles", "integrators"))
     if n == 0:
-        yield "No poles to be found", []
-        return
-    lines = pole_relocation.spectral_lines(record, delay, integrators, any(term.zeros == term.order for term in terms))
-    # Real and imaginary part of each line for numerators, transients and poles.
-    if lines is not None and 2 * lines.frequencies.size > 3 * n + 2 * integrators + 1:
-        yield "Poles from the spectra of the record, mode by mode", _spectral_poles(lines, pairs, reals)
-        weights = pole_relocation.local_weights(lines)
-        if weights.max() > NEARLY_WHITE * weights.min():
-            poles = _spectral_poles(lines.weighted(weights), pairs, reals)
-            yield "Poles from the spectra of the record, mode by mode, weighted by local noise levels", poles
+        return [("No poles to be found", [])]
+    search, sets = _Search(problem, data), []
+    if data.count > 2 * n + integrators:
+        sets.append(("Poles from transfer functions, added pair by pair", _upper(search.added(n))))
     order = min(n + integrators + SPARE_POLES, HIGHEST_ORDER)
-    if order >= n + integrators:
-        found = _transfer_function_poles(fitter.data, order, delay)
-        if found is not None:
-            yield f"Poles from a transfer function of order {order}", fitter.reduced(found, n)
+    found = _transfer_function_poles(data, order, problem.delay) if order >= n + integrators else None
+    if found is not None:
+        sets.append((f"Poles from a transfer function of order {order}", search.reduced(found, n)))
+    return sets
 
 
-def _spectral_poles(lines: pole_relocation.Lines, pairs: int, reals: int) -> list[complex]:
-    """Poles found with the weights of the lines, then moved with those that their residual asks for."""
-    poles = pole_relocation.find_poles(lines, pairs, reals)
-    weighted = lines.weighted(pole_relocation.residual_weights(lines, poles))
-    return pole_relocation.relocate(weighted, poles, WEIGHTED_MOVES)
+def _whitened(data: FilterData, error: Array) -> FilterData | None:
+    """The record filtered so that noise like an output error is white; None where it is, or lags are not in time."""
+    gaps = not data.use[np.argmax(data.use) :].all()
+    if data.interval == 0.0 or not data.common_clock or gaps:
+        return None
+    noise = fit_noise_model([error])
+    if noise.order == 0:
+        return None
+    return data._replace(y=noise.innovations(data.y), u=noise.innovations(data.u))
 
 
 # --- poles of one transfer function ----------------------------------------------------------------
+
+
+class _Search:
+    """Transfer functions with the integrators of a sum; their numerators and initial states are eliminated."""
+
+    def __init__(self, problem: AdditiveProblem, data: FilterData) -> None:
+        terms, delays = problem.terms, (problem.delay, problem.delay)
+        self.integrators = sum(term.integrators for term in terms)
+        self.direct = any(term.zeros == term.order for term in terms)
+        # Of one period the state at the first sample is unknown, too.
+        unknown = problem.initial_state != "rest"
+        options = SearchOptions(delays, free_response=unknown, integrators=self.integrators)
+        self.problem = problem_of([data], 0, options)
+        self.box = box_of(self.problem, delays)
+
+    def descent(self, poles: int) -> Descent:
+        """Searches with that number of poles besides the integrators, and a full numerator."""
+        return Descent(self.problem._replace(zeros=poles + self.integrators - 1 + self.direct), self.box)
+
+    def point(self, poles: Sequence[complex] | ComplexArray) -> Point:
+        """Poles with their conjugates, moved into the set that is searched."""
+        return point_of(np.array(poles, dtype=complex), self.box.delays[0], self.box)
+
+    def added(self, count: int) -> ComplexArray:
+        """The poles of the least squared error, two at a time: whatever there is already moves along."""
+        poles = np.zeros(0, dtype=complex)
+        frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1]
+        while poles.size < count:
+            single = poles.size == count - 1
+            descent = self.descent(poles.size + 2 - single)
+            ends: list[Local] = []
+            for zeta in (1.0,) if single else DAMPINGS:
+                pole = complex(-zeta, np.sqrt(1.0 - zeta**2))
+                new = frequencies[:, None] * ([pole] if single else [pole, pole.conjugate()])
+                trials = descent.sorted([self.point(np.concatenate((poles, own))) for own in new])
+                ends.append(descent.descend(trials[0], ends, NEAR))
+            poles = min(ends, key=lambda end: end.squared_error).point.poles
+        return poles
+
+    def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
+        """The ``count`` poles of the least squared error among given ones, of which one of each pair is listed."""
+        kept = [
+            list(chosen)
+            for number in range(count // 2, count + 1)
+            for chosen in combinations(poles, number)
+            if _size(chosen) == count
+        ]
+        if not kept:
+            if _size(poles) <= count:
+                return list(poles)
+            # One pole too many and only pairs: the best damped one makes room for a real pole.
+            pole = max(poles, key=_damping)
+            return self.reduced([other for other in poles if other != pole] + [complex(-abs(pole))], count)
+        both = [[*chosen, *(pole.conjugate() for pole in chosen if pole.imag)] for chosen in kept]
+        return kept[int(np.argmin(self.descent(count).squared_errors([self.point(each) for each in both])))]
 
 
 def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list[complex] | None:
@@ -141,8 +192,13 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
     if not refined:
         return None
     best = min(refined, key=lambda end: end.equations.squared_error)
-    roots = np.roots(problem.split(best.theta)[0])
-    return [complex(root) for root in roots if root.imag >= 0 and root.real < 0]
+    roots = np.roots(problem.split(best.theta)[0]).astype(complex)
+    return [pole for pole in _upper(roots) if pole.real < 0]
+
+
+def _upper(poles: ComplexArray) -> list[complex]:
+    """The real poles and one of each pair."""
+    return [complex(pole) for pole in poles if pole.imag >= 0]
 
 
 # --- poles to terms --------------------------------------------------------------------------------
@@ -151,6 +207,11 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
 def _size(poles: Sequence[complex]) -> int:
     """Number of poles, conjugates counted."""
     return sum(2 if pole.imag else 1 for pole in poles)
+
+
+def _damping(pole: complex) -> float:
+    """Damping ratio [-]."""
+    return -pole.real / abs(pole)
 
 
 def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
@@ -194,7 +255,7 @@ def _with_room(poles: Sequence[complex], room: int) -> tuple[list[complex], list
     reals = [pole for pole in poles if not pole.imag]
     while len(pairs) > room:
         # The best damped pair is nearest to two real poles.
-        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
+        pole = pairs.pop(int(np.argmax([_damping(pole) for pole in pairs])))
         reals += [complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)]
     return pairs, sorted(reals, key=abs)
 
@@ -212,134 +273,50 @@ def _distinct_orders(terms: Sequence[Term], left: Sequence[int]) -> Iterator[lis
 
 
 class _Fitted(NamedTuple):
-    """Fitted numerators, what they are judged by, and whether a free response was fitted too."""
+    """A model with fitted numerators, its output error, its J, and how its poles were found."""
 
-    gains: Array
+    model: AdditiveModel
+    error: Array
     criterion: float
-    squared_error: float
-    free: bool
+    way: str
 
 
-class _NumeratorFit:
-    """Numerators for given poles, by linear least squares on the output error."""
-
-    def __init__(self, data: FilterData, terms: Sequence[Term], delay: float) -> None:
-        self.data, self.terms, self.delay = data, tuple(terms), delay
-
-    def fit(self, groups: Sequence[Sequence[complex]]) -> tuple[AdditiveModel, _Fitted] | None:
-        """Fit with given poles of each term; None where they give no valid model or no finite response."""
-        responses = _responses(self.data, groups, self.terms, self.delay)
-        found = None if responses is None else responses.fit(self.data.y_used)
-        if responses is None or found is None:
-            return None
-        theta = responses.theta
-        theta[_numerator_places(self.terms)] = found.gains
-        return AdditiveModel.from_theta(theta, self.terms, self.delay), found
-
-    def _without_poles(self) -> list[Term]:
-        """What stands beside the modes: the integrators, and a direct feedthrough."""
-        integrators = sum(term.integrators for term in self.terms)
-        found = [Term(0, integrators - 1, integrators)] if integrators else []
-        return [*found, Term(0, 0)] if any(term.zeros == term.order for term in self.terms) else found
-
-    def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
-        """The poles without which the output error would rise most, in all ``count``, conjugates counted."""
-        kept, others = list(poles), self._without_poles()
-        terms = [Term(2, 1) if pole.imag else Term(1, 0) for pole in kept] + others
-        groups = [[pole] for pole in kept] + [[] for _ in others]
-        responses = _responses(self.data, groups, terms, self.delay)
-        places = list(range(len(kept)))
-
-        def squared_error(left_out: int) -> float:
-            used = [*range(len(kept), len(terms)), *(k for k in places if k != left_out)]
-            found = None if responses is None else responses.of(used).fit(self.data.y_used)
-            return np.inf if found is None else found.squared_error
-
-        while (size := _size([kept[k] for k in places])) > count:
-            possible = [k for k in places if size - _size([kept[k]]) >= count]
-            if possible:
-                places.remove(min(possible, key=squared_error))
-            else:
-                # One pole too many and only pairs: the best damped one makes room for a real pole.
-                k = max(places, key=lambda k: -kept[k].real / abs(kept[k]))
-                kept[k] = complex(-abs(kept[k]))
-        return [kept[k] for k in places]
+def _best(problem: AdditiveProblem, sets: Sequence[tuple[str, list[complex]]]) -> _Fitted | None:
+    """The fit of least J with the poles of one of several sets, shared out among the terms."""
+    found = [
+        fitted
+        for way, poles in sets
+        for groups in islice(_arrangements(poles, problem.terms), MOST_ARRANGEMENTS)
+        if (fitted := _with_numerators(problem, groups, way)) is not None
+    ]
+    return min(found, key=lambda fitted: fitted.criterion, default=None)
 
 
-@dataclass(frozen=True, eq=False)
-class _Responses:
-    """What each numerator coefficient and each initial condition contributes to the output, and whose they are."""
-
-    #: Of the model whose responses they are.
-    theta: Array
-    forced: Array
-    free: Array
-    forced_owner: IndexArray
-    free_owner: IndexArray
-
-    def of(self, owners: Sequence[int]) -> _Responses:
-        """Those of some submodels."""
-        forced, free = np.isin(self.forced_owner, owners), np.isin(self.free_owner, owners)
-        own = self.forced[:, forced], self.free[:, free], self.forced_owner[forced], self.free_owner[free]
-        return _Responses(self.theta, *own)
-
-    def fit(self, y: Array) -> _Fitted | None:
-        """Numerators, with free responses where they are worth their parameters; None if all is singular."""
-        best: _Fitted | None = None
-        for free, columns in ((False, self.forced), (True, np.hstack((self.forced, self.free)))):
-            gram = columns.T @ columns
-            scales = np.diag(gram).copy()
-            solved, solution = solve_scaled(gram, columns.T @ y, scales, scales, scales.size)
-            if not solved or y.size <= scales.size:
-                continue
-            error = y - columns @ solution
-            criterion = _criterion(error) + DECISIVE * free * self.free.shape[1] * np.log(y.size)
-            if best is None or criterion < best.criterion:
-                best = _Fitted(solution[: self.forced.shape[1]], criterion, float(error @ error), free)
-        return best
-
-
-def _responses(
-    data: FilterData, groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float
-) -> _Responses | None:
-    """Responses of submodels with given poles; None where they give no valid model or one is not finite."""
-    try:
-        theta = _with_poles(groups, terms, delay).theta
-    except DataError:
-        return None
-    rows = SubmodelFilter(data, terms, delay).rows(theta)
+def _with_numerators(problem: AdditiveProblem, groups: Sequence[Sequence[complex]], way: str) -> _Fitted | None:
+    """The model with given poles of each term; None where they give no valid model or no finite response."""
+    theta, free = np.zeros(problem.free), np.ones(problem.free, dtype=bool)
+    first = 0
+    for poles, term in zip(groups, problem.terms, strict=True):
+        monic = np.atleast_1d(np.real(np.poly([*poles, *(pole.conjugate() for pole in poles if pole.imag)])))
+        own = slice(first, first + term.poles)
+        theta[own], free[own] = monic[-2::-1] / monic[-1], False
+        first += term.size
+    rows = problem.rows(theta)
     if rows is None or not np.isfinite(rows[0]).all():
         return None
-    # Before the delayed input begins, which is where used samples do, nothing is known of the state.
-    elapsed = np.maximum(data.t - data.t[data.use][0], 0.0)
-    response = free_response(theta, np.zeros(free_response_size(terms)), terms, elapsed)
-    if response is None:
+    # With all of them zero the output error is what numerators and free response have to explain.
+    columns, error = rows[0][:, free], rows[1]
+    gram = columns.T @ columns
+    scales = np.diag(gram).copy()
+    solved, theta[free] = solve_scaled(gram, columns.T @ error, scales, scales, scales.size)
+    if not solved:
         return None
-    return _Responses(
-        theta,
-        rows[0][:, _numerator_places(terms)],
-        response[2][data.use],
-        np.repeat(np.arange(len(terms)), [term.zeros + 1 for term in terms]),
-        np.repeat(np.arange(len(terms)), [term.order for term in terms]),
-    )
-
-
-def _with_poles(groups: Sequence[Sequence[complex]], terms: Sequence[Term], delay: float) -> AdditiveModel:
-    """Model with given poles and numerators 1; DataError if two terms share a pole."""
-    submodels = []
-    for poles, term in zip(groups, terms, strict=True):
-        conjugates = [pole.conjugate() for pole in poles if pole.imag]
-        denominator = np.real(np.poly([*poles, *conjugates])) if poles else np.ones(1)
-        numerator = np.zeros(term.zeros + 1)
-        numerator[-1] = denominator[-1]
-        submodels.append(Submodel(numerator, denominator, term.integrators))
-    return AdditiveModel(submodels, delay)
-
-
-def _numerator_places(terms: Sequence[Term]) -> IndexArray:
-    """Places of the numerators' coefficients in theta."""
-    flags = [k >= term.poles for term in terms for k in range(term.size)]
-    return np.flatnonzero(flags)
+    try:
+        model = problem.model(theta)
+    except DataError:
+        return None
+    left = error - columns @ theta[free]
+    return _Fitted(model, left, _criterion(left), way)
 
 
 def _criterion(error: Array) -> float:

@@ -209,46 +209,30 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         return Submodels(record, problem)
 
     def _estimate(self, laid_out: Submodels, start: Start | None) -> AdditiveFit:
-        if start is not None and start.model is not None:
-            model, method = start.model, "The start was given."
-            if model.terms != self.terms:
-                raise DataError(f"the start has the submodels {model.terms} and the estimator {self.terms}")
-        else:
-            model, method = laid_out.start
-        problem, model = in_one_order(laid_out.problem, model)
-        return self._fit(self._iterate(problem, model), model, method)
+        start_model, method = laid_out.started(start)
+        estimate = self._iterate(laid_out.problem, start_model)
+        problem, model = estimate.problem, estimate.model
+        order = estimate.order[: problem.size]
+        return AdditiveFit(
+            model=unfactored(model),
+            parameter_names=model.names,
+            additive=model,
+            start=start_model,
+            start_method=method,
+            loop_radius=problem.loop_radius(model),
+            **estimate.described(self.covariance, self.bootstrap_draws, np.eye(problem.size)[order]),
+        )
 
     def _iterate(self, problem: AdditiveProblem, start: AdditiveModel) -> SubmodelEstimate:
         """Estimate from a start."""
         steps = Steps(self.max_iterations, self.tolerance, self.variant)
         if not problem.fixed:
-            return estimate_submodels(problem, start.theta, steps)
+            return estimate_submodels(replace(problem, terms=start.terms), start.theta, steps)
         # From the start, and from what all parameters together would be.
         free = estimate_submodels(replace(problem, fixed={}), start.theta, steps).theta[: problem.size]
         near = [_nearest(theta, self.terms, problem.fixed) for theta in (free, start.theta)]
         found = [estimate_submodels(problem, theta, steps) for theta in near]
         return min(found, key=lambda one: one.equations.squared_error)
-
-    def _fit(self, estimate: SubmodelEstimate, start: AdditiveModel, method: str) -> AdditiveFit:
-        """The result, with submodels by rising natural frequency."""
-        problem = estimate.problem
-        try:
-            model = problem.model(estimate.theta)
-        except DataError as error:
-            text = "the iterations ended where the terms cannot be told apart"
-            raise DataError(f"{text}: {error} Start closer.") from None
-        # Known parameters have names, so that submodels stay where they are.
-        ordered = model if problem.fixed else model.sorted()
-        order = estimate.order[: problem.size]
-        return AdditiveFit(
-            model=unfactored(ordered),
-            parameter_names=ordered.names,
-            additive=ordered,
-            start=start,
-            start_method=method,
-            loop_radius=problem.loop_radius(model),
-            **estimate.described(self.covariance, self.bootstrap_draws, np.eye(problem.size)[order]),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +245,18 @@ class Submodels:
     @cached_property
     def start(self) -> ModalStart:
         """Found once, from the record alone."""
-        return automatic_start(self.record, self.problem.terms, self.problem.delay)
+        return automatic_start(self.record, self.problem)
+
+    def started(self, given: Start | None) -> ModalStart:
+        """The start, given or found.
+
+        Its submodels rise in natural frequency, so that sums of submodels round the same in whatever order they were
+        given. Where parameters are known by name, submodels stay.
+        """
+        found = self.start if given is None or given.model is None else ModalStart(given.model, "The start was given.")
+        if found.model.terms != self.problem.terms:
+            raise DataError(f"the start has the submodels {found.model.terms} and the estimator {self.problem.terms}")
+        return found if self.problem.fixed else found._replace(model=found.model.sorted())
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:
@@ -273,16 +268,6 @@ def check_terms(terms: tuple[Term, ...]) -> None:
     order = sum(term.order for term in terms)
     if order > 40:
         raise OptionError("terms", f"terms have {order} poles together; at most 40 are supported")
-
-
-def in_one_order(problem: AdditiveProblem, start: AdditiveModel) -> tuple[AdditiveProblem, AdditiveModel]:
-    """A problem and its start with submodels by rising natural frequency: sums of submodels then round the same in
-    whatever order they were given. Where parameters are known by name, submodels stay.
-    """
-    if problem.fixed:
-        return problem, start
-    ordered = start.sorted()
-    return problem if ordered.terms == problem.terms else replace(problem, terms=ordered.terms), ordered
 
 
 def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) -> Array:

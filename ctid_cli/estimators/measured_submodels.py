@@ -14,10 +14,10 @@ from ctid_cli.estimation.additive_problem import Instruments
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import without_means
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
-from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels, in_one_order
+from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
-from ctid_cli.filtering.submodels import OPEN_LOOP, free_response
+from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
@@ -71,30 +71,17 @@ class LaidOutSubmodels(Submodels):
         """The record, without the means that were subtracted."""
         return [self.record]
 
-    def free_columns(self, theta: Array) -> Array:
-        """Free responses of a model at the used samples, a column for each of their coefficients."""
-        problem, data = self.problem, self.problem.data
-        size = sum(term.order for term in problem.terms)
-        found = free_response(theta[: problem.size], np.zeros(size), problem.terms, data.t - data.t[0])
-        return np.zeros((data.count, 0)) if found is None else found[2][data.use]
-
-    def errors_of(self, theta: Array, estimated: bool) -> AppliedModel:
+    def errors_of(self, theta: Array) -> AppliedModel:
         """Errors of a given model, with its own best initial state if that is estimated."""
         problem = self.problem
-        # A free response is projected out below.
-        alone = replace(problem, initial_state="rest") if problem.initial_state == "estimated" else problem
-        rows = alone.filter.rows(theta[: problem.size])
+        rows = problem.rows(np.concatenate((theta, np.zeros(problem.filter.free))))
         if rows is None:
             raise DataError(f"{named(self.record)}the response of the model is not finite on this record")
-        error: Array = np.asarray(rows[2], dtype=float)
-        state: Array = np.zeros(0)
-        psi: Array = np.asarray(rows[0], dtype=float)
-        if estimated:
-            columns = self.free_columns(theta)
-            psi = np.column_stack((psi, columns))
-            state = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
-            error = np.asarray(error - columns @ state, dtype=float)
-        return AppliedModel((error,), (used_samples(problem.data, self.record),), (state,), (self.offset,), (psi,))
+        psi, error = rows
+        columns = psi[:, problem.size :]
+        state: Array = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
+        used = used_samples(problem.data, self.record)
+        return AppliedModel((error - columns @ state,), (used,), (state,), (self.offset,), (psi,))
 
 
 @dataclass(frozen=True)
@@ -188,11 +175,9 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return LaidOutSubmodels(record, self.estimator._lay_out(record).problem, u0, y0)
 
     def _estimate(self, laid_out: LaidOutSubmodels, start: Start | None) -> SubmodelsFit:
-        model, method = laid_out.start
-        if start is not None and start.model is not None:
-            model, method = start.model, "The start was given."
-        problem, model = in_one_order(laid_out.problem, model)
-        found = self.estimator._iterate(problem, model)
+        model, method = laid_out.started(start)
+        found = self.estimator._iterate(laid_out.problem, model)
+        problem = found.problem
         y, equations = problem.data.y_used, found.equations
         if not np.isfinite(equations.squared_error):
             raise DataError(
@@ -201,14 +186,13 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             )
         order = found.order if self.factored else np.arange(found.theta.size)
         theta = found.theta[order]
-        ordered = problem.model(found.theta) if self.fixed else problem.model(found.theta).sorted()
+        ordered = found.model
         names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
         if not self.factored:
             size, structure = problem.size, Structure(self.poles, self.zeros)
             whole = unfactored(ordered)
             theta = np.concatenate((whole.denominator[1:], _padded(whole.numerator, self.zeros + 1), theta[size:]))
             names = (*structure.names, *names[size:])
-        fixed = np.isin(order, list(problem.fixed))
         fit = SubmodelsFit(
             model=unfactored(ordered),
             parameter_names=names,
@@ -219,9 +203,9 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             initial_states=(theta[problem.size :],),
             offsets=(laid_out.offset,),
             input_offsets=(laid_out.input_offset,),
-            tangent=np.delete(np.eye(theta.size), np.flatnonzero(fixed), axis=1),
+            tangent=problem.tangent,
             regular=problem.data.interval > 0.0,
-            known=tuple(names[k] for k in np.flatnonzero(fixed)),
+            known=tuple(names[k] for k in problem.fixed),
             additive=ordered if self.factored else None,
             start_method=method,
             loop_radius=problem.loop_radius(ordered),
@@ -249,21 +233,21 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """What a fit says of each used sample, from its parameters; of a monic fraction by its coefficients."""
         model, problem = self._factors(fit), laid_out.problem
-        ordered = replace(problem, terms=model.terms)
-        rows = ordered.filter.rows(np.concatenate((model.theta, fit.initial_states[0])))
+        rows = replace(problem, terms=model.terms).rows(np.concatenate((model.theta, fit.initial_states[0])))
         assert rows is not None
-        psi, size = rows[0], ordered.size
+        psi, error = rows
         if not self.factored:
             jacobian = unfactored_jacobian(model, self.zeros)
+            size = problem.size
             psi = np.column_stack((psi[:, :size] @ np.linalg.inv(jacobian), psi[:, size:]))
-        return FittedSamples((rows[2],), (psi,), (used_samples(problem.data, laid_out.record),), None)
+        return FittedSamples((error,), (psi,), (used_samples(problem.data, laid_out.record),), None)
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
         """The model on another record."""
         model = self._factors(fit)
         open_loop = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP)
         alone: LaidOutSubmodels = replace(laid_out, problem=open_loop)
-        return alone.errors_of(model.theta, self.initial_state == "estimate")
+        return alone.errors_of(model.theta)
 
     def _lowered(self, fit: MeasuredFit, laid_out: Any) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
@@ -278,7 +262,10 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         found = {}
         model = self._factors(fit)
         if self.initial_state == "rest":
-            found["initial_state"] = left(laid_out.free_columns(model.theta))
+            free = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP, initial_state="estimated")
+            rows = free.rows(np.concatenate((model.theta, np.zeros(free.filter.free))))
+            assert rows is not None
+            found["initial_state"] = left(rows[0][:, free.size :])
         if self.offset == "none":
             found["offset"] = left(np.ones((error.size, 1)))
         return found
