@@ -35,8 +35,6 @@ LONGEST = 20_000
 #: Frequencies of an added pole or pair, and the dampings of a pair, that are tried.
 FREQUENCIES = 20
 DAMPINGS = (0.03, 0.3)
-#: They move until a step promises less than this fraction of the squared error.
-NEAR = 1e-2
 #: Poles of the larger transfer function beyond those of the terms, for noise and modes that were not asked for.
 SPARE_POLES = 2
 #: Its greatest order.
@@ -51,6 +49,11 @@ MOST_ARRANGEMENTS = 24
 BAND = 16
 #: A complex pair that must give two real poles gives them this factor below and above its magnitude.
 SPLIT = 1.25
+
+
+#: How poles were found, and the real ones and one of each pair.
+PoleSet = tuple[str, list[complex]]
+ADDED = "Poles from transfer functions, added pair by pair"
 
 
 class ModalStart(NamedTuple):
@@ -81,8 +84,9 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
     problem = replace(problem, data=own, loop=OPEN_LOOP, fixed={})
     sets = _pole_sets(problem, data)
     best = _best(problem, sets)
-    if best is not None and (white := _whitened(data, best.error)) is not None:
-        sets += [(f"{way}, of the record with white noise", poles) for way, poles in _pole_sets(problem, white)]
+    white = None if best is None else _whitened(data, best.error)
+    if white is not None:
+        sets.append((f"{ADDED}, of the record with white noise", _Search(problem, white).added()))
         best = _best(problem, sets)
     if best is None:
         raise DataError(
@@ -93,18 +97,18 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
     return ModalStart(best.model, text)
 
 
-def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[tuple[str, list[complex]]]:
-    """Candidates for all poles but the integrators, one of each conjugate pair, and how they were found."""
-    n, integrators = (sum(getattr(term, name) for term in problem.terms) for name in ("poles", "integrators"))
-    if n == 0:
+def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[PoleSet]:
+    """How poles were found, and all of them but the integrators, one of each conjugate pair."""
+    search = _Search(problem, data)
+    if search.poles == 0:
         return [("No poles to be found", [])]
-    search, sets = _Search(problem, data), []
-    if data.count > 2 * n + integrators:
-        sets.append(("Poles from transfer functions, added pair by pair", _upper(search.added(n))))
-    order = min(n + integrators + SPARE_POLES, HIGHEST_ORDER)
-    found = _transfer_function_poles(data, order, problem.delay) if order >= n + integrators else None
+    sets, whole = list[PoleSet](), search.poles + search.integrators
+    if data.count > whole + search.poles:
+        sets.append((ADDED, search.added()))
+    order = min(whole + SPARE_POLES, HIGHEST_ORDER)
+    found = _transfer_function_poles(data, order, problem.delay) if order >= whole else None
     if found is not None:
-        sets.append((f"Poles from a transfer function of order {order}", search.reduced(found, n)))
+        sets.append((f"Poles from a transfer function of order {order}", search.reduced(found)))
     return sets
 
 
@@ -123,11 +127,11 @@ def _whitened(data: FilterData, error: Array) -> FilterData | None:
 
 
 class _Search:
-    """Transfer functions with the integrators of a sum; their numerators and initial states are eliminated."""
+    """Transfer functions with the poles of a sum; their numerators and initial states are eliminated."""
 
     def __init__(self, problem: AdditiveProblem, data: FilterData) -> None:
         terms, delays = problem.terms, (problem.delay, problem.delay)
-        self.integrators = sum(term.integrators for term in terms)
+        self.poles, self.integrators = sum(term.poles for term in terms), sum(term.integrators for term in terms)
         self.direct = any(term.zeros == term.order for term in terms)
         # Of one period the state at the first sample is unknown, too.
         unknown = problem.initial_state != "rest"
@@ -143,38 +147,39 @@ class _Search:
         """Poles with their conjugates, moved into the set that is searched."""
         return point_of(np.array(poles, dtype=complex), self.box.delays[0], self.box)
 
-    def added(self, count: int) -> ComplexArray:
+    def added(self) -> list[complex]:
         """The poles of the least squared error, two at a time: whatever there is already moves along."""
         poles = np.zeros(0, dtype=complex)
         frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1]
-        while poles.size < count:
-            single = poles.size == count - 1
+        while poles.size < self.poles:
+            single = poles.size == self.poles - 1
             descent = self.descent(poles.size + 2 - single)
             ends: list[Local] = []
             for zeta in (1.0,) if single else DAMPINGS:
                 pole = complex(-zeta, np.sqrt(1.0 - zeta**2))
                 new = frequencies[:, None] * ([pole] if single else [pole, pole.conjugate()])
                 trials = descent.sorted([self.point(np.concatenate((poles, own))) for own in new])
-                ends.append(descent.descend(trials[0], ends, NEAR))
+                # What moves the squared error by less than the variance of the noise is not seen.
+                ends.append(descent.descend(trials[0], ends, 1.0 / descent.count))
             poles = min(ends, key=lambda end: end.squared_error).point.poles
-        return poles
+        return _upper(poles)
 
-    def reduced(self, poles: Sequence[complex], count: int) -> list[complex]:
-        """The ``count`` poles of the least squared error among given ones, of which one of each pair is listed."""
+    def reduced(self, poles: Sequence[complex]) -> list[complex]:
+        """Those of too many poles that have the least squared error; one of each pair is listed."""
         kept = [
             list(chosen)
-            for number in range(count // 2, count + 1)
+            for number in range(len(poles) + 1)
             for chosen in combinations(poles, number)
-            if _size(chosen) == count
+            if _size(chosen) == self.poles
         ]
         if not kept:
-            if _size(poles) <= count:
+            if _size(poles) <= self.poles:
                 return list(poles)
             # One pole too many and only pairs: the best damped one makes room for a real pole.
             pole = max(poles, key=_damping)
-            return self.reduced([other for other in poles if other != pole] + [complex(-abs(pole))], count)
+            return self.reduced([other for other in poles if other != pole] + [complex(-abs(pole))])
         both = [[*chosen, *(pole.conjugate() for pole in chosen if pole.imag)] for chosen in kept]
-        return kept[int(np.argmin(self.descent(count).squared_errors([self.point(each) for each in both])))]
+        return kept[int(np.argmin(self.descent(self.poles).squared_errors([self.point(each) for each in both])))]
 
 
 def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list[complex] | None:
@@ -281,7 +286,7 @@ class _Fitted(NamedTuple):
     way: str
 
 
-def _best(problem: AdditiveProblem, sets: Sequence[tuple[str, list[complex]]]) -> _Fitted | None:
+def _best(problem: AdditiveProblem, sets: Sequence[PoleSet]) -> _Fitted | None:
     """The fit of least J with the poles of one of several sets, shared out among the terms."""
     found = [
         fitted
