@@ -21,7 +21,7 @@ from ctid_cli.estimation.additive_problem import AdditiveProblem
 from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
 from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
 from ctid_cli.estimation.optimum.box import Point, box_of, point_of
-from ctid_cli.estimation.optimum.search import Descent, Local
+from ctid_cli.estimation.optimum.search import Descent
 from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_starts
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.submodels import OPEN_LOOP
@@ -150,18 +150,14 @@ class _Search:
     def added(self) -> list[complex]:
         """The poles of the least squared error, two at a time: whatever there is already moves along."""
         poles = np.zeros(0, dtype=complex)
-        frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1]
+        frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1].tolist()
         while poles.size < self.poles:
             single = poles.size == self.poles - 1
-            descent = self.descent(poles.size + 2 - single)
-            ends: list[Local] = []
-            for zeta in (1.0,) if single else DAMPINGS:
-                pole = complex(-zeta, np.sqrt(1.0 - zeta**2))
-                new = frequencies[:, None] * ([pole] if single else [pole, pole.conjugate()])
-                trials = descent.sorted([self.point(np.concatenate((poles, own))) for own in new])
-                # What moves the squared error by less than the variance of the noise is not seen.
-                ends.append(descent.descend(trials[0], ends, 1.0 / descent.count))
-            poles = min(ends, key=lambda end: end.squared_error).point.poles
+            new = [(-w,) for w in frequencies] if single else [_pair(w, zeta) for w in frequencies for zeta in DAMPINGS]
+            descent = self.descent(poles.size + len(new[0]))
+            trials = descent.sorted([self.point([*poles, *own]) for own in new])
+            # What moves the squared error by less than the variance of the noise is not seen.
+            poles = descent.descend(trials[0], near=1.0 / descent.count).point.poles
         return _upper(poles)
 
     def reduced(self, poles: Sequence[complex]) -> list[complex]:
@@ -199,6 +195,12 @@ def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list
     best = min(refined, key=lambda end: end.equations.squared_error)
     roots = np.roots(problem.split(best.theta)[0]).astype(complex)
     return [pole for pole in _upper(roots) if pole.real < 0]
+
+
+def _pair(frequency: float, damping: float) -> tuple[complex, complex]:
+    """A pair of poles."""
+    pole = frequency * complex(-damping, np.sqrt(1.0 - damping**2))
+    return pole, pole.conjugate()
 
 
 def _upper(poles: ComplexArray) -> list[complex]:
