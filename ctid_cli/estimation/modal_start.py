@@ -1,9 +1,10 @@
 r"""A start for the estimation of a sum of submodels, from the record alone.
 
-Two sets of poles are found: those of one transfer function to which poles are added pair by pair, and those of a larger
-one that is fitted at once. Each set is shared out among the terms. For given poles the output is linear in the
-numerators, which least squares on the output error supplies; the set whose output errors are least, each band of
-frequencies compared with its own noise level, wins.
+Poles are those of a transfer function with a free numerator, to which they are added pair by pair: as many as the sum
+has, and two more of which the least important are left out. Both sets are shared out among the terms. For given poles
+the output is linear in the numerators, which least squares on the output error supplies; the set whose output errors
+are least, each band of frequencies compared with its own noise level, wins. Where these errors are coloured, poles are
+found once more in the record filtered so that they are white.
 """
 
 from __future__ import annotations
@@ -18,15 +19,13 @@ import numpy as np
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem
-from ctid_cli.estimation.iteration import GUARDED, Steps, iterate, solve_scaled
+from ctid_cli.estimation.iteration import solve_scaled
 from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
 from ctid_cli.estimation.optimum.box import Point, box_of, point_of
 from ctid_cli.estimation.optimum.search import Descent
-from ctid_cli.estimation.sampled_problem import at_known_delay, least_squares_starts
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.noise_model import fit_noise_model
-from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.signals.record import Record, beginning, named
 
@@ -35,14 +34,8 @@ LONGEST = 20_000
 #: Frequencies of an added pole or pair, and the dampings of a pair, that are tried.
 FREQUENCIES = 20
 DAMPINGS = (0.03, 0.3)
-#: Poles of the larger transfer function beyond those of the terms, for noise and modes that were not asked for.
+#: Poles that are added beyond those of the terms, for noise and modes that were not asked for.
 SPARE_POLES = 2
-#: Its greatest order.
-HIGHEST_ORDER = 12
-#: Cut-offs of the state-variable filter, how many of their estimates are refined, and steps of the refinement.
-CUTOFFS = 6
-REFINED = 3
-REFINEMENT = Steps(max_iterations=10, tolerance=1e-4, rule=GUARDED, halvings=4)
 #: Ways of sharing poles out among terms of different structure that are tried.
 MOST_ARRANGEMENTS = 24
 #: Frequencies of a periodogram that share one noise level.
@@ -51,9 +44,8 @@ BAND = 16
 SPLIT = 1.25
 
 
-#: How poles were found, and the real ones and one of each pair.
+#: How poles were found; the real ones and one of each pair.
 PoleSet = tuple[str, list[complex]]
-ADDED = "Poles from transfer functions, added pair by pair"
 
 
 class ModalStart(NamedTuple):
@@ -86,7 +78,8 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
     best = _best(problem, sets)
     white = None if best is None else _whitened(data, best.error)
     if white is not None:
-        sets.append((f"{ADDED}, of the record with white noise", _Search(problem, white).added()))
+        way, _ = sets[0]
+        sets.append((f"{way}, of the record with white noise", _upper(_Search(problem, white).found())))
         best = _best(problem, sets)
     if best is None:
         raise DataError(
@@ -98,18 +91,20 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
 
 
 def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[PoleSet]:
-    """How poles were found, and all of them but the integrators, one of each conjugate pair."""
+    """Candidates for all poles but the integrators; none where the record is too short for them."""
     search = _Search(problem, data)
-    if search.poles == 0:
+    count, order = search.poles, search.poles + search.integrators
+    if count == 0:
         return [("No poles to be found", [])]
-    sets, whole = list[PoleSet](), search.poles + search.integrators
-    if data.count > whole + search.poles:
-        sets.append((ADDED, search.added()))
-    order = min(whole + SPARE_POLES, HIGHEST_ORDER)
-    found = _transfer_function_poles(data, order, problem.delay) if order >= whole else None
-    if found is not None:
-        sets.append((f"Poles from a transfer function of order {order}", search.reduced(found)))
-    return sets
+    if data.count <= count + order:
+        return []
+    found = search.found()
+    more = search.with_more(found, SPARE_POLES)
+    way = "Poles of a transfer function, added pair by pair up to order "
+    return [
+        (f"{way}{order}", _upper(found)),
+        (f"{way}{order + SPARE_POLES}, the least important left out", search.without(more, SPARE_POLES)),
+    ]
 
 
 def _whitened(data: FilterData, error: Array) -> FilterData | None:
@@ -147,54 +142,33 @@ class _Search:
         """Poles with their conjugates, moved into the set that is searched."""
         return point_of(np.array(poles, dtype=complex), self.box.delays[0], self.box)
 
-    def added(self) -> list[complex]:
-        """The poles of the least squared error, two at a time: whatever there is already moves along."""
+    def found(self) -> ComplexArray:
+        """As many poles as the sum has."""
         poles = np.zeros(0, dtype=complex)
-        frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1].tolist()
         while poles.size < self.poles:
-            single = poles.size == self.poles - 1
-            new = [(-w,) for w in frequencies] if single else [_pair(w, zeta) for w in frequencies for zeta in DAMPINGS]
-            descent = self.descent(poles.size + len(new[0]))
-            trials = descent.sorted([self.point([*poles, *own]) for own in new])
-            # What moves the squared error by less than the variance of the noise is not seen.
-            poles = descent.descend(trials[0], near=1.0 / descent.count).point.poles
-        return _upper(poles)
+            poles = self.with_more(poles, min(2, self.poles - poles.size))
+        return poles
 
-    def reduced(self, poles: Sequence[complex]) -> list[complex]:
-        """Those of too many poles that have the least squared error; one of each pair is listed."""
-        kept = [
-            list(chosen)
-            for number in range(len(poles) + 1)
-            for chosen in combinations(poles, number)
-            if _size(chosen) == self.poles
-        ]
-        if not kept:
-            if _size(poles) <= self.poles:
-                return list(poles)
-            # One pole too many and only pairs: the best damped one makes room for a real pole.
-            pole = max(poles, key=_damping)
-            return self.reduced([other for other in poles if other != pole] + [complex(-abs(pole))])
-        both = [[*chosen, *(pole.conjugate() for pole in chosen if pole.imag)] for chosen in kept]
-        return kept[int(np.argmin(self.descent(self.poles).squared_errors([self.point(each) for each in both])))]
+    def with_more(self, poles: ComplexArray, added: int) -> ComplexArray:
+        """The poles of the least squared error with one more or two; those that there are move along."""
+        frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1].tolist()
+        new = [(-w,) for w in frequencies] if added == 1 else [_pair(w, zeta) for w in frequencies for zeta in DAMPINGS]
+        descent = self.descent(poles.size + added)
+        trials = descent.sorted([self.point([*poles, *own]) for own in new])
+        # What moves the squared error by less than the variance of the noise is not seen.
+        return descent.descend(trials[0], near=1.0 / descent.count).point.poles
 
-
-def _transfer_function_poles(data: FilterData, order: int, delay: float) -> list[complex] | None:
-    """Poles of the best of a few refined fits; None if there are too few samples or all equations are singular."""
-    structure = Structure(order, order - 1)
-    if data.count <= structure.size:
-        return None
-    problem = at_known_delay(data, structure)
-    duration = float(data.t[-1] - data.t[0])
-    fastest = 0.5 * np.pi / float(np.median(np.diff(data.t)))
-    cutoffs = np.geomspace(min(4.0 * np.pi / duration, fastest), fastest, CUTOFFS).tolist()
-    starts = least_squares_starts(data, structure, delay, cutoffs, refit=True)
-    starts.sort(key=lambda theta: problem.equations(theta).squared_error)
-    refined = [end for theta in starts[:REFINED] if (end := iterate(problem, theta, REFINEMENT)) is not None]
-    if not refined:
-        return None
-    best = min(refined, key=lambda end: end.equations.squared_error)
-    roots = np.roots(problem.split(best.theta)[0]).astype(complex)
-    return [pole for pole in _upper(roots) if pole.real < 0]
+    def without(self, poles: ComplexArray, left_out: int) -> list[complex]:
+        """The poles of the least squared error after some have been left out; one of each pair is listed."""
+        upper = _upper(poles)
+        kept = []
+        for number in range(1, left_out + 1):
+            for chosen in combinations(upper, len(upper) - number):
+                both = [*chosen, *(pole.conjugate() for pole in chosen if pole.imag)]
+                if len(both) == poles.size - left_out:
+                    kept.append(both)
+        errors = self.descent(poles.size - left_out).squared_errors([self.point(each) for each in kept])
+        return _upper(np.array(kept[int(np.argmin(errors))]))
 
 
 def _pair(frequency: float, damping: float) -> tuple[complex, complex]:
@@ -209,16 +183,6 @@ def _upper(poles: ComplexArray) -> list[complex]:
 
 
 # --- poles to terms --------------------------------------------------------------------------------
-
-
-def _size(poles: Sequence[complex]) -> int:
-    """Number of poles, conjugates counted."""
-    return sum(2 if pole.imag else 1 for pole in poles)
-
-
-def _damping(pole: complex) -> float:
-    """Damping ratio [-]."""
-    return -pole.real / abs(pole)
 
 
 def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
@@ -262,7 +226,7 @@ def _with_room(poles: Sequence[complex], room: int) -> tuple[list[complex], list
     reals = [pole for pole in poles if not pole.imag]
     while len(pairs) > room:
         # The best damped pair is nearest to two real poles.
-        pole = pairs.pop(int(np.argmax([_damping(pole) for pole in pairs])))
+        pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
         reals += [complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)]
     return pairs, sorted(reals, key=abs)
 

@@ -71,18 +71,6 @@ class LaidOutSubmodels(Submodels):
         """The record, without the means that were subtracted."""
         return [self.record]
 
-    def errors_of(self, theta: Array) -> AppliedModel:
-        """Errors of a given model, with its own best initial state if that is estimated."""
-        problem = self.problem
-        rows = problem.rows(np.concatenate((theta, np.zeros(problem.filter.free))))
-        if rows is None:
-            raise DataError(f"{named(self.record)}the response of the model is not finite on this record")
-        psi, error = rows
-        columns = psi[:, problem.size :]
-        state: Array = np.asarray(np.linalg.lstsq(columns, error)[0], dtype=float)
-        used = used_samples(problem.data, self.record)
-        return AppliedModel((error - columns @ state,), (used,), (state,), (self.offset,), (psi,))
-
 
 @dataclass(frozen=True)
 class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
@@ -230,24 +218,36 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             return record
         return Record(record.t, record.y, HeldSignal(record.t, record.loop.reference), name=record.name)
 
+    def _rows(
+        self, fit: MeasuredFit, laid_out: LaidOutSubmodels, state: Array | None = None, **changes: Any
+    ) -> tuple[Array, Array, Array]:
+        """Sensitivities to the parameters, free responses, and output errors; of a changed problem, by default at rest.
+
+        Closed-loop instruments stand in the place of sensitivities.
+        """
+        model = self._factors(fit)
+        problem = replace(laid_out.problem, terms=model.terms, **changes)
+        state = np.zeros(problem.filter.free) if state is None else state
+        rows = problem.rows(np.concatenate((model.theta, state)))
+        if rows is None:
+            raise DataError(f"{named(laid_out.record)}the response of the model is not finite on this record")
+        return rows[0][:, : problem.size], rows[0][:, problem.size :], rows[1]
+
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
         """What a fit says of each used sample, from its parameters; of a monic fraction by its coefficients."""
-        model, problem = self._factors(fit), laid_out.problem
-        rows = replace(problem, terms=model.terms).rows(np.concatenate((model.theta, fit.initial_states[0])))
-        assert rows is not None
-        psi, error = rows
+        psi, free, error = self._rows(fit, laid_out, fit.initial_states[0])
         if not self.factored:
-            jacobian = unfactored_jacobian(model, self.zeros)
-            size = problem.size
-            psi = np.column_stack((psi[:, :size] @ np.linalg.inv(jacobian), psi[:, size:]))
-        return FittedSamples((error,), (psi,), (used_samples(problem.data, laid_out.record),), None)
+            psi = psi @ np.linalg.inv(unfactored_jacobian(self._factors(fit), self.zeros))
+        used = used_samples(laid_out.problem.data, laid_out.record)
+        return FittedSamples((error,), (np.column_stack((psi, free)),), (used,), None)
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
-        """The model on another record."""
-        model = self._factors(fit)
-        open_loop = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP)
-        alone: LaidOutSubmodels = replace(laid_out, problem=open_loop)
-        return alone.errors_of(model.theta)
+        """The model on another record, with its own best initial state there if that is estimated."""
+        psi, free, error = self._rows(fit, laid_out, loop=OPEN_LOOP)
+        state: Array = np.asarray(np.linalg.lstsq(free, error)[0], dtype=float)
+        used = used_samples(laid_out.problem.data, laid_out.record)
+        sensitivities = np.column_stack((psi, free))
+        return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
 
     def _lowered(self, fit: MeasuredFit, laid_out: Any) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
@@ -260,12 +260,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             return float(rest @ rest)
 
         found = {}
-        model = self._factors(fit)
         if self.initial_state == "rest":
-            free = replace(laid_out.problem, terms=model.terms, loop=OPEN_LOOP, initial_state="estimated")
-            rows = free.rows(np.concatenate((model.theta, np.zeros(free.filter.free))))
-            assert rows is not None
-            found["initial_state"] = left(rows[0][:, free.size :])
+            found["initial_state"] = left(self._rows(fit, laid_out, loop=OPEN_LOOP, initial_state="estimated")[1])
         if self.offset == "none":
             found["offset"] = left(np.ones((error.size, 1)))
         return found
