@@ -193,8 +193,6 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
     """
     single, room = sum(term.poles % 2 for term in terms), sum(term.poles // 2 for term in terms)
     pairs, reals = _with_room(poles, room)
-    if len(reals) < single or len(reals) != single + 2 * (room - len(pairs)):
-        return
     tried: list[list[list[complex]]] = []
     for alone in combinations(range(len(reals)), single):
         rest = [pole for k, pole in enumerate(reals) if k not in alone]
