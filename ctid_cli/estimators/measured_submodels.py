@@ -172,9 +172,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
                 f"{named(laid_out.record)}the iterations for these terms diverged; use fewer or other terms, another "
                 "delay, or a longer record"
             )
-        order = found.order if self.factored else np.arange(found.theta.size)
-        theta = found.theta[order]
-        ordered = found.model
+        theta, ordered = found.theta[found.order], found.model
         names = (*ordered.names, *(f"x{k}" for k in range(1, problem.filter.free + 1)))
         if not self.factored:
             size, structure = problem.size, Structure(self.poles, self.zeros)
