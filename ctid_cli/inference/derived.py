@@ -1,14 +1,13 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.inference.intervals import UncertainValue, normal_quantile
-from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.factoring import pole_jacobian
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
@@ -66,36 +65,21 @@ def additive_derived(
     found: list[UncertainValue] = []
     first = 0
     for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
-        own = slice(first, first + term.size)
-        rows = _of_submodel(submodel, covariance[own, own], partial(_behind, quantile, first))
-        found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
-        first = own.stop
+        n, falling = term.poles, submodel.denominator
+        rows = _Rows(covariance, quantile, first=first, prefix=f"g{number}_")
+        poles, jacobian = pole_slopes(falling, range(1, n + 1))
+        rows.add_poles(poles, jacobian, number_lone=False)
+        if n == 2 and falling[0] > 0 and not poles.imag.any():
+            # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
+            a1, a2 = falling[1], falling[0]
+            frequency, slope = a2**-0.5, -0.5 * a2**-1.5
+            turning = 0.5 * np.array([frequency, a1 * slope])
+            rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a1 * frequency, turning)
+        reason = "This submodel integrates and has no static gain." if submodel.integrators else ""
+        rows.add("static_gain", submodel.dc_gain, np.eye(1, term.size, n)[0], GAIN_UNIT, reason)
+        found += rows.found
+        first += term.size
     return tuple(found)
-
-
-def _behind(quantile: Quantile, first: int, gradient: Array) -> float:
-    """Standard errors to each side of a quantity that does not depend on the first parameters."""
-    return quantile(np.concatenate((np.zeros(first), gradient)))
-
-
-def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> list[UncertainValue]:
-    """All quantities of one submodel; covariance of its own parameters."""
-    n = submodel.term().poles
-    falling = submodel.denominator
-    poles, jacobian = pole_slopes(falling, range(1, n + 1))
-    rows = _Rows(covariance, quantile)
-    rows.add_poles(poles, jacobian, number_lone=False)
-    if n == 2 and falling[0] > 0 and not poles.imag.any():
-        # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
-        a1, a2 = falling[1], falling[0]
-        frequency, slope = a2**-0.5, -0.5 * a2**-1.5
-        turning = 0.5 * np.array([frequency, a1 * slope])
-        rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a1 * frequency, turning)
-    gradient = np.zeros(len(covariance))
-    gradient[n] = 1.0
-    reason = "This submodel integrates and has no static gain." if submodel.integrators else ""
-    rows.add("static_gain", submodel.dc_gain, gradient, GAIN_UNIT, reason)
-    return rows.found
 
 
 def pole_slopes(denominator: Array, powers: Sequence[int]) -> tuple[ComplexArray, ComplexArray]:
@@ -106,27 +90,38 @@ def pole_slopes(denominator: Array, powers: Sequence[int]) -> tuple[ComplexArray
         return poles, by_constant * poles[:, None] ** np.asarray(powers, dtype=int)
 
 
+@dataclass
 class _Rows:
-    """Quantities computed from parameters of known covariance."""
+    """Quantities that depend on the parameters of one model or submodel, from the covariance of all."""
 
-    def __init__(self, covariance: Array, quantile: Quantile, tangent: Array | None = None) -> None:
-        self.covariance = covariance
-        self.quantile = quantile
-        self.tangent = tangent
-        self.found: list[UncertainValue] = []
+    covariance: Array
+    quantile: Quantile
+    tangent: Array | None = None
+    #: Place of the first parameter that the gradients are for, and what the names of the quantities begin with.
+    first: int = 0
+    prefix: str = ""
+    found: list[UncertainValue] = field(default_factory=list)
 
     def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
-        """One quantity, from its gradient by the leading parameters; with a reason, it has no standard error."""
-        covariance = self.covariance[: gradient.size, : gradient.size]
+        """Add one quantity, from its gradient; with a reason, it has no standard error."""
         if self.tangent is not None and not reason:
             moved = np.abs(gradient @ self.tangent[: gradient.size]).max(initial=0.0)
             reason = HELD if moved <= UNMOVED * abs(estimate) else ""
-        variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
+        variance = float(gradient @ self._own(gradient.size) @ gradient) if np.isfinite(gradient).all() else NAN
         error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
         if not reason and not np.isfinite(error):
             reason = "The covariance of the coefficients is not defined."
-        reach = self.quantile(gradient) if np.isfinite(error) else NAN
-        self.found.append(UncertainValue.symmetric(name, estimate, error, unit, reach, reason))
+        reach = self._reach(gradient) if np.isfinite(error) else NAN
+        self.found.append(UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason))
+
+    def _own(self, size: int) -> Array:
+        """Covariance of the parameters that a gradient is for."""
+        own = slice(self.first, self.first + size)
+        return self.covariance[own, own]
+
+    def _reach(self, gradient: Array) -> float:
+        """Standard errors to each side of a quantity."""
+        return self.quantile(np.concatenate((np.zeros(self.first), gradient)))
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
@@ -165,9 +160,9 @@ class _Rows:
 
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
         """Reason for which pole k has no standard error, or nothing."""
-        A = self.covariance[: slope.size, : slope.size]
-        text = "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
-        return text if indistinct(poles, k, slope, others, A, self.quantile) else ""
+        if indistinct(poles, k, slope, others, self._own(slope.size), self._reach):
+            return "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
+        return ""
 
 
 def indistinct(
