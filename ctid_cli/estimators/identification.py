@@ -22,7 +22,7 @@ from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.derived import additive_derived, derived_parameters
+from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.fit import DeferredFields, Status
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
@@ -438,7 +438,7 @@ def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Un
     known = np.isin(fit.parameter_names, fit.known)
     covariance[known] = covariance[:, known] = 0.0
     if isinstance(fit, SubmodelsFit) and fit.additive is not None:
-        return additive_derived(fit.additive, covariance, uncertainty.quantile)
+        return derived_parameters(fit.additive, covariance, uncertainty.quantile)
     size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
     held = fit.tangent[:size] if fit.held_poles else None
     return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)

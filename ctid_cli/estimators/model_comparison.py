@@ -161,6 +161,6 @@ def _treated(
             raise UsageError(str(error)) from None
         return options._applied(fit.fit, options.prepare(record).laid_out)
     model = parametric.fraction
-    structure = Structure(model.order, parametric.zeros_of_fraction)
+    structure = Structure(model.order, parametric.zeros)
     treatment = Treatment((model.delay, model.delay), state, shift, "foh")
     return Refinement(MeasuredRecords([record], structure, treatment)).errors_of(model)

@@ -197,7 +197,7 @@ class Estimated:
         decay, speeds = decay[decay > 1e-9 * speeds.max(initial=0.0)], speeds[speeds > 0]
         longest = 5.0 / float(decay.min()) if decay.size else 0.0
         if speeds.size:
-            # A mode that hardly decays is shown for thirty periods, and one that is much slower than all others in part.
+            # A mode that hardly decays is shown for thirty periods, one much slower than all others in part.
             longest = min(longest or np.inf, 60.0 * np.pi / float(speeds.min()))
         return np.linspace(0.0, model.delay + (longest or 10.0 * (model.delay or 1.0)), POINTS)
 

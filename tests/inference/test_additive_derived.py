@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.derived import additive_derived, derived_parameters
+from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
@@ -21,7 +21,7 @@ MIXED = AdditiveModel(
 
 
 def by_name(model, covariance, **options):
-    return {row.name: row for row in additive_derived(model, covariance, **options)}
+    return {row.name: row for row in derived_parameters(model, covariance, **options)}
 
 
 def random_covariance(model, relative=1e-4):
