@@ -14,6 +14,7 @@ from ctid_cli.inference.covariance import (
     white_noise_covariance,
 )
 from ctid_cli.inference.noise_model import fit_residual_noise
+from tests.inference.autoregression import autocovariance
 
 
 def sensitivities(seed, scales):
@@ -80,7 +81,7 @@ def covariance_of(psi, residuals, regular=True):
 
 def test_is_the_double_sum_over_all_pairs_of_samples():
     psi, v = regressors(200), noise(np.random.default_rng(1), 200)
-    R = toeplitz(fit_residual_noise([psi], [v]).autocovariance(200))
+    R = toeplitz(autocovariance(fit_residual_noise([psi], [v]), 200))
     M = np.linalg.inv(psi.T @ psi)
     assert largest_relative_error(covariance_of([psi], [v]), M @ psi.T @ R @ psi @ M) < 1e-9
 
@@ -128,7 +129,7 @@ def test_covariance_follows_the_units(regular):
 def test_experiments_are_independent_of_each_other():
     psi = [regressors(150, 1), regressors(90, 2)]
     v = [noise(np.random.default_rng(1), 150), noise(np.random.default_rng(2), 90)]
-    r = fit_residual_noise(psi, v).autocovariance(150)
+    r = autocovariance(fit_residual_noise(psi, v), 150)
     stacked = np.vstack(psi)
     M = np.linalg.inv(stacked.T @ stacked)
     sigma = stacked.T @ block_diag(toeplitz(r), toeplitz(r[:90])) @ stacked
