@@ -12,6 +12,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import Estimated
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
@@ -154,13 +155,8 @@ class Fit(FittedModel, ShownAsTable):
     @property
     def parameters(self) -> dict[str, float]:
         """Free parameters by name."""
-        a, b = self.model.denominator, self.model.numerator
-        values = {f"a{i}": float(a[i]) for i in range(1, a.size)}
-        # A leading numerator coefficient may be exactly zero and is dropped by the model; names keep their powers.
-        zeros = sum(name.startswith("b") for name in self.parameter_names)
-        padded = np.concatenate([np.zeros(zeros - b.size), b])
-        values |= {f"b{j}": float(value) for j, value in enumerate(padded)}
-        values["delay"] = self.model.delay
+        parametric = Parametric(self.parametrised, self.parameter_names)
+        values = dict(zip(parametric.every, parametric.theta.tolist(), strict=True))
         return {name: values[name] for name in self.parameter_names}
 
     @property
