@@ -66,11 +66,6 @@ class AdditiveFit(Fit):
     loop_radius: float = field(kw_only=True)
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
-        return self.additive.parameters
-
-    @property
     def parametrised(self) -> AdditiveModel:
         """The model in the form that has the parameters."""
         return self.additive

@@ -119,7 +119,7 @@ class Identification(DeferredFields, FittedModel, ShownAsTable):
     def _estimated(self) -> Estimated:
         """The model with what its reported errors and intervals are from."""
         law = self.uncertainty if self._determined else self.uncertainty.undefined
-        return Estimated.of(self.fit.parametrised, self.fit.parameter_names, law)
+        return Estimated(Parametric(self.fit.parametrised, self.fit.parameter_names), law)
 
     @property
     def _determined(self) -> bool:

@@ -154,7 +154,7 @@ class Fit(FittedModel, ShownAsTable):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Free parameters by name."""
+        """Free parameters by name; of submodels ``g1_a1 … g1_b0 …, g2_a1 …``, numbered by the power of p."""
         parametric = Parametric(self.parametrised, self.parameter_names)
         values = dict(zip(parametric.every, parametric.theta.tolist(), strict=True))
         return {name: values[name] for name in self.parameter_names}
@@ -179,4 +179,5 @@ class Fit(FittedModel, ShownAsTable):
 
     def _estimated(self) -> Estimated:
         """The model with the joint law of its parameters."""
-        return Estimated.of(self.parametrised, self.parameter_names, self.law or Uncertainty.known(self.covariance))
+        law = self.law or Uncertainty.known(self.covariance)
+        return Estimated(Parametric(self.parametrised, self.parameter_names), law)

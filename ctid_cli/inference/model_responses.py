@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.inference.derived import indistinct
-from ctid_cli.inference.sensitivities import Model, Parametric
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.checks import require_increasing
 from ctid_cli.signals.held import HeldSignal
@@ -134,11 +134,6 @@ class Estimated:
 
     parametric: Parametric
     law: Uncertainty
-
-    @classmethod
-    def of(cls, model: Model, names: tuple[str, ...], law: Uncertainty) -> Estimated:
-        """Join a model, the names of all parameters of its fit, and their law."""
-        return cls(Parametric(model, names), law)
 
     @cached_property
     def reported(self) -> Array:
