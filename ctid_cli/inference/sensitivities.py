@@ -127,12 +127,15 @@ class Part:
         if order == 0:
             return np.column_stack((signal.at(data.t - delay), np.zeros(data.t.size)))
         rows = standard_rows(data, a, rest, delay, integrators=self.integrators)
-        u, x = rows[:, order], direct * rows[:, order] - rows[:, order + 2 * n + 1]
-        driven = _with_highest(rows[:, :order], u, a)
-        filtered = rows[:, order + 1 : order + 1 + n] + direct * driven[:, self.integrators : order]
-        columns = [-_with_highest(filtered, x, a)[:, list(self.a_powers)], driven[:, list(self.b_powers)]]
+        driven, u, filtered = rows[:, :order], rows[:, order], rows[:, order + 1 : order + 1 + n]
+        # The rows are those of the strictly proper part of the model.
+        x = direct * u - rows[:, order + 2 * n + 1]
+        if direct:
+            filtered = filtered + direct * driven[:, self.integrators :]
+        by_a, by_b = _of_powers(filtered, x, a, self.a_powers), _of_powers(driven, u, a, self.b_powers)
         # Between the breaks of a held input the derivative by the delay has nothing of what passes at once.
-        return np.column_stack((np.hstack(columns) / highest, -rows[:, order + 2 * n + 2]))
+        scales = np.repeat((-1.0 / highest, 1.0 / highest, -1.0), (len(self.a_powers), len(self.b_powers), 1))
+        return np.asarray(np.hstack((by_a, by_b, rows[:, order + 2 * n + 2, None])) * scales)
 
     def pole_slopes(self) -> tuple[ComplexArray, ComplexArray]:
         """Return the poles but for the integrators, and their derivatives ``-p^k/A'(p)`` by the coefficients of A."""
@@ -142,10 +145,12 @@ class Part:
             return poles, by_constant * poles[:, None] ** np.asarray(self.a_powers, dtype=int)
 
 
-def _with_highest(lower: Array, signal: Array, a: Array) -> Array:
-    """Columns ``p^k/(p^l A) s`` from the lower powers of p on to the degree of the denominator, from s itself."""
-    n = a.size - 1
-    return np.column_stack((lower, signal - lower[:, lower.shape[1] - n :] @ a[:0:-1]))
+def _of_powers(lower: Array, signal: Array, a: Array, powers: tuple[int, ...]) -> Array:
+    """Columns ``p^k/(p^l A) s`` for given k, from those with k below the degree of the denominator and s itself."""
+    degree = lower.shape[1]
+    if degree in powers:
+        lower = np.column_stack((lower, signal - lower[:, degree - a.size + 1 :] @ a[:0:-1]))
+    return lower[:, list(powers)]
 
 
 def parts_of(model: Model, zeros: int | None = None) -> list[Part]:
