@@ -38,7 +38,8 @@ from .estimators.order_search import search_orders as search_orders
 from .estimators.identification import Identification as Identification, identify as identify
 
 # Results
-from .inference.fit import Fit as Fit, FittedModel as FittedModel, Status as Status
+from .inference.fit import Fit as Fit, Status as Status
+from .inference.fitted_model import FittedModel as FittedModel
 from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand as PoleBand
 from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit

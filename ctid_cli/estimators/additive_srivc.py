@@ -25,7 +25,7 @@ from ctid_cli.estimation.iteration import StepRule, Steps
 from ctid_cli.estimation.modal_start import ModalStart, automatic_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.submodels import InitialState
-from ctid_cli.inference.derived import additive_derived
+from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
@@ -66,11 +66,6 @@ class AdditiveFit(Fit):
     loop_radius: float = field(kw_only=True)
 
     @property
-    def parameters(self) -> dict[str, float]:
-        """Parameters by name: ``g1_a1 … g1_b0 …, g2_a1 …``, where the number is the power of p."""
-        return self.additive.parameters
-
-    @property
     def parametrised(self) -> AdditiveModel:
         """The model in the form that has the parameters."""
         return self.additive
@@ -87,10 +82,10 @@ class AdditiveFit(Fit):
         -------
         tuple of UncertainValue
             With standard errors by the delta method, see
-            :func:`~ctid_cli.inference.derived.additive_derived`.
+            :func:`~ctid_cli.inference.derived.derived_parameters`.
         """
         quantile = (lambda _: normal_quantile(level)) if self.law is None else partial(self.law.quantile, level=level)
-        return additive_derived(self.additive, self.covariance, quantile)
+        return derived_parameters(self.additive, self.covariance, quantile)
 
 
 @dataclass(frozen=True)

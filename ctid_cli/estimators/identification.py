@@ -22,8 +22,9 @@ from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.derived import additive_derived, derived_parameters
-from ctid_cli.inference.fit import DeferredFields, FittedModel, Status
+from ctid_cli.inference.derived import derived_parameters
+from ctid_cli.inference.fit import DeferredFields, Status
+from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
@@ -118,7 +119,7 @@ class Identification(DeferredFields, FittedModel, ShownAsTable):
     def _estimated(self) -> Estimated:
         """The model with what its reported errors and intervals are from."""
         law = self.uncertainty if self._determined else self.uncertainty.undefined
-        return Estimated.of(self.fit.parametrised, self.fit.parameter_names, law)
+        return Estimated(Parametric(self.fit.parametrised, self.fit.parameter_names), law)
 
     @property
     def _determined(self) -> bool:
@@ -437,7 +438,7 @@ def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Un
     known = np.isin(fit.parameter_names, fit.known)
     covariance[known] = covariance[:, known] = 0.0
     if isinstance(fit, SubmodelsFit) and fit.additive is not None:
-        return additive_derived(fit.additive, covariance, uncertainty.quantile)
+        return derived_parameters(fit.additive, covariance, uncertainty.quantile)
     size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
     held = fit.tangent[:size] if fit.held_poles else None
     return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)

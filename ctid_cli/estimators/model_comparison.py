@@ -11,7 +11,7 @@ from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.criteria import fit_percent, r_squared
-from ctid_cli.inference.fit import FittedModel
+from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivities import Parametric, Structure
 from ctid_cli.signals.record import Record, named
@@ -161,6 +161,6 @@ def _treated(
             raise UsageError(str(error)) from None
         return options._applied(fit.fit, options.prepare(record).laid_out)
     model = parametric.fraction
-    structure = Structure(model.order, parametric.zeros_of_fraction)
+    structure = Structure(model.order, parametric.zeros)
     treatment = Treatment((model.delay, model.delay), state, shift, "foh")
     return Refinement(MeasuredRecords([record], structure, treatment)).errors_of(model)

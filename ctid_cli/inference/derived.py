@@ -1,16 +1,16 @@
 """Poles, time constants, frequencies, damping and gain of estimated models, with their standard errors."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.inference.intervals import UncertainValue, normal_quantile
-from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.factoring import pole_jacobian
-from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
+from ctid_cli.inference.sensitivities import parts_of
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.transfer_function import TransferFunction
 
 NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
@@ -27,9 +27,12 @@ def normal_interval(gradient: Array) -> float:
 
 
 def derived_parameters(
-    model: TransferFunction, covariance: Array, quantile: Quantile = normal_interval, tangent: Array | None = None
+    model: AdditiveModel | TransferFunction,
+    covariance: Array,
+    quantile: Quantile = normal_interval,
+    tangent: Array | None = None,
 ) -> tuple[UncertainValue, ...]:
-    r"""What users read off a model, with standard errors by the delta method.
+    r"""What users read off a model, or the submodels of a sum, with standard errors by the delta method.
 
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
     ``g +- z se``. The linearisation only holds where a pole moves little compared with its distance to the others. A
@@ -37,96 +40,68 @@ def derived_parameters(
     accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
     from the *other* poles: they are regular where the pair meets on the real axis. What does not change along the
     tangent, the directions in which the coefficients were free, is held and has no standard error.
-    """
-    n = model.order
-    rows = _Rows(covariance, quantile, tangent)
-    rows.add_poles(*pole_slopes(model.denominator, range(n - 1, -1, -1)))
-    gradient = np.zeros(covariance.shape[0])
-    last = float(model.denominator[-1])
-    reason = ""
-    if last == 0:
-        reason = "The model integrates (a pole at the origin) and has no static gain."
-    else:
-        gradient[-1] = 1.0 / last
-        if n:
-            gradient[n - 1] = -model.dc_gain / last
-    rows.add("static_gain", model.dc_gain, gradient, GAIN_UNIT, reason)
-    return tuple(rows.found)
-
-
-def additive_derived(
-    model: AdditiveModel, covariance: Array, quantile: Quantile = normal_interval
-) -> tuple[UncertainValue, ...]:
-    r"""What users read off the submodels of a sum, as :func:`derived_parameters`.
 
     Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
-    be told from another one of the same submodel. With ``A = 1 + a_1 p + … + a_n p^n``, a pole moves by
-    ``dp/da_k = -p^k/A'(p)``.
+    be told from another one of the same submodel.
     """
     found: list[UncertainValue] = []
-    first = 0
-    for number, (submodel, term) in enumerate(zip(model.submodels, model.terms, strict=True), 1):
-        own = slice(first, first + term.size)
-        rows = _of_submodel(submodel, covariance[own, own], partial(_behind, quantile, first))
-        found += [replace(row, name=f"g{number}_{row.name}") for row in rows]
-        first = own.stop
+    first, additive = 0, isinstance(model, AdditiveModel)
+    # The numerator of a fraction may have leading coefficients that are estimated and zero.
+    for number, part in enumerate(parts_of(model, len(covariance) - model.order - 1), 1):
+        rows = _Rows(covariance, quantile, tangent, first, f"g{number}_" if additive else "")
+        a, last = part.denominator, float(part.denominator[-1])
+        poles, jacobian = part.pole_slopes()
+        rows.add_poles(poles, jacobian, number_lone=not additive)
+        if additive and poles.size == 2 and a[0] > 0 and not poles.imag.any():
+            # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
+            frequency, slope = a[0] ** -0.5, -0.5 * a[0] ** -1.5
+            turning = 0.5 * np.array([frequency, a[1] * slope])
+            rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a[1] * frequency, turning)
+        integrates = part.integrators > 0 or last == 0
+        gain = math.inf if integrates else float(part.numerator[-1] / last)
+        # Only the coefficients of p^0 count: of B, and of A where it has a free one.
+        slopes = [-gain if power == 0 else 0.0 for power in part.a_powers]
+        slopes += [float(power == 0) for power in part.b_powers]
+        which = "This submodel integrates" if additive else "The model integrates (a pole at the origin)"
+        reason = f"{which} and has no static gain." if integrates else ""
+        rows.add("static_gain", gain, np.array(slopes) / (last or 1.0), GAIN_UNIT, reason)
+        found += rows.found
+        first += part.size
     return tuple(found)
 
 
-def _behind(quantile: Quantile, first: int, gradient: Array) -> float:
-    """Standard errors to each side of a quantity that does not depend on the first parameters."""
-    return quantile(np.concatenate((np.zeros(first), gradient)))
-
-
-def _of_submodel(submodel: Submodel, covariance: Array, quantile: Quantile) -> list[UncertainValue]:
-    """All quantities of one submodel; covariance of its own parameters."""
-    n = submodel.term().poles
-    falling = submodel.denominator
-    poles, jacobian = pole_slopes(falling, range(1, n + 1))
-    rows = _Rows(covariance, quantile)
-    rows.add_poles(poles, jacobian, number_lone=False)
-    if n == 2 and falling[0] > 0 and not poles.imag.any():
-        # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
-        a1, a2 = falling[1], falling[0]
-        frequency, slope = a2**-0.5, -0.5 * a2**-1.5
-        turning = 0.5 * np.array([frequency, a1 * slope])
-        rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a1 * frequency, turning)
-    gradient = np.zeros(len(covariance))
-    gradient[n] = 1.0
-    reason = "This submodel integrates and has no static gain." if submodel.integrators else ""
-    rows.add("static_gain", submodel.dc_gain, gradient, GAIN_UNIT, reason)
-    return rows.found
-
-
-def pole_slopes(denominator: Array, powers: Sequence[int]) -> tuple[ComplexArray, ComplexArray]:
-    """Poles, and their derivatives ``-p^k/A'(p)`` by the coefficients of these powers."""
-    poles = sorted_roots(denominator)
-    with np.errstate(invalid="ignore"):
-        by_constant = pole_jacobian(denominator / denominator[0], poles)[:, -1:] / denominator[0]
-        return poles, by_constant * poles[:, None] ** np.asarray(powers, dtype=int)
-
-
+@dataclass
 class _Rows:
-    """Quantities computed from parameters of known covariance."""
+    """Quantities that depend on the parameters of one model or submodel, from the covariance of all."""
 
-    def __init__(self, covariance: Array, quantile: Quantile, tangent: Array | None = None) -> None:
-        self.covariance = covariance
-        self.quantile = quantile
-        self.tangent = tangent
-        self.found: list[UncertainValue] = []
+    covariance: Array
+    quantile: Quantile
+    tangent: Array | None = None
+    #: Place of the first parameter that the gradients are for, and what the names of the quantities begin with.
+    first: int = 0
+    prefix: str = ""
+    found: list[UncertainValue] = field(default_factory=list)
 
     def add(self, name: str, estimate: float, gradient: Array, unit: str, reason: str = "") -> None:
-        """One quantity, from its gradient by the leading parameters; with a reason, it has no standard error."""
-        covariance = self.covariance[: gradient.size, : gradient.size]
+        """Add one quantity, from its gradient; with a reason, it has no standard error."""
         if self.tangent is not None and not reason:
             moved = np.abs(gradient @ self.tangent[: gradient.size]).max(initial=0.0)
             reason = HELD if moved <= UNMOVED * abs(estimate) else ""
-        variance = float(gradient @ covariance @ gradient) if np.isfinite(gradient).all() else NAN
+        variance = float(gradient @ self._own(gradient.size) @ gradient) if np.isfinite(gradient).all() else NAN
         error = float(np.sqrt(variance)) if variance >= 0 and not reason else NAN
         if not reason and not np.isfinite(error):
             reason = "The covariance of the coefficients is not defined."
-        reach = self.quantile(gradient) if np.isfinite(error) else NAN
-        self.found.append(UncertainValue.symmetric(name, estimate, error, unit, reach, reason))
+        reach = self._reach(gradient) if np.isfinite(error) else NAN
+        self.found.append(UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason))
+
+    def _own(self, size: int) -> Array:
+        """Covariance of the parameters that a gradient is for."""
+        own = slice(self.first, self.first + size)
+        return self.covariance[own, own]
+
+    def _reach(self, gradient: Array) -> float:
+        """Standard errors to each side of a quantity."""
+        return self.quantile(np.concatenate((np.zeros(self.first), gradient)))
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
@@ -165,9 +140,9 @@ class _Rows:
 
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
         """Reason for which pole k has no standard error, or nothing."""
-        A = self.covariance[: slope.size, : slope.size]
-        text = "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
-        return text if indistinct(poles, k, slope, others, A, self.quantile) else ""
+        if indistinct(poles, k, slope, others, self._own(slope.size), self._reach):
+            return "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
+        return ""
 
 
 def indistinct(

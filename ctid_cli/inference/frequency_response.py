@@ -331,12 +331,9 @@ def _on_any_clock(
         f"Since {reason}, the spectrum of the output is that of straight lines between its samples, corrected for what "
         f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/{time_unit} that is rough."
     )
-    notes = (*found.notes, note, *_of_record(record))
-    bias = np.zeros(found.frequencies.size)
     _require_some(found, record)
-    return _with_phase_note(
-        FrequencyResponse(*found[:6], bias, "local-polynomial", record.input.hold, notes, found.told)
-    )
+    # The spectrum of the input is that of all its movements: no image of a hold is left.
+    return _response(found, "local-polynomial", record, np.zeros(found.frequencies.size), note)
 
 
 def _begins(record: Record) -> float:
@@ -366,12 +363,14 @@ def _finished(lines: ResponseLines, method: Estimate, record: Record, time_unit:
     distortion = None if lines.distortion is None else lines.distortion / power
     held = lines._replace(response=lines.response / factor, variance=lines.variance / power, distortion=distortion)
     bias = images(hold, held.frequencies, held.response, held.variance, interval)
-    notes = (*held.notes, _of_hold(hold, held.frequencies, bias, np.abs(held.response), time_unit), *_of_record(record))
-    return _with_phase_note(FrequencyResponse(*held[:6], bias, method, hold, notes, held.told))
+    note = _of_hold(hold, held.frequencies, bias, np.abs(held.response), time_unit)
+    return _response(held, method, record, bias, note)
 
 
-def _with_phase_note(found: FrequencyResponse) -> FrequencyResponse:
-    """The response with a sentence on where its phase is unknown, and why."""
+def _response(lines: ResponseLines, method: Estimate, record: Record, bias: Array, note: str) -> FrequencyResponse:
+    """The result, with sentences on missing samples and on where its phase is unknown, and why."""
+    notes = (*lines.notes, note, *_of_record(record))
+    found = FrequencyResponse(*lines[:6], bias, method, record.input.hold, notes, lines.told)
     unknown = int(np.count_nonzero(found.told & ~found.phase_known()))
     if not unknown:
         return found

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.inference.derived import indistinct
-from ctid_cli.inference.sensitivities import Model, Parametric
+from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.checks import require_increasing
 from ctid_cli.signals.held import HeldSignal
@@ -120,21 +120,12 @@ class PoleBand:
     level: float
 
 
-class SystemWithDelay(NamedTuple):
-    """A model as an object of another library."""
-
-    system: Any
-    #: Delay that is not part of the object [s].
-    delay: float
-
-
 #: Whether bands come from a linearisation or from drawn parameters.
 Bands = Literal["linearised", "sampled"]
 #: Parameters that are drawn, and the seed: one fit always gets one band.
 DRAWS, SEED = 1000, 20261122
 #: Points of a curve for which nobody gave any.
 POINTS = 400
-STEP = HeldSignal(np.zeros(1), np.ones(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +134,6 @@ class Estimated:
 
     parametric: Parametric
     law: Uncertainty
-
-    @classmethod
-    def of(cls, model: Model, names: tuple[str, ...], law: Uncertainty) -> Estimated:
-        """Join a model, the names of all parameters of its fit, and their law."""
-        return cls(Parametric(model, names), law)
 
     @cached_property
     def reported(self) -> Array:
@@ -196,82 +182,85 @@ class Estimated:
             with suppress(DataError):
                 yield self.parametric.at(change)
 
+    def response_times(self, times: ArrayLike | None) -> Array:
+        """Instants that are asked for, or until the slowest mode has settled."""
+        if times is not None:
+            return instants(times)
+        model = self.parametric.model
+        decay = np.abs(self.parametric.poles()[0].real)
+        speeds = np.abs(self.parametric.poles()[0])
+        decay, speeds = decay[decay > 1e-9 * speeds.max(initial=0.0)], speeds[speeds > 0]
+        longest = 5.0 / float(decay.min()) if decay.size else 0.0
+        if speeds.size:
+            # A mode that hardly decays is shown for thirty periods, one much slower than all others in part.
+            longest = min(longest or np.inf, 60.0 * np.pi / float(speeds.min()))
+        return np.linspace(0.0, model.delay + (longest or 10.0 * (model.delay or 1.0)), POINTS)
 
-def simulated(
-    found: Estimated, signal: HeldSignal, times: ArrayLike | None, level: float, bands: Bands
-) -> ResponseBand:
-    """Output from rest."""
-    return _over_time(found, found.parametric, signal, _instants(signal.t if times is None else times), level, bands)
+    def over_time(self, model: Parametric, signal: HeldSignal, t: Array, level: float, bands: Bands) -> ResponseBand:
+        """Return the output from rest of the model, or of the model behind a differentiator."""
+        _check(level, bands)
+        value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
+        errors, half = self.intervals(slopes, level)
+        if bands == "linearised" or self.linear_only:
+            lower, upper = value - half, value + half
+        else:
+            behind = (one.derivative if model.differentiated else one for one in self.draws())
+            lower, upper = _quantiles(np.array([one.simulated(signal, t) for one in behind]), level)
+        return ResponseBand(t, value, errors, lower, upper, level)
 
-
-def step_response(found: Estimated, times: ArrayLike | None, level: float, bands: Bands) -> ResponseBand:
-    """Output for a step of size one at time zero."""
-    return _over_time(found, found.parametric, STEP, _response_times(found, times), level, bands)
-
-
-def impulse_response(found: Estimated, times: ArrayLike | None, level: float, bands: Bands) -> ResponseBand:
-    """Derivative of the step response."""
-    return _over_time(found, found.parametric.derivative, STEP, _response_times(found, times), level, bands)
-
-
-def frequency_response(found: Estimated, frequencies: ArrayLike | None, level: float, bands: Bands) -> FrequencyBand:
-    """Gain and phase: the parts of ``d ln G = dG/G`` are the relative change of the gain and that of the phase."""
-    _check(level, bands)
-    model = found.parametric.model
-    w = _grid(found.parametric) if frequencies is None else _checked_frequencies(frequencies)
-    value, phase = model.frequency_response(w), _phase(found.parametric, w)
-    gain = np.abs(value)
-    slopes = found.parametric.frequency_slopes(w)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        relative = slopes / value[:, None]
-    gain_error, wide = found.intervals(relative.real, level)
-    phase_error, turn = found.intervals(relative.imag, level)
-    if bands == "linearised" or found.linear_only:
-        lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
-    else:
-        drawn = np.array([one.model.frequency_response(w) for one in found.draws()])
+    def over_frequency(self, frequencies: ArrayLike | None, level: float, bands: Bands) -> FrequencyBand:
+        """Gain and phase: the parts of ``d ln G = dG/G`` are the relative change of the gain and that of the phase."""
+        _check(level, bands)
+        model = self.parametric.model
+        w = _grid(self.parametric) if frequencies is None else _checked_frequencies(frequencies)
+        value, phase = model.frequency_response(w), _phase(self.parametric, w)
+        gain = np.abs(value)
+        slopes = self.parametric.frequency_slopes(w)
         with np.errstate(invalid="ignore", divide="ignore"):
-            turned = np.angle(drawn / value)
-        lower, upper = _quantiles(np.abs(drawn), level)
-        low_phase, high_phase = (phase + end for end in _quantiles(turned, level))
-    covariance = found.of_parts(slopes)
-    return FrequencyBand(
-        w, value, covariance, gain, gain * gain_error, lower, upper, phase, phase_error, low_phase, high_phase, level
-    )
+            relative = slopes / value[:, None]
+        gain_error, wide = self.intervals(relative.real, level)
+        phase_error, turn = self.intervals(relative.imag, level)
+        if bands == "linearised" or self.linear_only:
+            lower, upper, low_phase, high_phase = gain * np.exp(-wide), gain * np.exp(wide), phase - turn, phase + turn
+        else:
+            drawn = np.array([one.model.frequency_response(w) for one in self.draws()])
+            with np.errstate(invalid="ignore", divide="ignore"):
+                turned = np.angle(drawn / value)
+            lower, upper = _quantiles(np.abs(drawn), level)
+            low_phase, high_phase = (phase + end for end in _quantiles(turned, level))
+        covariance = self.of_parts(slopes)
+        return FrequencyBand(
+            w,
+            value,
+            covariance,
+            gain,
+            gain * gain_error,
+            lower,
+            upper,
+            phase,
+            phase_error,
+            low_phase,
+            high_phase,
+            level,
+        )
 
-
-def poles(found: Estimated, level: float) -> PoleBand:
-    """Poles by the delta method."""
-    _check(level, "linearised")
-    value, slopes = found.parametric.poles()
-    slopes[~np.isfinite(slopes).all(axis=1)] = np.nan
-    covariance = found.of_parts(slopes)
-    for k in range(value.size):
-        others = np.arange(value.size) != k
-        if indistinct(value, k, slopes[k], others, found.covariance, lambda row: found.law.quantile(row, level)):
-            covariance[k] = np.nan
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.maximum(np.einsum("nkk->nk", covariance), 0.0))
-    half = found.law.reach(slopes.real, level) * errors[:, 0] + 1j * found.law.reach(slopes.imag, level) * errors[:, 1]
-    reach = np.full(value.size, _ellipse(level, found.degrees_of_freedom))
-    return PoleBand(value, covariance, np.hypot(*errors.T), value - half, value + half, reach, level)
-
-
-# --- how ------------------------------------------------------------------------------------------
-
-
-def _over_time(
-    found: Estimated, model: Parametric, signal: HeldSignal, t: Array, level: float, bands: Bands
-) -> ResponseBand:
-    _check(level, bands)
-    value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
-    errors, half = found.intervals(slopes, level)
-    if bands == "linearised" or found.linear_only:
-        lower, upper = value - half, value + half
-    else:
-        behind = (one.derivative if model.differentiated else one for one in found.draws())
-        lower, upper = _quantiles(np.array([one.simulated(signal, t) for one in behind]), level)
-    return ResponseBand(t, value, errors, lower, upper, level)
+    def poles(self, level: float) -> PoleBand:
+        """Poles by the delta method."""
+        _check(level, "linearised")
+        value, slopes = self.parametric.poles()
+        slopes[~np.isfinite(slopes).all(axis=1)] = np.nan
+        covariance = self.of_parts(slopes)
+        for k in range(value.size):
+            others = np.arange(value.size) != k
+            if indistinct(value, k, slopes[k], others, self.covariance, lambda row: self.law.quantile(row, level)):
+                covariance[k] = np.nan
+        with np.errstate(invalid="ignore"):
+            errors = np.sqrt(np.maximum(np.einsum("nkk->nk", covariance), 0.0))
+        half = (
+            self.law.reach(slopes.real, level) * errors[:, 0] + 1j * self.law.reach(slopes.imag, level) * errors[:, 1]
+        )
+        reach = np.full(value.size, _ellipse(level, self.degrees_of_freedom))
+        return PoleBand(value, covariance, np.hypot(*errors.T), value - half, value + half, reach, level)
 
 
 def _quantiles(drawn: Array, level: float) -> tuple[Array, Array]:
@@ -296,27 +285,13 @@ def _check(level: float, bands: str) -> None:
         raise UsageError(f"bands are {' or '.join(map(repr, get_args(Bands)))}; got {bands!r}")
 
 
-def _instants(times: ArrayLike) -> Array:
+def instants(times: ArrayLike) -> Array:
+    """Return instants that are asked for, checked."""
     t = np.atleast_1d(np.array(times, dtype=float))
     if t.ndim != 1 or not np.isfinite(t).all():
         raise DataError("the instants of a response must be a list of finite numbers")
     require_increasing("instants", t)
     return t
-
-
-def _response_times(found: Estimated, times: ArrayLike | None) -> Array:
-    """Instants that are asked for, or until the slowest mode has settled."""
-    if times is not None:
-        return _instants(times)
-    model = found.parametric.model
-    decay = np.abs(found.parametric.poles()[0].real)
-    speeds = np.abs(found.parametric.poles()[0])
-    decay, speeds = decay[decay > 1e-9 * speeds.max(initial=0.0)], speeds[speeds > 0]
-    longest = 5.0 / float(decay.min()) if decay.size else 0.0
-    if speeds.size:
-        # A mode that hardly decays is shown for thirty periods, and one that is much slower than all others in part.
-        longest = min(longest or np.inf, 60.0 * np.pi / float(speeds.min()))
-    return np.linspace(0.0, model.delay + (longest or 10.0 * (model.delay or 1.0)), POINTS)
 
 
 def _grid(parametric: Parametric) -> Array:

@@ -15,7 +15,7 @@ References
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -67,6 +67,8 @@ class NoiseModel:
     first_autocovariances: Array
     #: Variance of e [output unit^2].
     innovation_variance: float
+    #: Partial correlations at the lags 1 ... r, of the opposite sign [-], where they are known, shape (order,).
+    partial: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def order(self) -> int:
@@ -83,14 +85,6 @@ class NoiseModel:
         """The white noise e behind successive samples of v, which is taken as zero before."""
         white: Array = np.convolve(v, self.coefficients)[: v.size]
         return white
-
-    def autocovariance(self, count: int) -> Array:
-        """Autocovariances at the lags 0, 1 … count - 1 intervals."""
-        result = np.zeros((max(count, self.order + 1), 1))
-        result[: self.order + 1, 0] = self.first_autocovariances
-        # The Yule-Walker recursion: autocovariances beyond the order follow the noise-free difference equation.
-        autoregress(result[1:], self.coefficients)
-        return result[:count, 0]
 
     def covariance_of(self, columns: Rows) -> Array:
         r"""Covariance of the products of successive samples of v with columns.
@@ -144,7 +138,7 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> No
     lags = range(max_order + 1)
     products = [sum(float(block[k:] @ block[: max(block.size - k, 0)]) for block in blocks) for k in lags]
     covariances = np.array(products) / max(count, 1)
-    coefficients = np.ones(1)
+    coefficients, partial = np.ones(1), np.zeros(max_order)
     variance = float(covariances[0])
     best = NoiseModel(coefficients, covariances[:1], variance)
     if variance <= 0:
@@ -152,7 +146,7 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> No
     best_criterion = count * np.log(variance)
     for order in range(1, covariances.size):
         # Levinson's recursion
-        reflection = -float(coefficients @ covariances[order:0:-1]) / variance
+        reflection = partial[order - 1] = -float(coefficients @ covariances[order:0:-1]) / variance
         variance *= 1.0 - reflection**2
         if variance <= 0:
             break
@@ -160,7 +154,8 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> No
         coefficients = coefficients + reflection * coefficients[::-1]
         criterion = count * np.log(variance) + 2 * order
         if criterion < best_criterion:
-            best, best_criterion = NoiseModel(coefficients, covariances[: order + 1], variance), criterion
+            best_criterion = criterion
+            best = NoiseModel(coefficients, covariances[: order + 1], variance, partial[:order])
     return best
 
 
@@ -238,7 +233,7 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
     columns = np.column_stack((orthonormal, left / np.sqrt(power)))
     blocks = np.split(columns, np.cumsum([len(block) for block in psi])[:-1])
     most = min(len(errors) // SAMPLES_PER_ORDER, min(len(block) for block in blocks) // 2)
-    guess = _partial(fit_noise_model([block[:, -1] for block in blocks]).coefficients)[:most]
+    guess = fit_noise_model([block[:, -1] for block in blocks]).partial[:most]
     products = _products(blocks, min(most, max(ORDERS, guess.size)))
     (count, size), number = columns.shape, len(blocks)
 
@@ -301,12 +296,3 @@ def _products(blocks: Sequence[Array], order: int) -> Array:
             products[i, j] = sum(block[i : len(block) - j].T @ block[j : len(block) - i] for block in blocks)
             products[j, i] = products[i, j].T
     return products
-
-
-def _partial(coefficients: Array) -> Array:
-    """Partial correlations of given coefficients: Levinson's recursion backwards."""
-    c, found = coefficients, []
-    while c.size > 1:
-        found.append(float(c[-1]))
-        c = ((c - c[-1] * c[::-1]) / (1.0 - c[-1] ** 2))[:-1]
-    return np.array(found[::-1])

@@ -13,9 +13,10 @@ and of a submodel ``B/(p^l A)`` of a sum, whose coefficients go by the powers of
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,13 +24,11 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array, ComplexArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import standard_rows
-from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.simulate import feedthrough, simulate
-from ctid_cli.filtering.submodels import SubmodelFilter
-from ctid_cli.inference.derived import pole_slopes
-from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.factoring import unfactored
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.factoring import pole_jacobian, unfactored
+from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -86,50 +85,109 @@ class Structure:
         return 3 * self.poles + 1
 
 
-def sensitivities(
-    model: AdditiveModel | TransferFunction,
-    signal: HeldSignal,
-    times: ArrayLike,
-    zeros: int | None = None,
-    *,
-    estimate_delay: bool = False,
-) -> Array:
-    """Derivatives of a model's output at given times by its parameters, of a fraction also by its delay."""
-    instants = np.asarray(times, dtype=float)
-    data = filter_data(Record(instants, np.zeros(instants.size), signal), start=-np.inf)
-    if isinstance(model, AdditiveModel):
-        found = SubmodelFilter(data, model.terms, model.delay).rows(model.theta)
-        if found is None:
-            raise DataError("the response of the system is not finite")
-        return found[0]
-    structure = Structure(model.order, model.numerator.size - 1 if zeros is None else zeros, estimate_delay)
-    if model.order == 0:
-        return np.column_stack([signal.at(instants - model.delay), *[np.zeros(instants.size)] * estimate_delay])
-    n, (direct, rest) = model.order, feedthrough(model)
-    rows = standard_rows(data, model.denominator, rest if direct else model.numerator, model.delay)
-    if structure.zeros == n:
-        # p^n/A u = u - sum of a_i p^(n-i)/A u, and x is what passes at once besides. Between the breaks of a held input
-        # the derivative by the delay has nothing of that.
-        rows[:, n + 1 : 2 * n + 1] += direct * rows[:, :n]
-        rows[:, n] -= rows[:, n - 1 :: -1] @ model.denominator[1:]
-    return np.asarray(rows[:, structure.sensitivity_rows] * structure.signs)
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A fraction ``B/(p^l A)``: all of a transfer function, or a submodel of a sum."""
 
-
-class _Part(NamedTuple):
-    """A fraction ``B/(p^l A)`` of a model, and the powers of p that its parameters multiply."""
-
+    #: B and A in descending powers; A is monic in a transfer function and has the constant term 1 in a submodel.
     numerator: Array
     denominator: Array
     integrators: int
-    a_powers: range
-    b_powers: range
+    #: Powers of p that the parameters multiply, in the order of theta.
+    a_powers: tuple[int, ...]
+    b_powers: tuple[int, ...]
 
-    @classmethod
-    def of_submodel(cls, part: Submodel) -> _Part:
-        """Lay out a submodel of a sum, whose coefficients go by rising powers."""
-        term = part.term()
-        a_powers, b_powers = range(1, term.poles + 1), range(term.zeros + 1)
-        return cls(part.numerator, part.denominator, part.integrators, a_powers, b_powers)
+    @property
+    def size(self) -> int:
+        """Number of coefficients that are parameters."""
+        return len(self.a_powers) + len(self.b_powers)
+
+    @property
+    def derivative(self) -> Part:
+        """The part behind a differentiator."""
+        return replace(self, numerator=np.append(self.numerator, 0.0), b_powers=tuple(k + 1 for k in self.b_powers))
+
+    def fraction(self, delay: float) -> TransferFunction:
+        """Return the part as a transfer function."""
+        return TransferFunction(self.numerator, np.append(self.denominator, np.zeros(self.integrators)), delay)
+
+    def frequency_slopes(self, s: ComplexArray, delay: float) -> list[ComplexArray]:
+        """Return the derivatives of the response at ``s = j w`` by the coefficients."""
+        own = np.polyval(self.denominator, s)
+        over = s**self.integrators * own * np.exp(s * delay)
+        response = np.polyval(self.numerator, s) / over
+        by_a = [np.asarray(-(s**k) / own * response) for k in self.a_powers]
+        return by_a + [np.asarray(s**k / over) for k in self.b_powers]
+
+    def output_slopes(self, data: FilterData, signal: HeldSignal, delay: float) -> Array:
+        """Return the derivatives of the output by the coefficients and, in the last column, by the delay."""
+        highest, model = self.denominator[0], self.fraction(delay)
+        a = self.denominator / highest
+        n, order, (direct, rest) = a.size - 1, model.order, feedthrough(model)
+        if order == 0:
+            return np.column_stack((signal.at(data.t - delay), np.zeros(data.t.size)))
+        rows = standard_rows(data, a, rest, delay, integrators=self.integrators)
+        driven, u, filtered = rows[:, :order], rows[:, order], rows[:, order + 1 : order + 1 + n]
+        # The rows are those of the strictly proper part of the model.
+        x = direct * u - rows[:, order + 2 * n + 1]
+        if direct:
+            filtered = filtered + direct * driven[:, self.integrators :]
+        by_a, by_b = _of_powers(filtered, x, a, self.a_powers), _of_powers(driven, u, a, self.b_powers)
+        # Between the breaks of a held input the derivative by the delay has nothing of what passes at once.
+        scales = np.repeat((-1.0 / highest, 1.0 / highest, -1.0), (len(self.a_powers), len(self.b_powers), 1))
+        return np.asarray(np.hstack((by_a, by_b, rows[:, order + 2 * n + 2, None])) * scales)
+
+    def pole_slopes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return the poles but for the integrators, and their derivatives ``-p^k/A'(p)`` by the coefficients of A."""
+        poles = sorted_roots(self.denominator)
+        with np.errstate(invalid="ignore"):
+            by_constant = pole_jacobian(self.denominator / self.denominator[0], poles)[:, -1:] / self.denominator[0]
+            return poles, by_constant * poles[:, None] ** np.asarray(self.a_powers, dtype=int)
+
+
+def _of_powers(lower: Array, signal: Array, a: Array, powers: tuple[int, ...]) -> Array:
+    """Columns ``p^k/(p^l A) s`` for given k, from those with k below the degree of the denominator and s itself."""
+    degree = lower.shape[1]
+    if degree in powers:
+        lower = np.column_stack((lower, signal - lower[:, degree - a.size + 1 :] @ a[:0:-1]))
+    return lower[:, list(powers)]
+
+
+def parts_of(model: Model, zeros: int | None = None) -> list[Part]:
+    """Return the submodels of a sum, whose coefficients go by rising powers, or the one fraction of another model.
+
+    A fraction may have a numerator with leading coefficients that are zero: then its number of zeros is given.
+    """
+    if isinstance(model, AdditiveModel):
+        return [
+            Part(
+                one.numerator,
+                one.denominator,
+                one.integrators,
+                tuple(range(1, one.denominator.size)),
+                tuple(range(one.numerator.size)),
+            )
+            for one in model.submodels
+        ]
+    m = model.numerator.size - 1 if zeros is None else zeros
+    a_powers, b_powers = tuple(range(model.order - 1, -1, -1)), tuple(range(m, -1, -1))
+    return [Part(model.numerator, model.denominator, 0, a_powers, b_powers)]
+
+
+def sensitivities(
+    model: Model, signal: HeldSignal, times: ArrayLike, zeros: int | None = None, *, estimate_delay: bool = False
+) -> Array:
+    """Derivatives of a model's output at given times by its coefficients, and by its delay if that is estimated."""
+    found = _output_slopes(parts_of(model, zeros), model.delay, signal, times)
+    return found if estimate_delay else found[:, :-1]
+
+
+def _output_slopes(parts: Sequence[Part], delay: float, signal: HeldSignal, times: ArrayLike) -> Array:
+    """Derivatives of the output from rest by the coefficients of all parts and, in the last column, by the delay."""
+    instants = np.asarray(times, dtype=float)
+    data = filter_data(Record(instants, np.zeros(instants.size), signal), start=-np.inf)
+    found = [part.output_slopes(data, signal, delay) for part in parts]
+    return np.column_stack((*(slopes[:, :-1] for slopes in found), np.sum([s[:, -1] for s in found], axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +202,9 @@ class Parametric:
 
     @cached_property
     def zeros(self) -> int:
-        """Degree of the numerator of a fraction, a leading coefficient that is zero included."""
+        """Degree of the numerator as one transfer function, leading coefficients that are zero included."""
         own = [int(name[1:]) for name in self.names if re.fullmatch(r"b\d+", name)]
         return max([self.fraction.numerator.size - 1, *own])
-
-    @property
-    def zeros_of_fraction(self) -> int:
-        """The same of the model as one transfer function."""
-        return self.fraction.numerator.size - 1 if isinstance(self.model, AdditiveModel) else self.zeros
 
     @property
     def fraction(self) -> TransferFunction:
@@ -202,47 +255,25 @@ class Parametric:
         return found
 
     @cached_property
-    def _parts(self) -> list[_Part]:
-        model = self.model
-        if isinstance(model, AdditiveModel):
-            return [_Part.of_submodel(part) for part in model.submodels]
-        n, m = model.order, self.zeros
-        return [_Part(model.numerator, model.denominator, 0, range(n - 1, -1, -1), range(m, -1, -1))]
+    def parts(self) -> list[Part]:
+        """Its fractions, behind the differentiator where there is one."""
+        parts = parts_of(self.model, None if isinstance(self.model, AdditiveModel) else self.zeros)
+        return [part.derivative for part in parts] if self.differentiated else parts
 
     def frequency_slopes(self, frequencies: Array) -> ComplexArray:
         """Derivatives of ``G(j w)``, shape (N, p)."""
         s = np.asarray(1j * frequencies, dtype=complex)
-        delayed = np.exp(-s * self.model.delay)
-        columns: list[ComplexArray] = []
-        for part in self._parts:
-            own = np.polyval(part.denominator, s)
-            over = s**part.integrators * own / delayed
-            response = np.polyval(part.numerator, s) / over
-            columns += [np.asarray(-(s**k) / own * response) for k in part.a_powers]
-            columns += [np.asarray(s**k / over) for k in part.b_powers]
-        columns.append(-s * self.model.frequency_response(frequencies))
-        return self._among_all(np.column_stack(columns))
+        columns = [column for part in self.parts for column in part.frequency_slopes(s, self.model.delay)]
+        return self._among_all(np.column_stack((*columns, -s * self.model.frequency_response(frequencies))))
 
     def simulated(self, signal: HeldSignal, times: Array) -> Array:
         """Output from rest."""
-        return np.asarray(np.sum([simulate(part, signal, times) for part in self._fractions], axis=0))
+        fractions = [part.fraction(self.model.delay) for part in self.parts]
+        return np.asarray(np.sum([simulate(fraction, signal, times) for fraction in fractions], axis=0))
 
     def output_slopes(self, signal: HeldSignal, times: Array) -> Array:
         """Derivatives of the output from rest, shape (N, p)."""
-        columns = []
-        delay = np.zeros((times.size, 1))
-        # What a differentiator is behind has no constant term: the numerator has one more coefficient without it.
-        more = int(self.differentiated)
-        if isinstance(self.model, AdditiveModel):
-            for part in self._submodels:
-                found = sensitivities(AdditiveModel([part], self.model.delay), signal, times)
-                columns.append(np.delete(found, np.s_[part.term().poles : part.term().poles + more], axis=1))
-            if "delay" in self.names:
-                delay += sum(sensitivities(one, signal, times, estimate_delay=True)[:, -1:] for one in self._fractions)
-        else:
-            found = sensitivities(self._fractions[0], signal, times, self.zeros + more, estimate_delay=True)
-            columns, delay = [found[:, : found.shape[1] - 1 - more]], found[:, -1:]
-        return self._among_all(np.hstack([*columns, delay]))
+        return self._among_all(_output_slopes(self.parts, self.model.delay, signal, times))
 
     @property
     def derivative(self) -> Parametric:
@@ -255,33 +286,14 @@ class Parametric:
             )
         return replace(self, differentiated=True)
 
-    @property
-    def _submodels(self) -> list[Submodel]:
-        """The submodels of a sum, differentiated where that is asked for."""
-        assert isinstance(self.model, AdditiveModel)
-        return [Submodel(self._driven(s.numerator), s.denominator, s.integrators) for s in self.model.submodels]
-
-    @property
-    def _fractions(self) -> list[TransferFunction]:
-        """The model, or each of its submodels, with the delay, differentiated where that is asked for."""
-        model = self.model
-        if isinstance(model, AdditiveModel):
-            parts = [part.transfer_function() for part in self._submodels]
-            return [TransferFunction(part.numerator, part.denominator, model.delay) for part in parts]
-        return [TransferFunction(self._driven(model.numerator), model.denominator, model.delay)]
-
-    def _driven(self, numerator: Array) -> Array:
-        """A numerator times p where the model is differentiated."""
-        return np.append(numerator, 0.0) if self.differentiated else numerator
-
     def poles(self) -> tuple[ComplexArray, ComplexArray]:
         """Poles, and their derivatives, shape (n, p); integrators of submodels stay where they are."""
         rows, found, first = [], [], 0
-        for part in self._parts:
-            poles, jacobian = pole_slopes(part.denominator, part.a_powers)
+        for part in self.parts:
+            poles, jacobian = part.pole_slopes()
             slopes = np.zeros((poles.size + part.integrators, len(self.every)), dtype=complex)
             slopes[: poles.size, first : first + len(part.a_powers)] = jacobian
             found.append(np.concatenate((poles, np.zeros(part.integrators))))
             rows.append(slopes)
-            first += len(part.a_powers) + len(part.b_powers)
+            first += part.size
         return np.concatenate(found), self._among_all(np.vstack(rows))

@@ -122,9 +122,7 @@ class Uncertainty:
 
     def quantile(self, gradient: Array, level: float = 0.95) -> float:
         """Standard errors to each side of a quantity with this gradient by the leading parameters."""
-        if self.bootstrap is None:
-            return student_quantile(self.degrees_of_freedom, level)
-        return self.bootstrap.quantile(gradient @ self.tangent[: gradient.size], level)
+        return float(self.reach(gradient[None], level)[0])
 
     def quantiles(self, level: float = 0.95) -> Array:
         """Standard errors to each side of every parameter, shape (p,)."""
@@ -134,7 +132,8 @@ class Uncertainty:
         """Standard errors to each side of quantities with these gradients, shape (N,)."""
         if self.bootstrap is None:
             return np.full(len(gradients), student_quantile(self.degrees_of_freedom, level))
-        return np.array([self.quantile(row, level) for row in gradients])
+        own = gradients @ self.tangent[: gradients.shape[1]]
+        return np.array([self.bootstrap.quantile(row, level) for row in own])
 
     def transformed(self, jacobian: Array) -> "Uncertainty":
         """Uncertainty of parameters with these derivatives by the present ones, shape (q, p)."""

@@ -11,7 +11,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
-from ctid_cli.inference.fit import FittedModel
+from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.reporting.estimate import Units

@@ -6,6 +6,7 @@ phase, of the step response, and of the output for an input that is not the expe
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.inference import model_responses
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.fitted_model import STEP, FittedModel
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.layout import Table, csv_text
@@ -42,16 +43,16 @@ def other_input(unit: float) -> HeldSignal:
     return HeldSignal(np.cumsum(rng.uniform(0.3, 2.0, 20)) * unit, rng.standard_normal(20))
 
 
-def hits_of(found: model_responses.Estimated, truth: TransferFunction, unit: float) -> dict[str, Array]:
+def hits_of(fit: FittedModel, truth: TransferFunction, unit: float) -> dict[str, Array]:
     """Which true values the bands of one fit hold, by response."""
     w, t, signal = OVER / unit, truth.delay + AFTER * unit, other_input(unit)
     late = truth.delay + unit * np.array([3.0, 8.0, 12.0, 17.0])
-    frequency = model_responses.frequency_response(found, w, 0.95, "linearised")
-    step = model_responses.step_response(found, t, 0.95, "linearised")
-    output = model_responses.simulated(found, signal, late, 0.95, "linearised")
+    frequency = fit.frequency_response(w)
+    step = fit.step_response(t)
+    output = fit.simulate(signal, late)
     true = truth.frequency_response(w)
     turned = np.angle(true * np.exp(-1j * frequency.phase))
-    x, y = simulate(truth, model_responses.STEP, t), simulate(truth, signal, late)
+    x, y = simulate(truth, STEP, t), simulate(truth, signal, late)
     return {
         "gain": (frequency.gain_lower <= np.abs(true)) & (np.abs(true) <= frequency.gain_upper),
         "phase": np.abs(turned) <= frequency.phase_upper - frequency.phase,
@@ -68,9 +69,7 @@ def coverage(letter: str, config: str, kind: Any, unit: float, runs: int) -> lis
     for replicate in range(runs):
         fit = estimator.estimator.prepare(cell.dataset(replicate).record).fit(None)
         if fit.status is Status.CONVERGED:
-            uncertainty = fit.uncertainty(kind)
-            found = model_responses.Estimated.of(fit.model, fit.parameter_names, uncertainty)
-            held.append(hits_of(found, truth, unit))
+            held.append(hits_of(replace(fit, law=fit.uncertainty(kind)), truth, unit))
     lines = []
     for name in RESPONSES:
         places = OVER if name in ("gain", "phase") else AFTER if name == "step response" else [3.0, 8.0, 12.0, 17.0]

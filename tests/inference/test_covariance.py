@@ -14,6 +14,7 @@ from ctid_cli.inference.covariance import (
     white_noise_covariance,
 )
 from ctid_cli.inference.noise_model import fit_residual_noise
+from tests.inference.autoregression import autocovariance
 
 
 def sensitivities(seed, scales):
@@ -80,7 +81,7 @@ def covariance_of(psi, residuals, regular=True):
 
 def test_is_the_double_sum_over_all_pairs_of_samples():
     psi, v = regressors(200), noise(np.random.default_rng(1), 200)
-    R = toeplitz(fit_residual_noise([psi], [v]).autocovariance(200))
+    R = toeplitz(autocovariance(fit_residual_noise([psi], [v]), 200))
     M = np.linalg.inv(psi.T @ psi)
     assert largest_relative_error(covariance_of([psi], [v]), M @ psi.T @ R @ psi @ M) < 1e-9
 
@@ -128,7 +129,7 @@ def test_covariance_follows_the_units(regular):
 def test_experiments_are_independent_of_each_other():
     psi = [regressors(150, 1), regressors(90, 2)]
     v = [noise(np.random.default_rng(1), 150), noise(np.random.default_rng(2), 90)]
-    r = fit_residual_noise(psi, v).autocovariance(150)
+    r = autocovariance(fit_residual_noise(psi, v), 150)
     stacked = np.vstack(psi)
     M = np.linalg.inv(stacked.T @ stacked)
     sigma = stacked.T @ block_diag(toeplitz(r), toeplitz(r[:90])) @ stacked
@@ -147,12 +148,6 @@ def test_undefined_where_the_data_say_nothing(regular):
 NAMES = ("a1", "b0", "delay")
 
 
-def described(C, theta, names, number, hessian=None):
-    C = np.asarray(C)
-    H = hessian if hessian is not None else np.linalg.inv(C) if np.isfinite(C).all() else np.full(C.shape, np.nan)
-    return describe_conditioning(C, np.asarray(theta), names, number, np.asarray(H))
-
-
 def covariance(errors, pairs=()):
     correlation = np.eye(len(errors))
     for i, j, value in pairs:
@@ -160,51 +155,55 @@ def covariance(errors, pairs=()):
     return correlation * np.outer(errors, errors)
 
 
-def test_nothing_is_said_of_a_sound_covariance():
-    assert described(covariance([0.1, 0.1, 0.1], [(0, 1, 0.998)]), [1.0, 2.0, 3.0], NAMES, 1e4) == []
+FIVE = ("a1", "a2", "b0", "b1", "delay")
+# Each pair of parameters 0.6 to 0.8, but the third is nearly the sum of the others.
+TOGETHER = np.random.default_rng(1).standard_normal((1000, 3))
+TOGETHER[:, 2] = TOGETHER[:, 0] + TOGETHER[:, 1] + 0.01 * TOGETHER[:, 2]
+UNDEFINED = np.full((3, 3), np.nan)
+DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
 
 
-def test_a_standard_error_of_many_times_the_value():
-    (sentence,) = described(covariance([0.1, 25.0, 0.1]), [1.0, -2.0, 3.0], NAMES, 10.0)
-    assert sentence.startswith("b0 = -2 has a standard error of 25, 12 times its value")
-    assert described(covariance([0.1, 19.0, 0.1]), [1.0, -2.0, 3.0], NAMES, 10.0) == []
-    # an initial state or an offset may be zero
-    assert described(covariance([0.1, 0.1]), [1.0, 0.0], ("a1", "offset"), 10.0) == []
-
-
-def test_two_parameters_that_cannot_be_told_apart():
-    C = covariance([0.1, 0.1, 0.1], [(1, 2, -0.9995)])
-    (sentence,) = described(C, [1.0, 2.0, 3.0], NAMES, 4000.0)
-    assert "b0 and delay can hardly be told apart by these data (correlation -0.99950)" in sentence
-    assert "sharper changes" in sentence  # without a zero it is not the zero
-    C = covariance([0.1] * 5, [(2, 4, 0.9995)])
-    (sentence,) = described(C, [1.0, 2.0, 3.0, 4.0, 5.0], ("a1", "a2", "b0", "b1", "delay"), 4000.0)
-    assert "A zero and a delay have nearly the same effect here" in sentence
-    assert "use fewer zeros" in sentence
-
-
-def test_three_parameters_that_cannot_be_told_apart_together():
-    # each pair 0.6 to 0.8, but the third is nearly the sum of the others
-    rng = np.random.default_rng(1)
-    x = rng.standard_normal((1000, 3))
-    x[:, 2] = x[:, 0] + x[:, 1] + 0.01 * x[:, 2]
-    C = np.cov(x.T)
-    (sentence,) = described(C, [5.0, 5.0, 5.0], ("a1", "a2", "b0"), 1e5)
-    assert sentence.startswith("a1, a2 and b0 can hardly be told apart by these data (multiple correlations")
-
-
-def test_a_singular_matrix_names_its_direction():
-    H = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
-    undefined = np.full((3, 3), np.nan)
-    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf, hessian=H)
-    assert "do not determine b0 and delay one by one (singular equations); no standard errors can be given" in sentence
-    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf)
-    assert "all the parameters together" in sentence
-    (sentence,) = described(undefined, [1.0, 2.0, 3.0], NAMES, np.inf, hessian=np.diag([1.0, 1.0, 0.0]))
-    assert sentence.startswith("delay has no effect that these data show")
-
-
-def test_nearly_singular_is_said_once():
-    C = covariance([0.1, 0.1, 0.1], [(1, 2, 1 - 1e-9)])
-    (sentence,) = described(C, [1.0, 2.0, 3.0], NAMES, 2e9)
-    assert "b0 and delay one by one (condition number 2.0e+09); their standard errors are not reliable" in sentence
+@pytest.mark.parametrize(
+    ("C", "theta", "names", "number", "hessian", "words"),
+    [
+        (covariance([0.1, 0.1, 0.1], [(0, 1, 0.998)]), [1, 2, 3], NAMES, 1e4, None, ()),
+        (covariance([0.1, 19.0, 0.1]), [1, -2, 3], NAMES, 10.0, None, ()),
+        # An initial state or an offset may be zero.
+        (covariance([0.1, 0.1]), [1, 0], ("a1", "offset"), 10.0, None, ()),
+        (covariance([0.1, 25, 0.1]), [1, -2, 3], NAMES, 10.0, None, ("b0 = -2 has a standard error of 25, 12 times",)),
+        (
+            covariance([0.1, 0.1, 0.1], [(1, 2, -0.9995)]),
+            *([1, 2, 3], NAMES, 4000.0, None),
+            # Without a zero it is not the zero.
+            ("b0 and delay can hardly be told apart by these data (correlation -0.99950)", "sharper changes"),
+        ),
+        (
+            covariance([0.1] * 5, [(2, 4, 0.9995)]),
+            *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
+            ("A zero and a delay have nearly the same effect here", "use fewer zeros"),
+        ),
+        (
+            np.cov(TOGETHER.T),
+            *([5, 5, 5], ("a1", "a2", "b0"), 1e5, None),
+            ("a1, a2 and b0 can hardly be told apart by these data (multiple correlations",),
+        ),
+        (
+            UNDEFINED,
+            *([1, 2, 3], NAMES, np.inf, DIRECTION),
+            ("do not determine b0 and delay one by one (singular equations); no standard errors can be given",),
+        ),
+        (UNDEFINED, [1, 2, 3], NAMES, np.inf, None, ("all the parameters together",)),
+        (UNDEFINED, [1, 2, 3], NAMES, np.inf, np.diag([1, 1, 0]), ("delay has no effect that these data show",)),
+        (
+            covariance([0.1, 0.1, 0.1], [(1, 2, 1 - 1e-9)]),
+            *([1, 2, 3], NAMES, 2e9, None),
+            ("b0 and delay one by one (condition number 2.0e+09); their standard errors are not reliable",),
+        ),
+    ],
+)
+def test_what_is_said_of_a_covariance(C, theta, names, number, hessian, words):
+    if hessian is None:
+        hessian = np.linalg.inv(C) if np.isfinite(C).all() else UNDEFINED
+    found = describe_conditioning(C, np.array(theta, dtype=float), names, number, np.asarray(hessian, dtype=float))
+    assert len(found) == bool(words)
+    assert all(word in sentence for sentence in found for word in words)

@@ -10,6 +10,7 @@ from ctid_cli.inference.spectral_methods import find_period, hold_factor
 INTERVAL, PERIOD = 0.1, 256
 MODEL = TransferFunction([2.0, 1.0], [1.0, 1.0, 3.0], delay=0.37)
 ODD = np.arange(1, 100, 2)
+T200 = INTERVAL * np.arange(200)
 
 
 def multisine(seed: int, harmonics: np.ndarray = ODD) -> np.ndarray:
@@ -187,29 +188,24 @@ def test_the_period_of_an_input():
     assert find_period(np.linspace(0.0, 1.0, 500)) is None
 
 
+def flat_or_short(n, u=None):
+    t = INTERVAL * np.arange(n)
+    return Record.from_arrays(t, np.sin(30 * t) if u is None else np.full(n, u), t)
+
+
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("record", "options", "words"),
     [
-        ({"method": "welch", "segment": 1900}, "segments of 1900 samples are too long"),
-        ({"method": "periodic"}, "the input does not repeat itself"),
-        ({"period": 1500}, "hold no two periods of 1500"),
+        (random_record(0), {"method": "welch", "segment": 1900}, "segments of 1900 samples are too long"),
+        (random_record(0), {"method": "periodic"}, "the input does not repeat itself"),
+        (random_record(0), {"period": 1500}, "hold no two periods of 1500"),
+        (random_record(0), {"half_width": 2}, "half_width"),
+        (flat_or_short(200, 1.0), {}, "the input is constant"),
+        (flat_or_short(10), {}, "at least"),
+        ([random_record(0), random_record(1)], {}, "do not all repeat"),
+        (Record.from_arrays(T200**1.01, np.sin(T200**2), np.cos(T200)), {"method": "welch"}, "the clock is irregular"),
     ],
 )
-def test_options_that_do_not_fit_the_record(options, words):
-    with pytest.raises(DataError, match=words):
-        estimate_frequency_response(random_record(0), **options)
-
-
-def test_records_that_have_no_frequency_response():
-    t = INTERVAL * np.arange(200)
-    with pytest.raises(DataError, match="the input is constant"):
-        estimate_frequency_response(Record.from_arrays(t, np.ones(t.size), t))
-    with pytest.raises(DataError, match="at least"):
-        estimate_frequency_response(Record.from_arrays(t[:10], np.sin(t[:10] * 30), t[:10]))
-    with pytest.raises(DataError, match="do not all repeat"):
-        estimate_frequency_response([random_record(0), random_record(1)])
-    irregular = Record.from_arrays(t**1.01, np.sin(t * t), np.cos(t))
-    with pytest.raises(DataError, match="the clock is irregular"):
-        estimate_frequency_response(irregular, method="welch")
-    with pytest.raises(ValueError, match="half_width"):
-        estimate_frequency_response(random_record(0), half_width=2)
+def test_records_and_options_that_give_no_frequency_response(record, options, words):
+    with pytest.raises((DataError, ValueError), match=words):
+        estimate_frequency_response(record, **options)

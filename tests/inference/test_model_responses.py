@@ -14,11 +14,13 @@ from ctid_cli.inference.sensitivities import Parametric
 
 NUMBERS = (Status.CONVERGED, 0.1, 90.0, 0.99, 100, 3, 12.0)
 T = np.linspace(0.0, 10.0, 101)
+IRREGULAR = np.cumsum(np.random.default_rng(1).uniform(0.02, 0.18, 100))
 W = np.geomspace(0.1, 20.0, 30)
 SIGNAL = HeldSignal(np.arange(0.0, 10.0, 0.37), np.random.default_rng(0).standard_normal(28))
 FOH = HeldSignal(SIGNAL.t, SIGNAL.values, "foh")
 SECOND = TransferFunction([2.0, 1.0], [1.0, 0.8, 2.0], 0.333)
 SUM = AdditiveModel([Submodel([3.0, 1.0], [0.25, 0.25, 1.0]), Submodel([0.3], [1.0], 2)], 0.333)
+BODY = AdditiveModel([Submodel([0.2, 0.4], [0.3, 1.0], 1), Submodel([2.0], [1.0])], 0.02)
 MODELS = {
     "fraction": (SECOND, ("a1", "a2", "b0", "b1", "delay")),
     "leading zero": (TransferFunction([1.0], [1.0, 0.8, 2.0], 0.333), ("a1", "a2", "b0", "b1", "delay")),
@@ -26,6 +28,7 @@ MODELS = {
     "biproper": (TransferFunction([0.5, 2.0, 1.0], [1.0, 0.8, 2.0], 0.333), ("a1", "a2", "b0", "b1", "b2")),
     "gain": (TransferFunction([2.0], [1.0], 0.5), ("b0",)),
     "sum": (SUM, (*SUM.names, "delay")),
+    "sum, gain": (BODY, BODY.names),
     "sum, held": (SUM, ("g1_a1", "g1_b1", "g2_b0")),
 }
 
@@ -50,10 +53,10 @@ def same(one, other):
 def test_derivatives_are_exact(name):
     parametric = Parametric(*MODELS[name])
     assert same(parametric.frequency_slopes(W), central(parametric, lambda one: one.model.frequency_response(W)))
-    for signal in (SIGNAL, FOH):
-        slopes = parametric.output_slopes(signal, T)
-        assert same(slopes, central(parametric, lambda one, s=signal: one.simulated(s, T)))
-    if name not in ("biproper", "gain"):
+    for signal, t in ((SIGNAL, T), (FOH, T), (SIGNAL, IRREGULAR), (FOH, IRREGULAR)):
+        slopes = parametric.output_slopes(signal, t)
+        assert same(slopes, central(parametric, lambda one, s=signal, t=t: one.simulated(s, t)))
+    if name not in ("biproper", "gain", "sum, gain"):
         behind, step = parametric.derivative, HeldSignal([0.0], [1.0])
         assert same(behind.output_slopes(step, T), central(behind, lambda one: one.simulated(step, T)))
         h = 1e-5

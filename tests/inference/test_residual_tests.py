@@ -18,6 +18,7 @@ from ctid_cli.inference.residual_tests import (
     rest_of,
 )
 from ctid_cli.signals.record import Record
+from tests.inference.autoregression import autocovariance
 
 
 def test_whiteness_by_hand():
@@ -148,7 +149,7 @@ def test_dependence_is_the_chi_square_form_of_dense_matrices():
     count, noise = 2 * ROWS + 5, NoiseModel(np.array([1.0, -0.6]), np.array([1.0, 0.6]) / 0.64, 1.0)
     e, columns, beside = (RNG.standard_normal((count, width)) for width in (1, 4, 2))
     rest = least_squares_rest(columns, beside)
-    covariance = rest.T @ matmul_toeplitz(noise.autocovariance(count), rest) * count / (count - 2)
+    covariance = rest.T @ matmul_toeplitz(autocovariance(noise, count), rest) * count / (count - 2)
     products = columns.T @ least_squares_rest(e, beside)
     found = dependence(e[:, 0], columns, noise, beside)
     assert found.statistic == pytest.approx((products.T @ np.linalg.solve(covariance, products)).item(), rel=1e-9)
