@@ -6,20 +6,19 @@ Useful redundancy over the delay: solver paths on the costs of several filters, 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import comb
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, descend
-from ctid_cli.estimation.iteration import Steps, solve_scaled
+from ctid_cli.estimation.iteration import Steps
 from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, minimise_redundantly
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra
-from ctid_cli.filtering.spectral_kernels import least_cost, projected_moments
+from ctid_cli.filtering.spectral_kernels import least_cost, least_squares
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
@@ -100,29 +99,18 @@ class FilteredCosts(NamedTuple):
         """Least cost of one filter over starts and, if asked for, from least squares."""
         reach = self.reach[k]
         data = self.frequencies[:reach], self.outputs[:reach], inputs[:reach], self.weights[k, :reach]
-        tried = [start[:-1] for start in starts]
+        sizes, tried = (self.zeros, self.integrators), [start[: self.poles] for start in starts]
         if own:
-            start = self._least_squares(data, self.svf_cutoffs[k])
-            tried += [] if start is None else [start]
+            # The state-variable filter 1/(p + w)^n.
+            solved, a = least_squares(*data, np.poly(np.full(self.poles, -self.svf_cutoffs[k]))[1:], *sizes)
+            if solved:
+                tried.append(reflect_unstable(np.append(1.0, a))[1:])
         best = Minimum(np.zeros(self.size), np.inf)
         for start in tried:
-            theta, squared_error, step = least_cost(*data, start, self.poles, self.integrators, *self.effort)
+            theta, squared_error, step = least_cost(*data, start, *sizes, *self.effort)
             if squared_error < best.squared_error:
                 best = Minimum(np.append(theta, delay), squared_error, step)
         return best
-
-    def _least_squares(self, data: tuple[Array, ComplexArray, ComplexArray, Array], cutoff: float) -> Array | None:
-        """Least-squares estimate of the coefficients with the state-variable filter ``1/(p + w)^n``.
-
-        ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
-        """
-        svf = np.array([comb(self.poles, k) * cutoff**k for k in range(self.poles + 1)])
-        gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1), self.integrators)
-        lengths = np.diag(gram)
-        solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)
-        if not solved:
-            return None
-        return np.concatenate((reflect_unstable(svf + np.append(0.0, theta[: self.poles]))[1:], theta[self.poles : -2]))
 
     @property
     def effort(self) -> tuple[int, float, int]:
