@@ -11,8 +11,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.delay_search import Descent
-from ctid_cli.estimation.iteration import Iterated, Problem
+from ctid_cli.estimation.iteration import Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
@@ -256,17 +255,16 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
 # --- results ---------------------------------------------------------------------------------------
 
 
-def history_entry(stage: str, iteration: int, problem: Problem, theta: Array, squared_error: float) -> IterationRecord:
-    """Describe one accepted iteration."""
-    a, b, delay = problem.split(theta)
-    cost = squared_error / problem.samples
+def history_entry(stage: str, iteration: int, problem: Problem, row: Array) -> IterationRecord:
+    """Describe one accepted iteration by its parameters, with their squared error behind them."""
+    a, b, delay = problem.split(row[:-1])
+    cost = float(row[-1]) / problem.samples
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
-def history_of(stage: str, problem: Problem, result: Iterated | Descent | None) -> list[IterationRecord]:
-    """Describe the start and the accepted steps of an iteration."""
-    path = np.empty((0, 1)) if result is None else result.path
-    return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]
+def history_of(stage: str, problem: Problem, path: Array) -> list[IterationRecord]:
+    """Describe the start and the accepted steps of an iteration, which are the rows of its path."""
+    return [history_entry(stage, k, problem, row) for k, row in enumerate(path)]
 
 
 def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:

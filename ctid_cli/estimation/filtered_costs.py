@@ -4,16 +4,16 @@ Useful redundancy over the delay: solver paths on the costs of several filters, 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, descend
+from ctid_cli.estimation.delay_search import Descent, Limits, Minima, Minimum, descend
 from ctid_cli.estimation.iteration import Steps
-from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, minimise_redundantly
+from ctid_cli.estimation.redundancy import RedundantMinimum, minimise_redundantly
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
@@ -69,8 +69,8 @@ class FilteredCosts(NamedTuple):
         """The cost of one filter."""
         return FilteredCost(self, k)
 
-    def minima_behind_all(self, delay: float) -> tuple[Array, Array]:
-        """Coefficients and squared error behind every filter, the narrowest band first.
+    def minima_behind_all(self, delay: float) -> Minima:
+        """Least costs behind every filter, the narrowest band first.
 
         Good coefficients are handed from filter to filter, down to the narrowest band and up again.
         """
@@ -87,7 +87,11 @@ class FilteredCosts(NamedTuple):
                 found = self.least(k, inputs, delay, thetas[k - 1 : k], False)
                 if found.squared_error < squared_errors[k]:
                     thetas[k], squared_errors[k] = found.theta, found.squared_error
-        return thetas, squared_errors
+        return Minima(thetas, squared_errors)
+
+    def reference_cost(self, minima: Minima) -> float:
+        """J0 (45): the mean of the costs behind all filters [%]."""
+        return float(percents(minima.squared_errors, self.spreads).mean())
 
     def inputs(self, delay: float, reach: int) -> ComplexArray:
         """Spectrum of the delayed input at the first frequencies."""
@@ -97,25 +101,20 @@ class FilteredCosts(NamedTuple):
 
     def least(self, k: int, inputs: ComplexArray, delay: float, starts: Iterable[Array], own: bool) -> Minimum:
         """Least cost of one filter over starts and, if asked for, from least squares."""
-        reach = self.reach[k]
+        reach, steps = self.reach[k], self.steps
         data = self.frequencies[:reach], self.outputs[:reach], inputs[:reach], self.weights[k, :reach]
-        sizes, tried = (self.zeros, self.integrators), [start[: self.poles] for start in starts]
+        tried = [start[: self.poles] for start in starts]
         if own:
             # The state-variable filter 1/(p + w)^n.
-            solved, a = least_squares(*data, np.poly(np.full(self.poles, -self.svf_cutoffs[k]))[1:], *sizes)
-            if solved:
-                tried.append(reflect_unstable(np.append(1.0, a))[1:])
-        best = Minimum(np.zeros(self.size), np.inf)
+            filter_ = np.poly(np.full(self.poles, -self.svf_cutoffs[k])).astype(np.float64)
+            solved, a = least_squares(*data, filter_[1:], self.zeros, self.integrators)
+            tried += [reflect_unstable(np.append(1.0, a))[1:]] if solved else []
+        best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
         for start in tried:
-            theta, squared_error, step = least_cost(*data, start, *sizes, *self.effort)
+            theta, squared_error, step = least_cost(*data, start, self.zeros, self.integrators, *effort)
             if squared_error < best.squared_error:
                 best = Minimum(np.append(theta, delay), squared_error, step)
         return best
-
-    @property
-    def effort(self) -> tuple[int, float, int]:
-        """Most iterations, tolerance and most halvings."""
-        return self.steps.max_iterations, self.steps.tolerance, self.steps.halvings
 
 
 class FilteredCost(NamedTuple):
@@ -189,7 +188,7 @@ class FilterPath:
 def path_history(
     stage: str, search: RedundantMinimum[float], paths: Sequence[FilterPath], poles: int, samples: int = 1
 ) -> list[IterationRecord]:
-    """The steps of the paths that led from incumbent to incumbent."""
+    """Describe the steps of the paths that led from incumbent to incumbent."""
     led = {(path.round, path.filter, path.end): path for path in reversed(paths)}
     return [
         IterationRecord(
@@ -201,109 +200,68 @@ def path_history(
     ]
 
 
-class ReferenceCost(NamedTuple):
-    """J0 at one delay and what it is made of."""
-
-    #: Mean of the costs of all filters [%].
-    mean: float
-    #: ``(a_1 … a_n, b_0 … b_m, delay)`` of each filter, shape (filters, n + m + 2).
-    thetas: Array
-    #: Infinite where nothing could be computed, shape (filters,).
-    squared_errors: Array
-
-
 class FilterSearch:
     """The costs of a record behind a set of filters, and the search through them."""
 
-    def __init__(
-        self,
-        costs: FilteredCosts,
-        filters: FilterSet,
-        bounds: tuple[float, float],
-        max_iterations: int,
-        tolerance: float,
-        max_delay_step: float,
-    ) -> None:
+    def __init__(self, costs: FilteredCosts, filters: FilterSet, limits: Limits) -> None:
         self.costs = costs
         self.filters = filters
         self.period = float(filters.periods[-1])
-        shortest = SMALLEST_STEP * self.period
-        self.limits = Limits(*bounds, max_iterations, tolerance, shortest, max_delay_step, reflect=True)
-        self._known: dict[float, ReferenceCost] = {}
-        self._descended: dict[tuple[int, float, bool], list[Descent]] = {}
+        self.limits = limits._replace(smallest_step=SMALLEST_STEP * self.period, reflect=True)
+        #: Least costs behind all filters at a point of the lattice.
+        self.at = cache(costs.minima_behind_all)
+        self._descended = cache(self._descend)
 
     def on_lattice(self, delay: float) -> float:
-        """The nearest point of the lattice within the bounds."""
+        """Return the nearest point of the lattice within the bounds."""
         step = LATTICE * self.period
         return min(max(round(delay / step) * step, self.limits.low), self.limits.high)
 
-    def at(self, delay: float) -> ReferenceCost:
-        """J0 and the minima of all filters at a point of the lattice."""
-        if delay not in self._known:
-            thetas, squared_errors = self.costs.minima_behind_all(delay)
-            self._known[delay] = ReferenceCost(
-                float(percents(squared_errors, self.costs.spreads).mean()), thetas, squared_errors
-            )
-        return self._known[delay]
-
     def reference_cost(self, delay: float) -> float:
         """J0 at the nearest point of the lattice [%]."""
-        return self.at(self.on_lattice(delay)).mean
+        return self.costs.reference_cost(self.at(self.on_lattice(delay)))
 
-    def run(self, delay: float, max_rounds: int, paths: list[FilterPath]) -> RedundantMinimum[float]:
-        """Rounds over all filters, and a look at the next valleys before a poor incumbent is settled for."""
+    def run(self, delay: float, max_rounds: int) -> tuple[RedundantMinimum[float], list[FilterPath]]:
+        """Follow the paths of all filters from incumbent to incumbent, round by round."""
+        found = minimise_redundantly(
+            self.on_lattice(delay),
+            self.reference_cost,
+            [partial(self._ends, k) for k in range(self.filters.count)],
+            choice="best",
+            settled=lambda before, now: abs(now - before) <= self.limits.tolerance * max(abs(now), self.period),
+            max_rounds=max_rounds,
+        )
+        incumbents = [visit.point for visit in found.trajectory]
+        paths = [
+            FilterPath(number, k, descent, self.costs.spreads[k], self.on_lattice(descent.minimum.delay))
+            for number, incumbent in enumerate(incumbents[: found.rounds], 1)
+            for k in range(self.filters.count)
+            for descent in self._followed(k, incumbent)
+        ]
+        return found, paths
 
-        def rounds_from(delay: float, done: int, hop: bool) -> RedundantMinimum[float]:
-            return minimise_redundantly(
-                delay,
-                lambda delay: self.at(delay).mean,
-                [self._path(k, paths, done, hop) for k in range(self.filters.count)],
-                choice="best",
-                settled=lambda before, now: abs(now - before) <= self.limits.tolerance * max(abs(now), self.period),
-                max_rounds=1 if hop else max_rounds - done,
-            )
+    def _ends(self, k: int, delay: float) -> list[float]:
+        """Where the paths of one filter from an incumbent end, on the lattice."""
+        return [self.on_lattice(descent.minimum.delay) for descent in self._followed(k, delay)]
 
-        found = rounds_from(self.on_lattice(delay), 0, False)
-        while found.status is SearchStatus.EXHAUSTED and found.cost > POOR and found.rounds < max_rounds - 1:
-            beyond = rounds_from(found.point, found.rounds, True)
-            improved = len(beyond.trajectory) > 1
-            found = _joined(found, beyond)
-            if not improved:
-                break
-            found = _joined(found, rounds_from(found.point, found.rounds, False))
-        return found
+    def _followed(self, k: int, delay: float) -> list[Descent]:
+        """Descents of one filter's cost from an incumbent, and from the next valleys if it is poor and a dead end."""
+        near, cost = self._descended(k, delay, 0), self.reference_cost(delay)
+        if cost <= POOR:
+            return near
+        others = (descent for other in range(self.filters.count) for descent in self._descended(other, delay, 0))
+        if any(self.reference_cost(descent.minimum.delay) < cost for descent in others):
+            return near
+        return near + self._descended(k, delay, -1) + self._descended(k, delay, 1)
 
-    def _path(self, k: int, paths: list[FilterPath], done: int, hop: bool) -> Path[float]:
-        """Solver path of one filter after a number of rounds; what it does goes to ``paths``."""
-        rounds = done
-
-        def follow(delay: float) -> list[float]:
-            nonlocal rounds
-            rounds += 1
-            if (k, delay, hop) not in self._descended:
-                self._descended[k, delay, hop] = self._descents(k, delay, hop)
-            ends = [(found, self.on_lattice(found.minimum.delay)) for found in self._descended[k, delay, hop]]
-            paths.extend(FilterPath(rounds, k, found, self.costs.spreads[k], end) for found, end in ends)
-            return [end for _, end in ends]
-
-        return follow
-
-    def _descents(self, k: int, delay: float, hop: bool) -> list[Descent]:
-        """Descents of one filter's cost from a point of the lattice, or from a period of the filter away from it."""
-        none = np.empty((0, self.costs.size))
-        if hop:
-            low, high, period = self.limits.low, self.limits.high, float(self.filters.periods[k])
-            starts = [(start, none) for start in (delay - period, delay + period) if low <= start <= high]
-        else:
-            # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
-            here = self.at(delay)
-            starts = [(delay, here.thetas[k : k + 1])] if np.isfinite(here.squared_errors[k]) else []
-            starts.append((delay, none))
-        found = [descend(self.costs.behind(k), start, theta, self.limits) for start, theta in starts]
+    def _descend(self, k: int, delay: float, periods: int) -> list[Descent]:
+        """Descents of one filter's cost from a number of its periods away from a point of the lattice."""
+        none, here = np.empty((0, self.costs.size)), self.at(delay)
+        start = delay + periods * float(self.filters.periods[k])
+        if not self.limits.low <= start <= self.limits.high:
+            return []
+        # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
+        known = periods == 0 and np.isfinite(here.squared_errors[k])
+        thetas = [here.thetas[k : k + 1], none] if known else [none]
+        found = [descend(self.costs.behind(k), start, theta, self.limits) for theta in thetas]
         return [descent for descent in found if descent.path.size]
-
-
-def _joined(first: RedundantMinimum[float], then: RedundantMinimum[float]) -> RedundantMinimum[float]:
-    """A search and the one that went on from its end as one."""
-    later = tuple(replace(visit, round=visit.round + first.rounds) for visit in then.visits[1:])
-    return replace(then, rounds=first.rounds + then.rounds, visits=first.visits + later)

@@ -9,8 +9,7 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay
-from ctid_cli.estimation.delay_grid import scan
-from ctid_cli.estimation.delay_search import Descent, Minimum
+from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, scan
 from ctid_cli.estimation.filtered_costs import (
     LARGEST_STEP,
     LATTICE,
@@ -228,8 +227,8 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
                 "delay, a larger bandwidth or a longer record"
             )
         longest = self.max_delay_step or LARGEST_STEP * (self.delay_bounds[1] - self.delay_bounds[0])
-        search = FilterSearch(costs, filters, self.delay_bounds, self.max_iterations, self.tolerance, longest)
-        return RedundantSearch(search, unfiltered, {})
+        limits = Limits(*self.delay_bounds, self.max_iterations, self.tolerance, 0.0, longest)
+        return RedundantSearch(FilterSearch(costs, filters, limits), unfiltered, {})
 
     def _estimate(self, laid_out: RedundantSearch | PrintedSearch, start: Start | None) -> RedundantFit:
         delay = initial_delay(start, self.delay_bounds)
@@ -237,8 +236,8 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             filters = laid_out.filters
             fit, found, paths = laid_out.run(delay)
         else:
-            search, paths = laid_out.filtered, []
-            filters, found = search.filters, search.run(delay, self.max_rounds, paths)
+            filters = laid_out.filtered.filters
+            found, paths = laid_out.filtered.run(delay, self.max_rounds)
             if found.point not in laid_out.refined:
                 laid_out.refined[found.point] = self._refine(laid_out, found.point)
             fit = laid_out.refined[found.point]

@@ -133,9 +133,9 @@ class HeldSpectrum(NamedTuple):
     jumps: Array
     integral: Array
     foh: bool
-    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, 2, count).
+    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, count).
     marks: IntArray
-    sums: Array
+    sums: ComplexArray
     duration: float
 
     def at(self, delay: float, gain: Array) -> ComplexArray:

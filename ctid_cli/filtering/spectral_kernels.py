@@ -103,7 +103,7 @@ def window_spectrum(
     if end <= begin:
         return spectrum
     # v, r and the integral of v at both ends, from the last break before each.
-    left, right = np.searchsorted(times, begin, "right") - 1, np.searchsorted(times, end, "right") - 1
+    left, right = int(np.searchsorted(times, begin, "right")) - 1, int(np.searchsorted(times, end, "right")) - 1
     before, after = begin - times[left], end - times[right]
     value_left, value_right = values[left] + slopes[left] * before, values[right] + slopes[right] * after
     total_left = integral[left] + before * (values[left] + 0.5 * slopes[left] * before)
@@ -146,11 +146,17 @@ def _at(coefficients: Array, s: complex) -> complex:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _moments(
-    frequencies: Array, outputs: ComplexArray, inputs: ComplexArray, weights: Array, theta: Array, poles: int, order: int
+    frequencies: Array,
+    outputs: ComplexArray,
+    inputs: ComplexArray,
+    weights: Array,
+    theta: Array,
+    poles: int,
+    order: int,
 ) -> tuple[Array, float]:
-    """Products of the columns (dx/da, dx/db, dx/dT, dx/dtau, eps) at ``theta = (a, b, T)``, and the power of the output.
+    """Products of the columns (dx/da, dx/db, dx/dT, dx/dtau, eps) at ``theta = (a, b, T)``; the power of the output.
 
-    ``order`` counts the integrators too. In dx/da stands the measured output where B is zero: what least squares need.
+    ``order`` counts the integrators too. Where B is zero, dx/da takes the measured output: what least squares need.
     """
     size, ahead = theta.size + 2, theta.size - order
     denominator = np.zeros(order + 1)
@@ -272,10 +278,10 @@ def least_cost(
 ) -> tuple[Array, float, float]:
     """Gauss-Newton on the coefficients from a stable denominator ``start = (a_1 … a_n)``, for which B and T are fitted.
 
-    A step to an unstable model, or one that does not lower the cost, is halved, so often at most. It ends where a step changes the model's output by
-    less than a fraction of its size. Returns the coefficients, the squared error, infinite where nothing could be
-    computed, and the Gauss-Newton step of the delay [s], NaN where the data do not determine it. With integrators no
-    frequency may be zero.
+    A step to an unstable model, or one that does not lower the cost, is halved, so often at most. The iteration ends
+    where a step changes the model's output by less than a fraction of its size. Returns the coefficients, the squared
+    error, infinite where nothing could be computed, and the Gauss-Newton step of the delay [s], NaN where the data do
+    not determine it. With integrators no frequency may be zero.
     """
     poles, order, coefficients = start.size, start.size + integrators, start.size + zeros + 1
     theta = np.append(start, np.zeros(zeros + 1 + order))
