@@ -17,7 +17,7 @@ from ctid_cli.estimation.redundancy import RedundantMinimum, minimise_redundantl
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra
+from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
 from ctid_cli.filtering.spectral_kernels import least_cost, least_squares
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.sensitivities import Structure
@@ -42,10 +42,7 @@ POOR = 25.0
 class FilteredCosts(NamedTuple):
     """What searches need of a record behind filters, the spectra of which they share."""
 
-    #: Frequencies [rad/s], shape (K,).
-    frequencies: Array
-    outputs: ComplexArray
-    input: HeldSpectrum
+    spectra: RecordSpectra
     #: ``|L|^2`` of each filter, shape (filters, K), and at how many frequencies it matters, shape (filters,).
     weights: Array
     reach: IntArray
@@ -75,7 +72,7 @@ class FilteredCosts(NamedTuple):
         Good coefficients are handed from filter to filter, down to the narrowest band and up again.
         """
         many = self.reach.size
-        inputs = self.inputs(delay, int(self.reach.max()))
+        inputs = self.spectra.inputs(delay, int(self.reach.max()))
         thetas, squared_errors = np.zeros((many, self.size)), np.full(many, np.inf)
         for k in range(many - 1, -1, -1):
             # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
@@ -93,16 +90,11 @@ class FilteredCosts(NamedTuple):
         """J0 (45): the mean of the costs behind all filters [%]."""
         return float(percents(minima.squared_errors, self.spreads).mean())
 
-    def inputs(self, delay: float, reach: int) -> ComplexArray:
-        """Spectrum of the delayed input at the first frequencies."""
-        if self.integrators:
-            return self.input.at(delay, np.ones(reach))[1:]
-        return self.input.at(delay, np.ones(reach - 1))
-
     def least(self, k: int, inputs: ComplexArray, delay: float, starts: Iterable[Array], own: bool) -> Minimum:
         """Least cost of one filter over starts and, if asked for, from least squares."""
         reach, steps = self.reach[k], self.steps
-        data = self.frequencies[:reach], self.outputs[:reach], inputs[:reach], self.weights[k, :reach]
+        frequencies, outputs = self.spectra.frequencies, self.spectra.outputs
+        data = frequencies[:reach], outputs[:reach], inputs[:reach], self.weights[k, :reach]
         tried = [start[: self.poles] for start in starts]
         if own:
             # The state-variable filter 1/(p + w)^n.
@@ -130,7 +122,7 @@ class FilteredCost(NamedTuple):
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
-        inputs = self.costs.inputs(delay, int(self.costs.reach[self.filter]))
+        inputs = self.costs.spectra.inputs(delay, int(self.costs.reach[self.filter]))
         return self.costs.least(self.filter, inputs, delay, starts, own)
 
 
@@ -158,7 +150,7 @@ def filtered_costs(
     reach = (weights >= NEGLIGIBLE_WEIGHT * weights.max(axis=1, keepdims=True)).sum(axis=1)
     spreads = weights @ (np.where(w > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2)
     sizes = structure.poles, structure.zeros, integrators
-    return FilteredCosts(w, spectra.outputs, spectra.input, weights, reach, svf_cutoffs, spreads, *sizes, steps)
+    return FilteredCosts(spectra, weights, reach, svf_cutoffs, spreads, *sizes, steps)
 
 
 @dataclass(frozen=True, eq=False)

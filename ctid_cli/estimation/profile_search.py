@@ -8,7 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.delay_search import Minimum, lowest_minima, quarter_periods, scan, search_levels
 from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
+from ctid_cli.estimation.iteration import GUARDED, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import CUTOFFS, least_squares_starts
@@ -32,7 +32,7 @@ MOST_LEVELS = 4
 LEVEL_ORDER = 10
 #: Real equations inside the pass band of a level for every parameter, those of the transient included.
 EQUATIONS_PER_PARAMETER = 4
-LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GAUSS_NEWTON, halvings=3)
+LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GUARDED, halvings=3)
 
 
 @dataclass(frozen=True, eq=False)

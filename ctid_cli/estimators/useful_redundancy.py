@@ -18,7 +18,7 @@ from ctid_cli.estimation.filtered_costs import (
     filtered_costs,
     path_history,
 )
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, Variant
+from ctid_cli.estimation.iteration import GUARDED, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
@@ -32,7 +32,7 @@ from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
 #: How hard to work at each trial delay.
-EFFORT = Steps(6, 1e-2, GAUSS_NEWTON, 2)
+EFFORT = Steps(6, 1e-2, GUARDED, 2)
 #: Points of the lattice by which one start of the refinement is shorter than the best delay behind the widest band.
 SHORTER = 2
 
@@ -219,7 +219,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             svf_cutoffs=np.full(self.filters, self.svf_cutoff or bandwidth),
             steps=EFFORT,
         )
-        passed = int((costs.frequencies <= bandwidth).sum())
+        passed = int((costs.spectra.frequencies <= bandwidth).sum())
         if 2 * passed - 1 <= costs.size + self.poles:
             raise DataError(
                 f"{named(record)}fewer than {passed} periods of the bandwidth, {bandwidth:.3g} rad/s, are left after "

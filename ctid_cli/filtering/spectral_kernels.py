@@ -171,7 +171,9 @@ def _moments(
         jw = complex(0.0, frequencies[k])
         # A frequency above zero stands for its negative too.
         root = math.sqrt(weights[k] if frequencies[k] == 0.0 else 2.0 * weights[k])
-        inverse = 1.0 / _at(denominator, jw)
+        # Without a complex division, which Numba checks for zero and raises at.
+        at = _at(denominator, jw)
+        inverse = at.conjugate() * (1.0 / (at.real * at.real + at.imag * at.imag))
         forced = _at(numerator, jw) * inputs[k] * inverse
         output = forced + _at(transient, jw) * inverse
         power += root * root * (output.real * output.real + output.imag * output.imag)

@@ -6,7 +6,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ctid_cli.estimation.iteration import (
-    GAUSS_NEWTON,
     PATIENCE,
     RELAXATIONS,
     SLOW_STEPS,
@@ -70,13 +69,13 @@ def test_plain_step_is_the_textbook_formula(model, hold_output, regular):
 def test_gradient_vanishes_at_convergence(model, regular):
     # On noisy data: sum psi eps = 0, so the estimate minimises the output error, whatever the rule and the hold of y.
     found = []
-    for rule, hold_output in (("plain", "foh"), ("guarded", "zoh"), ("gauss_newton", "foh")):
+    for rule, hold_output in (("plain", "foh"), ("guarded", "zoh")):
         problem, truth = problem_of(model, regular, hold_output)
         result = iterate(problem, truth, Steps(100, 1e-11, rule))
         assert result.status is Status.CONVERGED
         assert relative_gradient(result.equations, problem.free) < 1e-8
         found.append(result.theta)
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-7)
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-7)
 
 
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
@@ -105,13 +104,6 @@ def test_guarded_iteration_never_raises_the_cost():
         assert np.diff(guarded).max() <= 1e-12 * guarded[0]
         rises.append(np.diff(plain).max() / plain[-1])
     assert max(rises) > 1.0
-
-
-def test_unstable_starts_are_reflected():
-    problem, truth = problem_of(CASE_1)
-    result = iterate(problem, np.array([-2.8, 4.0, 8.0, 8.0]), Steps(50, 1e-9, "guarded"))
-    assert result.status is Status.CONVERGED
-    np.testing.assert_allclose(result.theta, truth, rtol=0.1)
 
 
 def test_step_of_convergence_is_free_of_units():
@@ -188,7 +180,7 @@ def test_steps_that_give_less_than_they_promise_end_the_iteration():
     sequence = [equations()]
     for k in range(SLOW_STEPS + 5):
         sequence += [equations(cost=2.0)] * 8 + [equations(cost=1.0 - 1e-3 * (k + 1))]
-    result = iterate(Sequence(sequence), np.zeros(1), Steps(100, 1e-8, GAUSS_NEWTON))
+    result = iterate(Sequence(sequence), np.zeros(1), Steps(100, 1e-8, "guarded"))
     assert (result.status, result.iterations) == (Status.STALLED, SLOW_STEPS)
 
 

@@ -12,7 +12,6 @@ from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectral_kernels import projected_moments
 from ctid_cli.inference.fit import Status
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
 
@@ -24,13 +23,12 @@ FILTERS = {CASE_1: 10, CASE_2: 15}
 def member_costs(prepared, delay):
     """Costs of all filters at a delay, each with its own coefficients."""
     costs = prepared.laid_out.filtered.costs
-    return percents(costs.minima_behind_all(delay)[1], costs.spreads)
+    return percents(costs.minima_behind_all(delay).squared_errors, costs.spreads)
 
 
 def reference_cost(prepared, delay):
     """J0 where the search evaluates it."""
-    search = prepared.laid_out.filtered
-    return search.at(search.on_lattice(delay)).mean
+    return prepared.laid_out.filtered.reference_cost(delay)
 
 
 def options(model=CASE_1, **more):
@@ -199,14 +197,11 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         assert [entry.iteration for entry in block] == list(range(len(block)))
         assert block[0].delay == before.point
         assert block[-1].delay == pytest.approx(after.point, abs=0.5 * LATTICE * prepared.laid_out.filtered.period)
-        costs = prepared.laid_out.filtered.costs
-        weight = costs.weights[after.path]
+        cost = prepared.laid_out.filtered.costs.behind(after.path)
         for entry in block:
-            inputs = costs.inputs(entry.delay, costs.frequencies.size)
-            a, b = np.array(entry.denominator), np.array(entry.numerator)
-            gram, _ = projected_moments(costs.frequencies, costs.outputs, inputs, weight, a, b, 0)
-            # What lies beyond 1e-6 of the greatest weight is left out.
-            assert entry.cost == pytest.approx(gram[-1, -1], rel=1e-4)
+            # A fit goes on from these coefficients.
+            theta = np.array([*entry.denominator[1:], *entry.numerator, entry.delay])
+            assert cost.minimise(entry.delay, theta[None], False).squared_error <= entry.cost * (1 + 1e-9)
         assert (np.diff([entry.cost for entry in block]) < 0).all()
     stages = list(dict.fromkeys(entry.stage for entry in fit.history if entry not in steps))
     assert stages == ["refine", "joint"]
@@ -217,7 +212,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
 def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
     # Two filters are too few for this start: J0 is above 25 % where they end, and paths start a period away from there.
     record = make_record(snr_db=5, seed=5, replicate=2, n=2500)
-    fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(12.0))
+    fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(14.0))
     away = []
     for path in fit.paths:
         incumbent = [visit.point for visit in fit.search.trajectory if visit.round < path.round][-1]
