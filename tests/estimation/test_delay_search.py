@@ -120,16 +120,6 @@ def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflec
     assert abs(found.minimum.delay - nearest) <= max(abs(start - nearest), SMALLEST)
 
 
-def test_search_ends_at_its_smallest_step():
-    # No trial closer than 1e-5 of the range of the delay, and the best point reached so far is kept.
-    cost = Artificial(lambda d: 1.0 + abs(d - 5.0), lambda d: 5.0)
-    found = search(cost, 5.0)
-    assert (found.minimum.delay, found.iterations) == (5.0, 0)
-    tried = np.array(cost.asked[1:]) - 5.0
-    np.testing.assert_allclose(tried, 5.0 * 0.5 ** np.arange(tried.size))
-    assert SMALLEST < tried[-1] <= 2 * SMALLEST
-
-
 def test_nothing_at_the_start_is_no_search():
     cost = Artificial(lambda d: math.inf, lambda d: 1.0)
     found = search(cost, 5.0)

@@ -10,7 +10,6 @@ from ctid_cli.estimation.filtered_costs import LATTICE, percents
 from ctid_cli.estimation.redundancy import SearchStatus
 from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
-from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Status
 from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_model, make_record
@@ -125,14 +124,6 @@ def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bound
     assert round(9.0 / step) * step > 9.0
     for bound in (1.0, 9.0):
         assert reference_cost(prepared, bound) == member_costs(prepared, bound).mean()
-
-
-def test_members_are_those_of_the_filter_set(prepared):
-    assert prepared.laid_out.filtered.filters == FilterSet(BANDWIDTH[CASE_1], 10, 10.0, 10)
-    other = UsefulRedundancy(**options(filters=4, beta=3.0, order=5)).prepare(make_record(snr_db=15, n=2000))
-    filters = other.laid_out.filtered.filters
-    np.testing.assert_allclose(filters.cutoffs, BANDWIDTH[CASE_1] / np.array([3, 7 / 3, 5 / 3, 1]))
-    assert {lowpass.order for lowpass in filters.lowpasses} == {5}
 
 
 # Of the search ----------------------------------------------------------------------------------------
