@@ -229,7 +229,7 @@ def search_levels(
     """
     low, high = bounds
     grid = np.linspace(low, high, max(int(np.ceil((high - low) / spacings[0])) + 1, FEWEST_DELAYS))
-    first = found = scan(costs[0], grid)
+    first = found = scan([costs[0]] * grid.size, grid.tolist())
     coarser = float(grid[1] - grid[0])
     for level, spacing in enumerate(spacings[1:], 1):
         count = int(np.ceil(REACH * coarser / spacing))
@@ -239,7 +239,7 @@ def search_levels(
             round(float(minimum.delay + offset) / spacing) for minimum in _hopeful(found, KEPT) for offset in offsets
         }
         delays = np.unique(np.clip([place * spacing for place in sorted(places)], low, high))
-        found = scan(costs[level], delays)
+        found = scan([costs[level]] * delays.size, delays.tolist())
         coarser = spacing
     limits = Limits(low, high, DESCENT_ITERATIONS, DESCENT_TOLERANCE, SMALLEST_STEP * (high - low))
     last = costs[-1]
@@ -247,15 +247,19 @@ def search_levels(
     return grid, first.squared_errors, sorted(ends, key=lambda end: end.squared_error)
 
 
-def scan(cost: DelayCost, delays: Array) -> Minima:
-    """Least costs of all samples at given delays, one after the other."""
-    found = Minima(np.zeros((delays.size, cost.size)), np.full(delays.size, np.inf))
-    # Along the delays and back, so that good coefficients reach both neighbours.
-    for order in (range(delays.size), range(delays.size - 1, -1, -1)):
-        neighbour = np.empty((0, cost.size))
+def scan(costs: Sequence[DelayCost], delays: Sequence[float], own: bool = True) -> Minima:
+    """Least costs at delays, of one cost each, one after the other.
+
+    Each starts from the coefficients of both neighbours, and from its own; or, if not ``own``, from its own only where
+    the neighbour has none.
+    """
+    found = Minima(np.zeros((len(costs), costs[0].size)), np.full(len(costs), np.inf))
+    # Along the delays and back: the way back only hands good coefficients on to worse neighbours.
+    for order in (range(len(costs)), range(len(costs) - 1, -1, -1)):
+        neighbour = np.empty((0, costs[0].size))
         for k in order:
-            # The way back only hands good coefficients on to worse neighbours.
-            trial = cost.minimise(float(delays[k]), neighbour, bool(np.isinf(found.squared_errors[k])))
+            alone = bool(np.isinf(found.squared_errors[k])) and (own or not neighbour.size)
+            trial = costs[k].minimise(delays[k], neighbour, alone)
             if trial.squared_error < found.squared_errors[k]:
                 found.thetas[k], found.squared_errors[k] = trial.theta, trial.squared_error
             neighbour = found.thetas[k : k + 1] if np.isfinite(found.squared_errors[k]) else neighbour[:0]

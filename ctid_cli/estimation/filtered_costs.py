@@ -3,15 +3,14 @@
 Useful redundancy over the delay: solver paths on the costs of several filters, ranked by the mean of all.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.estimation.delay_search import Descent, Limits, Minima, Minimum, descend
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.delay_search import Descent, Limits, Minima, Minimum, descend, scan
 from ctid_cli.estimation.iteration import Steps
 from ctid_cli.estimation.redundancy import RedundantMinimum, minimise_redundantly
 from ctid_cli.estimation.sampled_problem import reflect_unstable
@@ -39,19 +38,18 @@ LARGEST_STEP = 1 / 3
 POOR = 25.0
 
 
-class FilteredCosts(NamedTuple):
-    """What searches need of a record behind filters, the spectra of which they share."""
+@dataclass(frozen=True, eq=False)
+class FilteredCost:
+    """The output-error cost of a record behind a low-pass filter as a function of the delay."""
 
     spectra: RecordSpectra
-    #: ``|L|^2`` of each filter, shape (filters, K), and at how many frequencies it matters, shape (filters,).
+    #: ``|L|^2`` at the first frequencies, those where it matters.
     weights: Array
-    reach: IntArray
-    #: Cut-off of the state-variable filter of the least-squares start [rad/s], shape (filters,).
-    svf_cutoffs: Array
-    #: Mean square of the filtered output less its mean [output unit^2], shape (filters,).
-    spreads: Array
-    poles: int
-    zeros: int
+    #: Mean square of the filtered output less its mean [output unit^2].
+    spread: float
+    #: Cut-off of the state-variable filter of the least-squares start [rad/s].
+    svf_cutoff: float
+    structure: Structure
     #: Poles at the origin besides; with any the mean is left out.
     integrators: int
     #: How hard to work at each delay.
@@ -60,70 +58,25 @@ class FilteredCosts(NamedTuple):
     @property
     def size(self) -> int:
         """Number of parameters, the delay included."""
-        return self.poles + self.zeros + 2
-
-    def behind(self, k: int) -> "FilteredCost":
-        """The cost of one filter."""
-        return FilteredCost(self, k)
-
-    def minima_behind_all(self, delay: float) -> Minima:
-        """Least costs behind every filter, the narrowest band first.
-
-        Good coefficients are handed from filter to filter, down to the narrowest band and up again.
-        """
-        many = self.reach.size
-        inputs = self.spectra.inputs(delay, int(self.reach.max()))
-        thetas, squared_errors = np.zeros((many, self.size)), np.full(many, np.inf)
-        for k in range(many - 1, -1, -1):
-            # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
-            known = k + 1 < many and bool(np.isfinite(squared_errors[k + 1]))
-            found = self.least(k, inputs, delay, thetas[k + 1 : k + 1 + known], not known)
-            thetas[k], squared_errors[k] = found.theta, found.squared_error
-        for k in range(1, many):
-            if np.isfinite(squared_errors[k - 1]):
-                found = self.least(k, inputs, delay, thetas[k - 1 : k], False)
-                if found.squared_error < squared_errors[k]:
-                    thetas[k], squared_errors[k] = found.theta, found.squared_error
-        return Minima(thetas, squared_errors)
-
-    def reference_cost(self, minima: Minima) -> float:
-        """J0 (45): the mean of the costs behind all filters [%]."""
-        return float(percents(minima.squared_errors, self.spreads).mean())
-
-    def least(self, k: int, inputs: ComplexArray, delay: float, starts: Iterable[Array], own: bool) -> Minimum:
-        """Least cost of one filter over starts and, if asked for, from least squares."""
-        reach, steps = self.reach[k], self.steps
-        frequencies, outputs = self.spectra.frequencies, self.spectra.outputs
-        data = frequencies[:reach], outputs[:reach], inputs[:reach], self.weights[k, :reach]
-        tried = [start[: self.poles] for start in starts]
-        if own:
-            # The state-variable filter 1/(p + w)^n.
-            filter_ = np.poly(np.full(self.poles, -self.svf_cutoffs[k])).astype(np.float64)
-            solved, a = least_squares(*data, filter_[1:], self.zeros, self.integrators)
-            tried += [reflect_unstable(np.append(1.0, a))[1:]] if solved else []
-        best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
-        for start in tried:
-            theta, squared_error, step = least_cost(*data, start, self.zeros, self.integrators, *effort)
-            if squared_error < best.squared_error:
-                best = Minimum(np.append(theta, delay), squared_error, step)
-        return best
-
-
-class FilteredCost(NamedTuple):
-    """The cost behind one filter of several."""
-
-    costs: FilteredCosts
-    filter: int
-
-    @property
-    def size(self) -> int:
-        """Number of parameters, the delay included."""
-        return self.costs.size
+        return self.structure.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
-        inputs = self.costs.spectra.inputs(delay, int(self.costs.reach[self.filter]))
-        return self.costs.least(self.filter, inputs, delay, starts, own)
+        spectra, reach, steps = self.spectra, self.weights.size, self.steps
+        data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
+        poles, zeros = self.structure.poles, self.structure.zeros
+        tried = [start[:poles] for start in starts]
+        if own:
+            # The state-variable filter 1/(p + w)^n.
+            filter_ = np.poly(np.full(poles, -self.svf_cutoff)).astype(np.float64)
+            solved, a = least_squares(*data, filter_[1:], zeros, self.integrators)
+            tried += [reflect_unstable(np.append(1.0, a))[1:]] if solved else []
+        best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
+        for start in tried:
+            theta, squared_error, step = least_cost(*data, start, zeros, self.integrators, *effort)
+            if squared_error < best.squared_error:
+                best = Minimum(np.append(theta, delay), squared_error, step)
+        return best
 
 
 def percents(squared_errors: Array, spreads: Array | float) -> Array:
@@ -138,19 +91,22 @@ def filtered_costs(
     greatest_delay: float,
     *,
     start: float,
-    svf_cutoffs: Array,
+    svf_cutoffs: Sequence[float],
     steps: Steps,
     integrators: int = 0,
-) -> FilteredCosts:
+) -> list[FilteredCost]:
     """Costs of one record behind filters; samples earlier than ``start`` after the first input are not used."""
     highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
     spectra = record_spectra(record, start, highest, greatest_delay, keep_mean=integrators == 0)
-    w = spectra.frequencies
-    weights = np.array([lowpass_weight(w, lowpass) for lowpass in lowpasses])
-    reach = (weights >= NEGLIGIBLE_WEIGHT * weights.max(axis=1, keepdims=True)).sum(axis=1)
-    spreads = weights @ (np.where(w > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2)
-    sizes = structure.poles, structure.zeros, integrators
-    return FilteredCosts(spectra, weights, reach, svf_cutoffs, spreads, *sizes, steps)
+    power = np.where(spectra.frequencies > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2
+    costs = []
+    for lowpass, svf_cutoff in zip(lowpasses, svf_cutoffs, strict=True):
+        weights = lowpass_weight(spectra.frequencies, lowpass)
+        reach = int((weights >= NEGLIGIBLE_WEIGHT * weights.max()).sum())
+        costs.append(
+            FilteredCost(spectra, weights[:reach], float(weights @ power), svf_cutoff, structure, integrators, steps)
+        )
+    return costs
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,13 +151,13 @@ def path_history(
 class FilterSearch:
     """The costs of a record behind a set of filters, and the search through them."""
 
-    def __init__(self, costs: FilteredCosts, filters: FilterSet, limits: Limits) -> None:
+    def __init__(self, costs: Sequence[FilteredCost], filters: FilterSet, limits: Limits) -> None:
+        #: That of the lowest cut-off first.
         self.costs = costs
         self.filters = filters
         self.period = float(filters.periods[-1])
         self.limits = limits._replace(smallest_step=SMALLEST_STEP * self.period, reflect=True)
-        #: Least costs behind all filters at a point of the lattice.
-        self.at = cache(costs.minima_behind_all)
+        self.at = cache(self._minima)
         self._descended = cache(self._descend)
 
     def on_lattice(self, delay: float) -> float:
@@ -210,8 +166,9 @@ class FilterSearch:
         return min(max(round(delay / step) * step, self.limits.low), self.limits.high)
 
     def reference_cost(self, delay: float) -> float:
-        """J0 at the nearest point of the lattice [%]."""
-        return self.costs.reference_cost(self.at(self.on_lattice(delay)))
+        """J0 (45), the mean of the costs behind all filters, at the nearest point of the lattice [%]."""
+        spreads = np.array([cost.spread for cost in self.costs])
+        return float(percents(self.at(self.on_lattice(delay)).squared_errors, spreads).mean())
 
     def run(self, delay: float, max_rounds: int) -> tuple[RedundantMinimum[float], list[FilterPath]]:
         """Follow the paths of all filters from incumbent to incumbent, round by round."""
@@ -225,12 +182,18 @@ class FilterSearch:
         )
         incumbents = [visit.point for visit in found.trajectory]
         paths = [
-            FilterPath(number, k, descent, self.costs.spreads[k], self.on_lattice(descent.minimum.delay))
+            FilterPath(number, k, descent, self.costs[k].spread, self.on_lattice(descent.minimum.delay))
             for number, incumbent in enumerate(incumbents[: found.rounds], 1)
             for k in range(self.filters.count)
             for descent in self._followed(k, incumbent)
         ]
         return found, paths
+
+    def _minima(self, delay: float) -> Minima:
+        """Least costs behind all filters at a delay."""
+        # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
+        found = scan(self.costs[::-1], [delay] * len(self.costs), own=False)
+        return Minima(found.thetas[::-1], found.squared_errors[::-1])
 
     def _ends(self, k: int, delay: float) -> list[float]:
         """Where the paths of one filter from an incumbent end, on the lattice."""
@@ -248,12 +211,12 @@ class FilterSearch:
 
     def _descend(self, k: int, delay: float, periods: int) -> list[Descent]:
         """Descents of one filter's cost from a number of its periods away from a point of the lattice."""
-        none, here = np.empty((0, self.costs.size)), self.at(delay)
+        none, here = np.empty((0, self.costs[k].size)), self.at(delay)
         start = delay + periods * float(self.filters.periods[k])
         if not self.limits.low <= start <= self.limits.high:
             return []
         # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
         known = periods == 0 and np.isfinite(here.squared_errors[k])
         thetas = [here.thetas[k : k + 1], none] if known else [none]
-        found = [descend(self.costs.behind(k), start, theta, self.limits) for theta in thetas]
+        found = [descend(self.costs[k], start, theta, self.limits) for theta in thetas]
         return [descent for descent in found if descent.path.size]

@@ -133,12 +133,11 @@ def _search_levels(cost: RecordsCost) -> Found:
         cost.coefficients,
         bounds[1],
         start=0.0 if measured.plain else bounds[1],
-        svf_cutoffs=cutoffs,
+        svf_cutoffs=cutoffs.tolist(),
         steps=LEVEL_EFFORT,
         integrators=cost.integrators,
     )
-    levels = [costs.behind(level) for level in range(cutoffs.size)]
-    delays, found, minima = search_levels(levels, (0.5 * np.pi / cutoffs).tolist(), bounds)
+    delays, found, minima = search_levels(costs, (0.5 * np.pi / cutoffs).tolist(), bounds)
     profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0 and measured.plain:
@@ -163,7 +162,7 @@ def _search_samples(cost: RecordsCost) -> Found:
     measured = cost.measured
     low, high = measured.treatment.delay_bounds
     delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
-    found = scan(cost, delays)
+    found = scan([cost] * delays.size, delays.tolist())
     count = sum(data.count for data in measured.data)
     chosen = found.lowest(MINIMA)
     if not chosen or delays.size == 1:

@@ -216,11 +216,11 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             Structure(self.poles, self.zeros),
             self.delay_bounds[1],
             start=self.delay_bounds[1],
-            svf_cutoffs=np.full(self.filters, self.svf_cutoff or bandwidth),
+            svf_cutoffs=[self.svf_cutoff or bandwidth] * self.filters,
             steps=EFFORT,
         )
-        passed = int((costs.spectra.frequencies <= bandwidth).sum())
-        if 2 * passed - 1 <= costs.size + self.poles:
+        passed = int((costs[0].spectra.frequencies <= bandwidth).sum())
+        if 2 * passed - 1 <= costs[0].size + self.poles:
             raise DataError(
                 f"{named(record)}fewer than {passed} periods of the bandwidth, {bandwidth:.3g} rad/s, are left after "
                 f"the greatest delay, {self.delay_bounds[1]:g} s: too few to estimate from; take a smaller greatest "
@@ -251,7 +251,8 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
         search = laid_out.filtered
         # J0 is flat around its minimum where noise, or a model with too long a delay, weighs on the narrow filters.
         nearby = point + search.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE))
-        found = scan(search.costs.behind(self.filters - 1), np.unique(np.clip(nearby, *self.delay_bounds)))
+        delays = np.unique(np.clip(nearby, *self.delay_bounds)).tolist()
+        found = scan([search.costs[-1]] * len(delays), delays)
         least = int(np.argmin(found.squared_errors))
         # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
         starts = found.thetas[[least, max(least - SHORTER, 0)]]

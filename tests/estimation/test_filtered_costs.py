@@ -1,9 +1,12 @@
 """Fits to the spectra of a record behind low-pass filters, against columns written out and SciPy's least squares."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from ctid_cli.estimation.delay_search import scan
 from ctid_cli.estimation.filtered_costs import filtered_costs, percents
 from ctid_cli.estimation.iteration import Steps
 from ctid_cli.estimation.sampled_problem import reflect_unstable
@@ -152,7 +155,7 @@ def test_start_that_cannot_be_computed_has_no_cost():
 
 def costs_of(record, model=CASE_1, cutoffs=CUTOFFS):
     lowpasses = [Lowpass(cutoff, 10) for cutoff in cutoffs]
-    svf_cutoffs = np.full(len(cutoffs), SVF_CUTOFF[model])
+    svf_cutoffs = [SVF_CUTOFF[model]] * len(cutoffs)
     return filtered_costs(
         record, lowpasses, DEGREES[model], GREATEST, start=GREATEST, svf_cutoffs=svf_cutoffs, steps=THOROUGH
     )
@@ -169,18 +172,18 @@ def test_least_cost_is_that_of_all_frequencies(model, cutoffs):
     for k, cutoff in enumerate(cutoffs):
         data = spectral_data(record, 1.5 * cutoffs[-1], 7.9, Lowpass(cutoff, 10))
         _, expected, _ = fitted(data, model, theta_of(model), iterations=100, tolerance=1e-9)
-        found = costs.behind(k).minimise(7.9, np.append(theta_of(model), 0.0)[None], False)
+        found = costs[k].minimise(7.9, np.append(theta_of(model), 0.0)[None], False)
         assert found.squared_error == pytest.approx(expected, rel=1e-5)
         assert found.delay == 7.9
         deviation = real_rows(data, [np.where(data[0] > 0, data[1], 0.0)])
-        assert costs.spreads[k] == pytest.approx(np.sum(deviation**2))
+        assert costs[k].spread == pytest.approx(np.sum(deviation**2))
 
 
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_own_start_is_the_least_squares_solution(model):
     # (jw)^n Y/F on -(jw)^(n-i) Y/F, (jw)^(m-j) U/F and (jw)^l/F, with real coefficients, by orthogonal decomposition.
     record, cutoff = make_record(model, snr_db=15), HIGHEST[model] / 1.5
-    costs = costs_of(record, model, [cutoff])._replace(steps=Steps(0, 1e-9, "guarded", 12))
+    cost = replace(costs_of(record, model, [cutoff])[0], steps=Steps(0, 1e-9, "guarded", 12))
     data = spectral_data(record, HIGHEST[model], 7.9, Lowpass(cutoff, 10))
     n, m, jw = model.order, model.numerator.size - 1, 1j * data[0]
     f = np.poly(np.full(n, -SVF_CUTOFF[model]))
@@ -191,7 +194,7 @@ def test_own_start_is_the_least_squares_solution(model):
     size = np.linalg.norm(columns, axis=0)
     solution = np.linalg.lstsq(columns[:, :-1] / size[:-1], columns[:, -1], rcond=None)[0] / size[:-1]
     expected = reflect_unstable(np.append(1.0, solution[:n]))[1:]
-    found = costs.behind(0).minimise(7.9, np.empty((0, n + m + 2)), True)
+    found = cost.minimise(7.9, np.empty((0, n + m + 2)), True)
     np.testing.assert_allclose(found.theta[:n], expected, rtol=1e-4)
 
 
@@ -200,15 +203,15 @@ def test_unstable_own_starts_are_reflected():
     t = 0.05 * np.arange(400)
     record = Record(t, 5 * np.exp(0.5 * t), HeldSignal(t, np.where(t < 1, 1.0, 0.0)))
     steps = Steps(0, 1e-9, "guarded", 12)
-    cutoffs = np.ones(1)
+    cutoffs = [1.0]
     costs = filtered_costs(
         record, [Lowpass(7.0, 10)], Structure(1, 0), 0.5, start=0.5, svf_cutoffs=cutoffs, steps=steps
     )
-    assert costs.behind(0).minimise(0.25, np.empty((0, 3)), True).theta[0] == pytest.approx(0.5, rel=1e-2)
+    assert costs[0].minimise(0.25, np.empty((0, 3)), True).theta[0] == pytest.approx(0.5, rel=1e-2)
 
 
 def test_minimum_is_the_best_of_its_starts():
-    cost = costs_of(make_record(snr_db=15, n=2000)).behind(2)
+    cost = costs_of(make_record(snr_db=15, n=2000))[2]
     starts = np.column_stack((theta_of(CASE_1) * np.array([[1.0], [1e-3]]), np.zeros(2)))
     alone = [cost.minimise(7.7, start[None], False).squared_error for start in starts]
     least_squares = cost.minimise(7.7, NONE, True).squared_error
@@ -219,22 +222,22 @@ def test_minimum_is_the_best_of_its_starts():
 
 def test_costs_behind_all_filters_are_handed_down_and_up():
     costs = costs_of(make_record(snr_db=5, n=2000))
-    thetas, squared_errors = costs.minima_behind_all(6.5)
-    down = [costs.behind(2).minimise(6.5, NONE, True)]
+    found = scan(costs[::-1], [6.5] * 3, own=False)
+    down = [costs[2].minimise(6.5, NONE, True)]
     for k in (1, 0):
-        down.insert(0, costs.behind(k).minimise(6.5, down[0].theta[None], False))
+        down.insert(0, costs[k].minimise(6.5, down[0].theta[None], False))
     best = down[:1]
     for k in (1, 2):
-        up = costs.behind(k).minimise(6.5, best[-1].theta[None], False)
+        up = costs[k].minimise(6.5, best[-1].theta[None], False)
         best.append(min(up, down[k], key=lambda minimum: minimum.squared_error))
-    np.testing.assert_allclose(squared_errors, [minimum.squared_error for minimum in best], rtol=1e-9)
-    np.testing.assert_allclose(thetas, [minimum.theta for minimum in best], rtol=1e-6)
+    np.testing.assert_allclose(found.squared_errors[::-1], [minimum.squared_error for minimum in best], rtol=1e-9)
+    np.testing.assert_allclose(found.thetas[::-1], [minimum.theta for minimum in best], rtol=1e-6)
 
 
 def test_input_that_rests_while_it_counts_has_no_minimum():
     # All that the output could tell of the input lies before the samples that count.
     t = 0.05 * np.arange(1000)
     costs = costs_of(Record(t, np.sin(t), HeldSignal(t, np.where(t < t[-1], 0.0, 1.0))))
-    _, squared_errors = costs.minima_behind_all(1.0)
+    squared_errors = scan(costs, [1.0] * 3, own=False).squared_errors
     assert np.isinf(squared_errors).all()
-    assert percents(squared_errors, costs.spreads).tolist() == [100.0] * 3
+    assert percents(squared_errors, costs[0].spread).tolist() == [100.0] * 3

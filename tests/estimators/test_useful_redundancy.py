@@ -21,8 +21,8 @@ FILTERS = {CASE_1: 10, CASE_2: 15}
 
 def member_costs(prepared, delay):
     """Costs of all filters at a delay, each with its own coefficients."""
-    costs = prepared.laid_out.filtered.costs
-    return percents(costs.minima_behind_all(delay).squared_errors, costs.spreads)
+    search = prepared.laid_out.filtered
+    return percents(search.at(delay).squared_errors, np.array([cost.spread for cost in search.costs]))
 
 
 def reference_cost(prepared, delay):
@@ -188,7 +188,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         assert [entry.iteration for entry in block] == list(range(len(block)))
         assert block[0].delay == before.point
         assert block[-1].delay == pytest.approx(after.point, abs=0.5 * LATTICE * prepared.laid_out.filtered.period)
-        cost = prepared.laid_out.filtered.costs.behind(after.path)
+        cost = prepared.laid_out.filtered.costs[after.path]
         for entry in block:
             # A fit goes on from these coefficients.
             theta = np.array([*entry.denominator[1:], *entry.numerator, entry.delay])
