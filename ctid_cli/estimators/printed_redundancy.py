@@ -122,7 +122,8 @@ def printed_search(
 
     def rounds(*lowpasses: Lowpass | None) -> PrintedRounds:
         behind = (replace(options, lowpass=lowpass)._lay_out(record).first for lowpass in lowpasses)
-        members = [FilteredMember(**vars(options._cost(problem, (cutoff,)))) for problem in behind]
+        costs = [options._cost(problem, (cutoff,)) for problem in behind]
+        members = [FilteredMember(cost.problem, cost.steps, cost.svf_cutoffs) for cost in costs]
         return PrintedRounds(options, members, max_delay_step, max_rounds)
 
     return PrintedSearch(filters, rounds(*filters.lowpasses), rounds(None))
