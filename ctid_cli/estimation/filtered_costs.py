@@ -64,16 +64,19 @@ class FilteredCost:
         """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
         spectra, reach, steps = self.spectra, self.weights.size, self.steps
         data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
-        poles, zeros = self.structure.poles, self.structure.zeros
-        tried = [start[:poles] for start in starts]
+        poles, order = self.structure.poles, self.structure.poles + self.integrators
+        # B, and what the states at the ends of the window add.
+        linear = np.zeros(self.structure.zeros + 1 + order)
+        tried = [np.concatenate((start[:poles], linear)) for start in starts]
         if own:
             # The state-variable filter 1/(p + w)^n.
-            filter_ = np.poly(np.full(poles, -self.svf_cutoff)).astype(np.float64)
-            solved, a = least_squares(*data, filter_[1:], zeros, self.integrators)
-            tried += [reflect_unstable(np.append(1.0, a))[1:]] if solved else []
+            filter_ = np.concatenate((np.poly(np.full(poles, -self.svf_cutoff))[1:], linear))
+            solved, theta = least_squares(*data, filter_, poles, order)
+            if solved:
+                tried.append(np.concatenate((reflect_unstable(np.append(1.0, theta[:poles]))[1:], linear)))
         best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
         for start in tried:
-            theta, squared_error, step = least_cost(*data, start, zeros, self.integrators, *effort)
+            theta, squared_error, step = least_cost(*data, start, poles, order, *effort)
             if squared_error < best.squared_error:
                 best = Minimum(np.append(theta, delay), squared_error, step)
         return best

@@ -164,7 +164,9 @@ def _moments(
     for i in range(poles):
         denominator[i + 1] = theta[i]
     numerator, transient = theta[poles:ahead], theta[ahead:]
-    measured, power = not numerator.any(), 0.0
+    measured, power = True, 0.0
+    for b in numerator:
+        measured = measured and b == 0.0
     rising, column = np.empty(order, np.complex128), np.empty(size, np.complex128)
     columns = np.empty((2 * frequencies.size, size))
     for k in range(frequencies.size):
@@ -251,18 +253,16 @@ def least_squares(
     inputs: ComplexArray,
     weights: Array,
     start: Array,
-    zeros: int,
-    integrators: int,
+    poles: int,
+    order: int,
 ) -> tuple[bool, Array]:
-    """Least-squares estimate of ``(a_1 … a_n)`` with a state-variable filter 1/F, ``start = (f_1 … f_n)``.
+    """Least-squares estimate of ``(a, b, T)`` with a state-variable filter 1/F, ``start = (f_1 … f_n, 0 … 0)``.
 
     ``A Y = B U + T`` divided by F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
     """
-    poles, order = start.size, start.size + integrators
-    theta = np.append(start, np.zeros(zeros + 1 + order))
-    gram, _ = _moments(frequencies, outputs, inputs, weights, theta, poles, order)
-    solved, step = _solve(gram, theta.size + 1, 0, theta.size)
-    return solved, start + step[:poles]
+    gram, _ = _moments(frequencies, outputs, inputs, weights, start, poles, order)
+    solved, step = _solve(gram, start.size + 1, 0, start.size)
+    return solved, start + step
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -272,26 +272,24 @@ def least_cost(
     inputs: ComplexArray,
     weights: Array,
     start: Array,
-    zeros: int,
-    integrators: int,
+    poles: int,
+    order: int,
     max_iterations: int,
     tolerance: float,
     halvings: int,
 ) -> tuple[Array, float, float]:
-    """Gauss-Newton on the coefficients from a stable denominator ``start = (a_1 … a_n)``, for which B and T are fitted.
+    """Gauss-Newton on the coefficients from a stable denominator, for which B and T are fitted: ``start = (a, 0, 0)``.
 
     A step to an unstable model, or one that does not lower the cost, is halved, so often at most. The iteration ends
     where a step changes the model's output by less than a fraction of its size. Returns the coefficients, the squared
     error, infinite where nothing could be computed, and the Gauss-Newton step of the delay [s], NaN where the data do
     not determine it. With integrators no frequency may be zero.
     """
-    poles, order, coefficients = start.size, start.size + integrators, start.size + zeros + 1
-    theta = np.append(start, np.zeros(zeros + 1 + order))
-    size = theta.size
-    gram, power = _moments(frequencies, outputs, inputs, weights, theta, poles, order)
+    size, coefficients = start.size, start.size - order
+    gram, power = _moments(frequencies, outputs, inputs, weights, start, poles, order)
     # At zero B and T the output error is what they explain: one step is the minimum.
     solved, step = _solve(gram, size + 1, poles, size)
-    theta = theta + step
+    theta = start + step
     gram, power = _moments(frequencies, outputs, inputs, weights, theta, poles, order)
     if not (solved and math.isfinite(gram[-1, -1])):
         return theta[:coefficients], np.inf, np.nan

@@ -60,7 +60,9 @@ def columns_of(data, theta, poles):
 
 def fitted(data, model, start, *, iterations=50, tolerance=1e-6):
     """The fit from a denominator, which is at the head of the parameters of a start."""
-    return least_cost(*data, start[: model.order], model.numerator.size - 1, 0, iterations, tolerance, 12)
+    n = model.order
+    start = np.concatenate((start[:n], np.zeros(model.numerator.size + n)))
+    return least_cost(*data, start, n, n, iterations, tolerance, 12)
 
 
 def disturbed(model):
@@ -136,7 +138,9 @@ def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
     assert spectra.frequencies.size == 2
     data = spectra.frequencies, spectra.outputs, spectra.inputs(1.0), np.ones(2)
     for order in (3, 5):
-        _, squared_error, step = least_cost(*data, np.poly(np.full(order, -1.0))[1:], 0, 0, 5, 1e-9, 12)
+        _, squared_error, step = least_cost(
+            *data, np.append(np.poly(np.full(order, -1.0))[1:], np.zeros(1 + order)), order, order, 5, 1e-9, 12
+        )
         assert squared_error < 1e-12 * np.sum(np.abs(spectra.outputs) ** 2)
         assert np.isnan(step)
 
