@@ -69,8 +69,8 @@ class FilteredCost:
         linear = np.zeros(self.structure.zeros + 1 + order)
         tried = [np.concatenate((start[:poles], linear)) for start in starts]
         if own:
-            # The state-variable filter 1/(p + w)^n.
-            filter_ = np.concatenate((np.poly(np.full(poles, -self.svf_cutoff))[1:], linear))
+            # The state-variable filter 1/(p + w)^n; of no poles NumPy makes a number.
+            filter_ = np.concatenate((np.atleast_1d(np.poly(np.full(poles, -self.svf_cutoff)))[1:], linear))
             solved, theta = least_squares(*data, filter_, poles, order)
             if solved:
                 tried.append(np.concatenate((reflect_unstable(np.append(1.0, theta[:poles]))[1:], linear)))
