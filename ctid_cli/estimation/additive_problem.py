@@ -213,7 +213,7 @@ class History(Sequence[IterationRecord]):
         if isinstance(index, slice):
             return tuple(self[k] for k in range(*index.indices(len(self))))
         stage, iteration, row = self._entries[index]
-        return history_entry(stage, iteration, self._problem, row[:-1], float(row[-1]))
+        return history_entry(stage, iteration, self._problem, row)
 
 
 class SubmodelEstimate(NamedTuple):

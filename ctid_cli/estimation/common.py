@@ -11,8 +11,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.delay_search import Descent
-from ctid_cli.estimation.iteration import Iterated, Problem
+from ctid_cli.estimation.iteration import Problem
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
@@ -256,17 +255,16 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
 # --- results ---------------------------------------------------------------------------------------
 
 
-def history_entry(stage: str, iteration: int, problem: Problem, theta: Array, squared_error: float) -> IterationRecord:
-    """Describe one accepted iteration."""
-    a, b, delay = problem.split(theta)
-    cost = squared_error / problem.samples
+def history_entry(stage: str, iteration: int, problem: Problem, row: Array) -> IterationRecord:
+    """Describe one accepted iteration by its parameters, with their squared error behind them."""
+    a, b, delay = problem.split(row[:-1])
+    cost = float(row[-1]) / problem.samples
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
-def history_of(stage: str, problem: Problem, result: Iterated | Descent | None) -> list[IterationRecord]:
-    """Describe the start and the accepted steps of an iteration."""
-    path = np.empty((0, 1)) if result is None else result.path
-    return [history_entry(stage, k, problem, row[:-1], float(row[-1])) for k, row in enumerate(path)]
+def history_of(stage: str, problem: Problem, path: Array) -> list[IterationRecord]:
+    """Describe the start and the accepted steps of an iteration, which are the rows of its path."""
+    return [history_entry(stage, k, problem, row) for k, row in enumerate(path)]
 
 
 def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
@@ -281,12 +279,6 @@ def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
     }
 
 
-def diverged(size: int, count: int) -> dict[str, Any]:
-    """What stands in a `Fit` without a finite response."""
-    nothing = dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), float("nan"))
-    return {"covariance": np.full((size, size), np.nan), "status": Status.DIVERGED, "count": count, **nothing}
-
-
 def assessed(
     problem: Problem,
     theta: Array,
@@ -297,35 +289,24 @@ def assessed(
     tangent: Array,
 ) -> dict[str, Any]:
     """Uncertainty, status, cost and agreement by the names of `Fit`; the tangent has the free directions as columns."""
-    y = problem.data.y_used
+    y, nothing = problem.data.y_used, np.full((len(tangent),) * 2, np.nan)
     if not np.isfinite(equations.squared_error):
-        return diverged(len(tangent), y.size)
-    law = _uncertainty(problem, theta, equations, kind, draws, tangent) if tangent.shape[1] else None
-    if status is Status.CONVERGED and law is not None and not np.isfinite(law.free_covariance).all():
-        status = Status.SINGULAR
-    covariance = np.full((len(tangent),) * 2, np.nan) if law is None else law.covariance
-    spread = float(np.sum((y - y.mean()) ** 2))
-    return {"covariance": covariance, "law": law, "status": status, **quality(equations, spread, y.size)}
-
-
-def _uncertainty(
-    problem: Problem,
-    theta: Array,
-    equations: Equations,
-    kind: Covariance,
-    draws: int,
-    tangent: Array,
-) -> Uncertainty | None:
-    """Uncertainty of all parameters; None where the response is not finite."""
-    if kind == "white":
+        unknown = dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), float("nan"))
+        return {"covariance": nothing, "status": Status.DIVERGED, "count": y.size, **unknown}
+    law: Uncertainty | None = None
+    rows = problem.rows(theta) if tangent.shape[1] and kind != "white" else None
+    if rows is not None:
+        psi, error = rows
+        law = estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
+    elif tangent.shape[1] and kind == "white":
         hessian = tangent.T @ equations.hessian @ tangent
         covariance = white_noise_covariance(hessian, equations.squared_error, problem.samples)
-        return Uncertainty("white", tangent, covariance, problem.samples)
-    rows = problem.rows(theta)
-    if rows is None:
-        return None
-    psi, error = rows
-    return estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
+        law = Uncertainty("white", tangent, covariance, problem.samples)
+    if status is Status.CONVERGED and law is not None and not np.isfinite(law.free_covariance).all():
+        status = Status.SINGULAR
+    covariance = nothing if law is None else law.covariance
+    spread = float(np.sum((y - y.mean()) ** 2))
+    return {"covariance": covariance, "law": law, "status": status, **quality(equations, spread, y.size)}
 
 
 def finish(

@@ -3,23 +3,21 @@
 Useful redundancy over the delay: solver paths on the costs of several filters, ranked by the mean of all.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from math import comb
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray, IntArray
-from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, descend
-from ctid_cli.estimation.iteration import Steps, solve_scaled
-from ctid_cli.estimation.redundancy import Path, RedundantMinimum, SearchStatus, minimise_redundantly
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.delay_search import Descent, Limits, Minima, Minimum, descend, scan
+from ctid_cli.estimation.iteration import Steps
+from ctid_cli.estimation.redundancy import RedundantMinimum, minimise_redundantly
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.filtering.spectra import HeldSpectrum, lowpass_weight, record_spectra
-from ctid_cli.filtering.spectral_kernels import least_cost, projected_moments
+from ctid_cli.filtering.spectra import RecordSpectra, lowpass_weight, record_spectra
+from ctid_cli.filtering.spectral_kernels import least_cost, least_squares
 from ctid_cli.inference.fit import IterationRecord
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
@@ -40,22 +38,18 @@ LARGEST_STEP = 1 / 3
 POOR = 25.0
 
 
-class FilteredCosts(NamedTuple):
-    """What searches need of a record behind filters, the spectra of which they share."""
+@dataclass(frozen=True, eq=False)
+class FilteredCost:
+    """The output-error cost of a record behind a low-pass filter as a function of the delay."""
 
-    #: Frequencies [rad/s], shape (K,).
-    frequencies: Array
-    outputs: ComplexArray
-    input: HeldSpectrum
-    #: ``|L|^2`` of each filter, shape (filters, K), and at how many frequencies it matters, shape (filters,).
+    spectra: RecordSpectra
+    #: ``|L|^2`` at the first frequencies, those where it matters.
     weights: Array
-    reach: IntArray
-    #: Cut-off of the state-variable filter of the least-squares start [rad/s], shape (filters,).
-    svf_cutoffs: Array
-    #: Mean square of the filtered output less its mean [output unit^2], shape (filters,).
-    spreads: Array
-    poles: int
-    zeros: int
+    #: Mean square of the filtered output less its mean [output unit^2].
+    spread: float
+    #: Cut-off of the state-variable filter of the least-squares start [rad/s].
+    svf_cutoff: float
+    structure: Structure
     #: Poles at the origin besides; with any the mean is left out.
     integrators: int
     #: How hard to work at each delay.
@@ -64,87 +58,28 @@ class FilteredCosts(NamedTuple):
     @property
     def size(self) -> int:
         """Number of parameters, the delay included."""
-        return self.poles + self.zeros + 2
-
-    def behind(self, k: int) -> "FilteredCost":
-        """The cost of one filter."""
-        return FilteredCost(self, k)
-
-    def minima_behind_all(self, delay: float) -> tuple[Array, Array]:
-        """Coefficients and squared error behind every filter, the narrowest band first.
-
-        Good coefficients are handed from filter to filter, down to the narrowest band and up again.
-        """
-        many = self.reach.size
-        inputs = self.inputs(delay, int(self.reach.max()))
-        thetas, squared_errors = np.zeros((many, self.size)), np.full(many, np.inf)
-        for k in range(many - 1, -1, -1):
-            # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
-            known = k + 1 < many and bool(np.isfinite(squared_errors[k + 1]))
-            found = self.least(k, inputs, delay, thetas[k + 1 : k + 1 + known], not known)
-            thetas[k], squared_errors[k] = found.theta, found.squared_error
-        for k in range(1, many):
-            if np.isfinite(squared_errors[k - 1]):
-                found = self.least(k, inputs, delay, thetas[k - 1 : k], False)
-                if found.squared_error < squared_errors[k]:
-                    thetas[k], squared_errors[k] = found.theta, found.squared_error
-        return thetas, squared_errors
-
-    def inputs(self, delay: float, reach: int) -> ComplexArray:
-        """Spectrum of the delayed input at the first frequencies."""
-        if self.integrators:
-            return self.input.at(delay, np.ones(reach))[1:]
-        return self.input.at(delay, np.ones(reach - 1))
-
-    def least(self, k: int, inputs: ComplexArray, delay: float, starts: Iterable[Array], own: bool) -> Minimum:
-        """Least cost of one filter over starts and, if asked for, from least squares."""
-        reach = self.reach[k]
-        data = self.frequencies[:reach], self.outputs[:reach], inputs[:reach], self.weights[k, :reach]
-        tried = [start[:-1] for start in starts]
-        if own:
-            start = self._least_squares(data, self.svf_cutoffs[k])
-            tried += [] if start is None else [start]
-        best = Minimum(np.zeros(self.size), np.inf)
-        for start in tried:
-            theta, squared_error, step = least_cost(*data, start, self.poles, self.integrators, *self.effort)
-            if squared_error < best.squared_error:
-                best = Minimum(np.append(theta, delay), squared_error, step)
-        return best
-
-    def _least_squares(self, data: tuple[Array, ComplexArray, ComplexArray, Array], cutoff: float) -> Array | None:
-        """Least-squares estimate of the coefficients with the state-variable filter ``1/(p + w)^n``.
-
-        ``A Y = B U + T`` divided by the filter F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
-        """
-        svf = np.array([comb(self.poles, k) * cutoff**k for k in range(self.poles + 1)])
-        gram, _ = projected_moments(*data, svf, np.zeros(self.zeros + 1), self.integrators)
-        lengths = np.diag(gram)
-        solved, theta = solve_scaled(gram, gram[:, -1], lengths, lengths, self.size - 1)
-        if not solved:
-            return None
-        return np.concatenate((reflect_unstable(svf + np.append(0.0, theta[: self.poles]))[1:], theta[self.poles : -2]))
-
-    @property
-    def effort(self) -> tuple[int, float, int]:
-        """Most iterations, tolerance and most halvings."""
-        return self.steps.max_iterations, self.steps.tolerance, self.steps.halvings
-
-
-class FilteredCost(NamedTuple):
-    """The cost behind one filter of several."""
-
-    costs: FilteredCosts
-    filter: int
-
-    @property
-    def size(self) -> int:
-        """Number of parameters, the delay included."""
-        return self.costs.size
+        return self.structure.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
-        inputs = self.costs.inputs(delay, int(self.costs.reach[self.filter]))
-        return self.costs.least(self.filter, inputs, delay, starts, own)
+        spectra, reach, steps = self.spectra, self.weights.size, self.steps
+        data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
+        poles, order = self.structure.poles, self.structure.poles + self.integrators
+        # B, and what the states at the ends of the window add.
+        linear = np.zeros(self.structure.zeros + 1 + order)
+        tried = [np.concatenate((start[:poles], linear)) for start in starts]
+        if own:
+            # The state-variable filter 1/(p + w)^n; of no poles NumPy makes a number.
+            filter_ = np.concatenate((np.atleast_1d(np.poly(np.full(poles, -self.svf_cutoff)))[1:], linear))
+            solved, theta = least_squares(*data, filter_, poles, order)
+            if solved:
+                tried.append(np.concatenate((reflect_unstable(np.append(1.0, theta[:poles]))[1:], linear)))
+        best, effort = Minimum(np.zeros(self.size), np.inf), (steps.max_iterations, steps.tolerance, steps.halvings)
+        for start in tried:
+            theta, squared_error, step = least_cost(*data, start, poles, order, *effort)
+            if squared_error < best.squared_error:
+                best = Minimum(np.append(theta, delay), squared_error, step)
+        return best
 
 
 def percents(squared_errors: Array, spreads: Array | float) -> Array:
@@ -159,19 +94,22 @@ def filtered_costs(
     greatest_delay: float,
     *,
     start: float,
-    svf_cutoffs: Array,
+    svf_cutoffs: Sequence[float],
     steps: Steps,
     integrators: int = 0,
-) -> FilteredCosts:
+) -> list[FilteredCost]:
     """Costs of one record behind filters; samples earlier than ``start`` after the first input are not used."""
     highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
     spectra = record_spectra(record, start, highest, greatest_delay, keep_mean=integrators == 0)
-    w = spectra.frequencies
-    weights = np.array([lowpass_weight(w, lowpass) for lowpass in lowpasses])
-    reach = (weights >= NEGLIGIBLE_WEIGHT * weights.max(axis=1, keepdims=True)).sum(axis=1)
-    spreads = weights @ (np.where(w > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2)
-    sizes = structure.poles, structure.zeros, integrators
-    return FilteredCosts(w, spectra.outputs, spectra.input, weights, reach, svf_cutoffs, spreads, *sizes, steps)
+    power = np.where(spectra.frequencies > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2
+    costs = []
+    for lowpass, svf_cutoff in zip(lowpasses, svf_cutoffs, strict=True):
+        weights = lowpass_weight(spectra.frequencies, lowpass)
+        reach = int((weights >= NEGLIGIBLE_WEIGHT * weights.max()).sum())
+        costs.append(
+            FilteredCost(spectra, weights[:reach], float(weights @ power), svf_cutoff, structure, integrators, steps)
+        )
+    return costs
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +139,7 @@ class FilterPath:
 def path_history(
     stage: str, search: RedundantMinimum[float], paths: Sequence[FilterPath], poles: int, samples: int = 1
 ) -> list[IterationRecord]:
-    """The steps of the paths that led from incumbent to incumbent."""
+    """Describe the steps of the paths that led from incumbent to incumbent."""
     led = {(path.round, path.filter, path.end): path for path in reversed(paths)}
     return [
         IterationRecord(
@@ -213,109 +151,75 @@ def path_history(
     ]
 
 
-class ReferenceCost(NamedTuple):
-    """J0 at one delay and what it is made of."""
-
-    #: Mean of the costs of all filters [%].
-    mean: float
-    #: ``(a_1 … a_n, b_0 … b_m, delay)`` of each filter, shape (filters, n + m + 2).
-    thetas: Array
-    #: Infinite where nothing could be computed, shape (filters,).
-    squared_errors: Array
-
-
 class FilterSearch:
     """The costs of a record behind a set of filters, and the search through them."""
 
-    def __init__(
-        self,
-        costs: FilteredCosts,
-        filters: FilterSet,
-        bounds: tuple[float, float],
-        max_iterations: int,
-        tolerance: float,
-        max_delay_step: float,
-    ) -> None:
+    def __init__(self, costs: Sequence[FilteredCost], filters: FilterSet, limits: Limits) -> None:
+        #: That of the lowest cut-off first.
         self.costs = costs
         self.filters = filters
         self.period = float(filters.periods[-1])
-        shortest = SMALLEST_STEP * self.period
-        self.limits = Limits(*bounds, max_iterations, tolerance, shortest, max_delay_step, reflect=True)
-        self._known: dict[float, ReferenceCost] = {}
-        self._descended: dict[tuple[int, float, bool], list[Descent]] = {}
+        self.limits = limits._replace(smallest_step=SMALLEST_STEP * self.period, reflect=True)
+        self.at = cache(self._minima)
+        self._descended = cache(self._descend)
 
     def on_lattice(self, delay: float) -> float:
-        """The nearest point of the lattice within the bounds."""
+        """Return the nearest point of the lattice within the bounds."""
         step = LATTICE * self.period
         return min(max(round(delay / step) * step, self.limits.low), self.limits.high)
 
-    def at(self, delay: float) -> ReferenceCost:
-        """J0 and the minima of all filters at a point of the lattice."""
-        if delay not in self._known:
-            thetas, squared_errors = self.costs.minima_behind_all(delay)
-            self._known[delay] = ReferenceCost(
-                float(percents(squared_errors, self.costs.spreads).mean()), thetas, squared_errors
-            )
-        return self._known[delay]
-
     def reference_cost(self, delay: float) -> float:
-        """J0 at the nearest point of the lattice [%]."""
-        return self.at(self.on_lattice(delay)).mean
+        """J0 (45), the mean of the costs behind all filters, at the nearest point of the lattice [%]."""
+        spreads = np.array([cost.spread for cost in self.costs])
+        return float(percents(self.at(self.on_lattice(delay)).squared_errors, spreads).mean())
 
-    def run(self, delay: float, max_rounds: int, paths: list[FilterPath]) -> RedundantMinimum[float]:
-        """Rounds over all filters, and a look at the next valleys before a poor incumbent is settled for."""
+    def run(self, delay: float, max_rounds: int) -> tuple[RedundantMinimum[float], list[FilterPath]]:
+        """Follow the paths of all filters from incumbent to incumbent, round by round."""
+        found = minimise_redundantly(
+            self.on_lattice(delay),
+            self.reference_cost,
+            [partial(self._ends, k) for k in range(self.filters.count)],
+            choice="best",
+            settled=lambda before, now: abs(now - before) <= self.limits.tolerance * max(abs(now), self.period),
+            max_rounds=max_rounds,
+        )
+        incumbents = [visit.point for visit in found.trajectory]
+        paths = [
+            FilterPath(number, k, descent, self.costs[k].spread, self.on_lattice(descent.minimum.delay))
+            for number, incumbent in enumerate(incumbents[: found.rounds], 1)
+            for k in range(self.filters.count)
+            for descent in self._followed(k, incumbent)
+        ]
+        return found, paths
 
-        def rounds_from(delay: float, done: int, hop: bool) -> RedundantMinimum[float]:
-            return minimise_redundantly(
-                delay,
-                lambda delay: self.at(delay).mean,
-                [self._path(k, paths, done, hop) for k in range(self.filters.count)],
-                choice="best",
-                settled=lambda before, now: abs(now - before) <= self.limits.tolerance * max(abs(now), self.period),
-                max_rounds=1 if hop else max_rounds - done,
-            )
+    def _minima(self, delay: float) -> Minima:
+        """Least costs behind all filters at a delay."""
+        # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
+        found = scan(self.costs[::-1], [delay] * len(self.costs), own=False)
+        return Minima(found.thetas[::-1], found.squared_errors[::-1])
 
-        found = rounds_from(self.on_lattice(delay), 0, False)
-        while found.status is SearchStatus.EXHAUSTED and found.cost > POOR and found.rounds < max_rounds - 1:
-            beyond = rounds_from(found.point, found.rounds, True)
-            improved = len(beyond.trajectory) > 1
-            found = _joined(found, beyond)
-            if not improved:
-                break
-            found = _joined(found, rounds_from(found.point, found.rounds, False))
-        return found
+    def _ends(self, k: int, delay: float) -> list[float]:
+        """Where the paths of one filter from an incumbent end, on the lattice."""
+        return [self.on_lattice(descent.minimum.delay) for descent in self._followed(k, delay)]
 
-    def _path(self, k: int, paths: list[FilterPath], done: int, hop: bool) -> Path[float]:
-        """Solver path of one filter after a number of rounds; what it does goes to ``paths``."""
-        rounds = done
+    def _followed(self, k: int, delay: float) -> list[Descent]:
+        """Descents of one filter's cost from an incumbent, and from the next valleys if it is poor and a dead end."""
+        near, cost = self._descended(k, delay, 0), self.reference_cost(delay)
+        if cost <= POOR:
+            return near
+        others = (descent for other in range(self.filters.count) for descent in self._descended(other, delay, 0))
+        if any(self.reference_cost(descent.minimum.delay) < cost for descent in others):
+            return near
+        return near + self._descended(k, delay, -1) + self._descended(k, delay, 1)
 
-        def follow(delay: float) -> list[float]:
-            nonlocal rounds
-            rounds += 1
-            if (k, delay, hop) not in self._descended:
-                self._descended[k, delay, hop] = self._descents(k, delay, hop)
-            ends = [(found, self.on_lattice(found.minimum.delay)) for found in self._descended[k, delay, hop]]
-            paths.extend(FilterPath(rounds, k, found, self.costs.spreads[k], end) for found, end in ends)
-            return [end for _, end in ends]
-
-        return follow
-
-    def _descents(self, k: int, delay: float, hop: bool) -> list[Descent]:
-        """Descents of one filter's cost from a point of the lattice, or from a period of the filter away from it."""
-        none = np.empty((0, self.costs.size))
-        if hop:
-            low, high, period = self.limits.low, self.limits.high, float(self.filters.periods[k])
-            starts = [(start, none) for start in (delay - period, delay + period) if low <= start <= high]
-        else:
-            # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
-            here = self.at(delay)
-            starts = [(delay, here.thetas[k : k + 1])] if np.isfinite(here.squared_errors[k]) else []
-            starts.append((delay, none))
-        found = [descend(self.costs.behind(k), start, theta, self.limits) for start, theta in starts]
+    def _descend(self, k: int, delay: float, periods: int) -> list[Descent]:
+        """Descents of one filter's cost from a number of its periods away from a point of the lattice."""
+        none, here = np.empty((0, self.costs[k].size)), self.at(delay)
+        start = delay + periods * float(self.filters.periods[k])
+        if not self.limits.low <= start <= self.limits.high:
+            return []
+        # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
+        known = periods == 0 and np.isfinite(here.squared_errors[k])
+        thetas = [here.thetas[k : k + 1], none] if known else [none]
+        found = [descend(self.costs[k], start, theta, self.limits) for theta in thetas]
         return [descent for descent in found if descent.path.size]
-
-
-def _joined(first: RedundantMinimum[float], then: RedundantMinimum[float]) -> RedundantMinimum[float]:
-    """A search and the one that went on from its end as one."""
-    later = tuple(replace(visit, round=visit.round + first.rounds) for visit in then.visits[1:])
-    return replace(then, rounds=first.rounds + then.rounds, visits=first.visits + later)

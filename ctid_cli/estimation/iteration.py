@@ -19,10 +19,7 @@ from ctid_cli.inference.fit import Status
 #: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
 Variant = Literal["plain", "guarded"]
 StepRule = Literal["plain", "relaxed", "guarded"]
-#: The same, and guarded Gauss-Newton steps alone.
-Rule = Literal["plain", "relaxed", "guarded", "gauss_newton"]
-GUARDED: Rule = "guarded"
-GAUSS_NEWTON: Rule = "gauss_newton"
+GUARDED: StepRule = "guarded"
 
 #: Halvings of a step before a direction is given up.
 HALVINGS = 12
@@ -49,7 +46,7 @@ class Steps(NamedTuple):
     max_iterations: int
     #: Stop when a step changes the simulated output by less than this fraction of its rms value [-].
     tolerance: float
-    rule: Rule
+    rule: StepRule
     halvings: int = HALVINGS
 
 
@@ -174,10 +171,9 @@ def iterate(problem: Problem, theta: Array, steps: Steps) -> Iterated | None:
     if not np.isfinite(current.squared_error):
         return None
     path = [np.append(theta, current.squared_error)]
-    guarded, pace = steps.rule in (GUARDED, GAUSS_NEWTON), _Pace()
-    # Where instruments are regressors the step is Gauss-Newton's already: a second trial would repeat the first. And a
-    # direction in which the cost does not fall will not be better at the next step: it is not tried again.
-    gauss_newton = steps.rule == GAUSS_NEWTON
+    guarded, pace = steps.rule == GUARDED, _Pace()
+    # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
+    gauss_newton = False
     slow, converged, ending = 0, Status.CONVERGED, Status.MAX_ITERATIONS
     for _ in range(steps.max_iterations):
         move: _Move | Status = Status.SINGULAR
@@ -214,7 +210,7 @@ def _moved(
 
     The first acceptable fraction: any with a finite response, unless the cost is guarded.
     """
-    guarded = steps.rule in (GUARDED, GAUSS_NEWTON)
+    guarded = steps.rule == GUARDED
     solved, step = _step(current, problem.free, gauss_newton)
     if not solved:
         return Status.SINGULAR

@@ -6,24 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.estimation.delay_grid import quarter_periods, scan, search_grid
-from ctid_cli.estimation.delay_search import Minimum, best_of, lowest_minima
+from ctid_cli.estimation.delay_search import Minimum, lowest_minima, quarter_periods, scan, search_levels
 from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps
+from ctid_cli.estimation.iteration import GUARDED, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.sampled_problem import CUTOFFS, at_known_delay, least_squares_starts
+from ctid_cli.estimation.sampled_problem import CUTOFFS, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivities import Structure
 
 #: Local minima of the profile that are refined.
 MINIMA = 3
-#: How hard to work at each delay of the grid. Far from the true delay a pole may run to infinity, where no number of
-#: halvings helps. Gauss-Newton is a direction of descent also where the delay is wrong.
-GRID_EFFORT = Steps(max_iterations=15, tolerance=1e-2, rule=GAUSS_NEWTON, halvings=4)
-#: The same where an initial state, an offset, a period or several records are treated: the fall of the cost that a step
-#: must promise, as a fraction of it, and most steps.
-ROUGH = 1e-3, 15
+#: How hard to work at each delay of the grid: the fall of the cost that a step must promise, as a fraction of it, and
+#: most steps.
+ROUGH = 3e-3, 10
 #: Most delays on the grid, whatever the bandwidth asks for.
 MOST_DELAYS = 2000
 #: Most parts into which a step of the grid is divided around its minima.
@@ -36,7 +32,7 @@ MOST_LEVELS = 4
 LEVEL_ORDER = 10
 #: Real equations inside the pass band of a level for every parameter, those of the transient included.
 EQUATIONS_PER_PARAMETER = 4
-LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GAUSS_NEWTON, halvings=3)
+LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GUARDED, halvings=3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +87,6 @@ class RecordsCost:
         """Least cost at a delay over the denominators of several starts."""
         measured, n = self.measured, self.coefficients.poles
         tried = np.vstack((starts, *(self.starts(delay) if own else ())))
-        if measured.plain:
-            tried[:, -1] = delay
-            least: Minimum = best_of(at_known_delay(measured.data[0], self.coefficients), tried, n, GRID_EFFORT)
-            return least
         best = Minimum(np.zeros(self.size), np.inf)
         for start in tried:
             poles = np.roots(np.concatenate(([1.0], start[:n]))).astype(complex)
@@ -141,11 +133,11 @@ def _search_levels(cost: RecordsCost) -> Found:
         cost.coefficients,
         bounds[1],
         start=0.0 if measured.plain else bounds[1],
-        svf_cutoffs=cutoffs,
+        svf_cutoffs=cutoffs.tolist(),
         steps=LEVEL_EFFORT,
         integrators=cost.integrators,
     )
-    delays, found, minima = search_grid(costs, (0.5 * np.pi / cutoffs).tolist(), bounds)
+    delays, found, minima = search_levels(costs, (0.5 * np.pi / cutoffs).tolist(), bounds)
     profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0 and measured.plain:
@@ -170,7 +162,7 @@ def _search_samples(cost: RecordsCost) -> Found:
     measured = cost.measured
     low, high = measured.treatment.delay_bounds
     delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
-    found = scan(cost, delays)
+    found = scan([cost] * delays.size, delays.tolist())
     count = sum(data.count for data in measured.data)
     chosen = found.lowest(MINIMA)
     if not chosen or delays.size == 1:

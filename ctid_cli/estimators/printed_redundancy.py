@@ -7,31 +7,34 @@ delay estimation for continuous-time models" (arXiv:1703.09344).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.delay_search import SMALLEST_STEP, Limits, Minimum, descend
+from ctid_cli.estimation.delay_search import Minimum, SampledCost, descend
 from ctid_cli.estimation.filtered_costs import FilterPath, path_history, percents
 from ctid_cli.estimation.redundancy import START, RedundantMinimum, SearchStatus, Visit
-from ctid_cli.estimation.sampled_problem import SampledProblem
-from ctid_cli.estimators.td_srivc import SrivcCost, TdSrivc
+from ctid_cli.estimators.td_srivc import TdSrivc
 from ctid_cli.filtering.filter_set import FilterSet
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.signals.record import Record
 
 
-class FilteredMember(SrivcCost):
+class FilteredMember(SampledCost):
     """The cost of one filter's data; what SRIVC finds from its own start at a delay is kept for that very delay."""
 
-    def __init__(self, options: TdSrivc, problem: SampledProblem) -> None:
-        assert options.svf_cutoff is not None
-        super().__init__(options, problem, (options.svf_cutoff,))
-        y = problem.data.y_used
-        self.spread = float(np.sum((y - y.mean()) ** 2))
-        self._known: dict[float, Minimum] = {}
+    @cached_property
+    def spread(self) -> float:
+        """Sum of squares of the filtered output less its mean [output unit^2]."""
+        y = self.problem.data.y_used
+        return float(np.sum((y - y.mean()) ** 2))
+
+    @cached_property
+    def _known(self) -> dict[float, Minimum]:
+        return {}
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """SRIVC at one delay, from given coefficients or by the whole of Algorithm I."""
@@ -84,10 +87,7 @@ class PrintedRounds:
 
     def _followed(self, number: int, delay: float) -> list[FilterPath]:
         """Algorithm II without its step 3 on the cost of each filter."""
-        low, high = self.options.delay_bounds
-        effort = self.options.max_iterations, self.options.tolerance
-        limits = Limits(low, high, *effort, SMALLEST_STEP * (high - low), self.max_delay_step)
-        paths = []
+        limits, paths = self.options._limits._replace(largest_step=self.max_delay_step), []
         for k, member in enumerate(self.members):
             descent = descend(member, delay, np.empty((0, member.size)), limits)
             if descent.path.size:
@@ -118,10 +118,12 @@ def printed_search(
     options: TdSrivc, record: Record, filters: FilterSet, max_delay_step: float, max_rounds: int
 ) -> PrintedSearch:
     """Filter a record through all filters, once for all initial delays."""
+    cutoff = options.svf_cutoff or filters.bandwidth
 
     def rounds(*lowpasses: Lowpass | None) -> PrintedRounds:
         behind = (replace(options, lowpass=lowpass)._lay_out(record).first for lowpass in lowpasses)
-        members = [FilteredMember(options, problem) for problem in behind]
+        costs = [options._cost(problem, (cutoff,)) for problem in behind]
+        members = [FilteredMember(cost.problem, cost.steps, cost.svf_cutoffs) for cost in costs]
         return PrintedRounds(options, members, max_delay_step, max_rounds)
 
     return PrintedSearch(filters, rounds(*filters.lowpasses), rounds(None))

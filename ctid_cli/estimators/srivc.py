@@ -169,7 +169,7 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
         result = iterate(problem, theta, steps)
         if result is None:
             return finish(problem, theta, Status.DIVERGED, 0, [])
-        history = history_of("refine", problem, result)
+        history = history_of("refine", problem, result.path)
         return finish(problem, result.theta, result.status, result.iterations, history, *noise)
 
 

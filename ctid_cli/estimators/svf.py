@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_entry
+from ctid_cli.estimation.common import Estimator, Start, check_proper, check_record, finish, history_of
 from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay, cutoffs_of, least_squares_start
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Fit, Status
@@ -71,5 +73,5 @@ class Svf(Estimator[tuple[SampledProblem, float], Fit]):
         if theta is None:
             raise DataError(Status.SINGULAR.value)
         squared_error = problem.equations(theta).squared_error
-        entry = history_entry("least squares", 0, problem, theta, squared_error)
-        return finish(problem, theta, Status.LEAST_SQUARES, 1, [entry])
+        history = history_of("least squares", problem, np.append(theta, squared_error)[None])
+        return finish(problem, theta, Status.LEAST_SQUARES, 1, history)

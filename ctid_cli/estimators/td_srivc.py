@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import (
     Estimator,
@@ -19,23 +18,20 @@ from ctid_cli.estimation.common import (
     check_record,
     checked_bounds,
     finish,
-    history_entry,
     history_of,
     initial_delay,
 )
 from ctid_cli.estimation.delay_search import (
-    LEAST_CURVATURE,
     SMALLEST_STEP,
     Descent,
     Limits,
-    Minimum,
+    SampledCost,
     bound_in_the_way,
-    delay_step,
     descend,
+    lower_elsewhere,
 )
-from ctid_cli.estimation.global_look import lower_elsewhere
-from ctid_cli.estimation.iteration import GUARDED, Iterated, Steps, Variant, iterate
-from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around, least_squares_starts
+from ctid_cli.estimation.iteration import GUARDED, Steps, Variant, iterate
+from ctid_cli.estimation.sampled_problem import SampledProblem, cutoffs_around
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.fit import Fit, IterationRecord, Status
@@ -146,12 +142,12 @@ class TdSrivc(Estimator["Searches", Fit]):
 
     def _estimate(self, searches: Searches, start: Start | None) -> Fit:
         delay = initial_delay(start, self.delay_bounds)
-        history: list[IterationRecord] = []
-        starts = cutoffs_around(searches.bandwidth) if self.svf_cutoff is None else (self.svf_cutoff,)
-        none = np.empty((0, searches.first.free))
-        found = self._descend(searches.first, delay, none, "search", history, starts)
+        cutoffs = cutoffs_around(searches.bandwidth) if self.svf_cutoff is None else (self.svf_cutoff,)
+        cost = self._cost(searches.first, cutoffs)
+        found = descend(cost, delay, np.empty((0, cost.size)), self._limits)
         if found.end is None:
             raise DataError(Status.SINGULAR.value)
+        history = history_of("search", searches.first, found.path)
         end = self._finish if self.lowpass is None else self._refine
         fit = end(searches.last, found, history)
         if self.variant == "plain" or fit.status in (Status.DELAY_AT_BOUND, Status.SINGULAR):
@@ -159,58 +155,47 @@ class TdSrivc(Estimator["Searches", Fit]):
         local = lower_elsewhere(searches.last, fit, searches.bandwidth)
         return replace(fit, status=Status.LOCAL) if local else fit
 
+    def _cost(self, problem: SampledProblem, svf_cutoffs: tuple[float, ...] = ()) -> SampledCost:
+        """The cost as a function of the delay; SRIVC estimates the coefficients."""
+        steps = Steps(INNER_ITERATIONS, self._limits.tolerance, self.variant)
+        return SampledCost(problem._replace(free_delay=False), steps, svf_cutoffs)
+
+    @property
+    def _limits(self) -> Limits:
+        """What limits a search."""
+        low, high = self.delay_bounds
+        # The guarded variant ends with joint iterations: its search only has to find the basin.
+        tolerance = self.tolerance if self.variant == "plain" else max(self.tolerance, SEARCH_TOLERANCE)
+        return Limits(low, high, self.max_iterations, tolerance, SMALLEST_STEP * (high - low))
+
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Go on from a delay and coefficients that a search on filtered data has found."""
-        refined = self._descend(problem, found.minimum.delay, found.minimum.theta[None], "refine", history)
+        refined = descend(self._cost(problem), found.minimum.delay, found.minimum.theta[None], self._limits)
+        history += history_of("refine", problem, refined.path)
         if refined.end is not None:
             found = refined._replace(iterations=found.iterations + refined.iterations)
         return self._finish(problem, found, history)
 
-    def _descend(
-        self,
-        problem: SampledProblem,
-        delay: float,
-        thetas: Array,
-        stage: str,
-        history: list[IterationRecord],
-        svf_cutoffs: tuple[float, ...] = (),
-    ) -> Descent:
-        """Search from a delay; the accepted steps go to the history."""
-        cost = SrivcCost(self, problem, svf_cutoffs)
-        low, high = self.delay_bounds
-        limits = Limits(low, high, self.max_iterations, cost.tolerance, SMALLEST_STEP * (high - low))
-        found = descend(cost, delay, thetas, limits)
-        history += history_of(stage, problem, found)
-        return found
-
     def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
         """Polish with joint iterations on coefficients and delay, mind the bounds, and report."""
         theta, status, iterations = found.minimum.theta, found.end or Status.DIVERGED, found.iterations
-        if self.variant == "guarded":
+        guarded, steps = self.variant == "guarded", Steps(self.max_iterations, self.tolerance, GUARDED)
+        polished = iterate(problem, theta, steps) if guarded else None
+        if polished is not None:
             # From the right basin they converge in a few steps.
-            polished = self._iterated(problem, theta)
-            history += history_of("joint", problem, polished)
-            if polished is not None:
-                theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
-        there = self._at_bound(problem, theta)
-        if there is not None:
-            status = Status.DELAY_AT_BOUND
-            if self.variant == "guarded":
-                theta = there.theta
-                history.append(history_entry("bound", 0, problem, theta, there.equations.squared_error))
-        return finish(problem, theta, status, iterations, history, self.covariance, self.bootstrap_draws)
-
-    def _at_bound(self, problem: SampledProblem, theta: Array) -> Iterated | None:
-        """The estimate with the delay on a bound, if that is where the cost leads."""
+            history += history_of("joint", problem, polished.path)
+            theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
+        # The delay is on a bound if that is where the cost leads.
         here = problem.equations(theta)
         bound = bound_in_the_way(here, float(theta[-1]), self.delay_bounds)
-        if bound is None:
-            return None
-        there = self._iterated(problem._replace(free_delay=False), np.append(theta[:-1], bound))
-        return None if there is None or there.equations.squared_error > here.squared_error else there
-
-    def _iterated(self, problem: SampledProblem, theta: Array) -> Iterated | None:
-        return iterate(problem, theta, Steps(self.max_iterations, self.tolerance, GUARDED))
+        if bound is not None:
+            there = iterate(problem._replace(free_delay=False), np.append(theta[:-1], bound), steps)
+            if there is not None and there.equations.squared_error <= here.squared_error:
+                status = Status.DELAY_AT_BOUND
+                if guarded:
+                    theta = there.theta
+                    history += history_of("bound", problem, there.path[-1:])
+        return finish(problem, theta, status, iterations, history, self.covariance, self.bootstrap_draws)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,31 +210,3 @@ class Searches:
     def bandwidth(self) -> float:
         """Of the record [rad/s], found once for all starts."""
         return output_bandwidth(self.record)
-
-
-class SrivcCost:
-    """The cost of a record's samples as a function of the delay; SRIVC estimates the coefficients."""
-
-    def __init__(self, options: TdSrivc, problem: SampledProblem, svf_cutoffs: tuple[float, ...]) -> None:
-        self.options = options
-        self.svf_cutoffs = svf_cutoffs
-        self.problem = problem._replace(free_delay=False)
-        # The guarded variant ends with joint iterations: its search only has to find the basin.
-        self.tolerance = options.tolerance if options.variant == "plain" else max(options.tolerance, SEARCH_TOLERANCE)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters, the delay included."""
-        return self.problem.free + 1
-
-    def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """SRIVC at one delay, from given coefficients and, if asked for, from the least-squares starts."""
-        problem, refit = self.problem, self.options.variant == "guarded"
-        cutoffs = self.svf_cutoffs if own else ()
-        tried = [*least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit), *starts]
-        steps = Steps(INNER_ITERATIONS, self.tolerance, self.options.variant)
-        ends = (iterate(problem, np.append(start[:-1], delay), steps) for start in tried)
-        best = min((end for end in ends if end is not None), key=lambda end: end.equations.squared_error, default=None)
-        if best is None:
-            return Minimum(np.zeros(self.size), np.inf)
-        return Minimum(best.theta, best.equations.squared_error, delay_step(best.equations, LEAST_CURVATURE))

@@ -3,14 +3,13 @@ r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Start, StartFrom, check_proper, initial_delay
-from ctid_cli.estimation.delay_grid import scan
-from ctid_cli.estimation.delay_search import Descent, Minimum
+from ctid_cli.estimation.delay_search import Descent, Limits, Minimum, scan
 from ctid_cli.estimation.filtered_costs import (
     LARGEST_STEP,
     LATTICE,
@@ -19,7 +18,7 @@ from ctid_cli.estimation.filtered_costs import (
     filtered_costs,
     path_history,
 )
-from ctid_cli.estimation.iteration import GAUSS_NEWTON, Steps, Variant
+from ctid_cli.estimation.iteration import GUARDED, Steps, Variant
 from ctid_cli.estimation.redundancy import RedundantMinimum, Visit
 from ctid_cli.estimation.sampled_problem import SampledProblem
 from ctid_cli.estimators.printed_redundancy import PrintedSearch, printed_search
@@ -33,7 +32,7 @@ from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
 #: How hard to work at each trial delay.
-EFFORT = Steps(6, 1e-2, GAUSS_NEWTON, 2)
+EFFORT = Steps(6, 1e-2, GUARDED, 2)
 #: Points of the lattice by which one start of the refinement is shorter than the best delay behind the widest band.
 SHORTER = 2
 
@@ -217,42 +216,55 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             Structure(self.poles, self.zeros),
             self.delay_bounds[1],
             start=self.delay_bounds[1],
-            svf_cutoffs=np.full(self.filters, self.svf_cutoff or bandwidth),
+            svf_cutoffs=[self.svf_cutoff or bandwidth] * self.filters,
             steps=EFFORT,
         )
-        passed = int((costs.frequencies <= bandwidth).sum())
-        if 2 * passed - 1 <= costs.size + self.poles:
+        passed = int((costs[0].spectra.frequencies <= bandwidth).sum())
+        if 2 * passed - 1 <= costs[0].size + self.poles:
             raise DataError(
                 f"{named(record)}fewer than {passed} periods of the bandwidth, {bandwidth:.3g} rad/s, are left after "
                 f"the greatest delay, {self.delay_bounds[1]:g} s: too few to estimate from; take a smaller greatest "
                 "delay, a larger bandwidth or a longer record"
             )
         longest = self.max_delay_step or LARGEST_STEP * (self.delay_bounds[1] - self.delay_bounds[0])
-        search = FilterSearch(costs, filters, self.delay_bounds, self.max_iterations, self.tolerance, longest)
-        return RedundantSearch(search, unfiltered, {})
+        limits = Limits(*self.delay_bounds, self.max_iterations, self.tolerance, 0.0, longest)
+        search = FilterSearch(costs, filters, limits)
+        return RedundantSearch(filters, search, self.max_rounds, self.refinement, unfiltered)
 
     def _estimate(self, laid_out: RedundantSearch | PrintedSearch, start: Start | None) -> RedundantFit:
-        delay = initial_delay(start, self.delay_bounds)
-        if isinstance(laid_out, PrintedSearch):
-            filters = laid_out.filters
-            fit, found, paths = laid_out.run(delay)
-        else:
-            search, paths = laid_out.filtered, []
-            filters, found = search.filters, search.run(delay, self.max_rounds, paths)
-            if found.point not in laid_out.refined:
-                laid_out.refined[found.point] = self._refine(laid_out, found.point)
-            fit = laid_out.refined[found.point]
-            history = (*path_history("filter {}", found, paths, self.poles), *fit.history)
-            fit = replace(fit, iterations=found.rounds + fit.iterations, history=history)
+        fit, found, paths = laid_out.run(initial_delay(start, self.delay_bounds))
         values = {item.name: getattr(fit, item.name) for item in fields(Fit)}
-        return RedundantFit(**values, search=found, filters=filters, paths=tuple(paths))
+        return RedundantFit(**values, search=found, filters=laid_out.filters, paths=tuple(paths))
 
-    def _refine(self, laid_out: RedundantSearch, point: float) -> Fit:
+
+@dataclass(frozen=True, eq=False)
+class RedundantSearch:
+    """The search behind filters on one record and its end on unfiltered data, for any number of initial delays."""
+
+    filters: FilterSet
+    filtered: FilterSearch
+    max_rounds: int
+    refinement: TdSrivc
+    unfiltered: SampledProblem
+    #: What was refined from which minimum of J0 [s].
+    refined: dict[float, Fit] = field(default_factory=dict)
+
+    def run(self, delay: float) -> tuple[Fit, RedundantMinimum[float], list[FilterPath]]:
+        """Search from an initial delay and refine what was found."""
+        found, paths = self.filtered.run(delay, self.max_rounds)
+        if found.point not in self.refined:
+            self.refined[found.point] = self._refine(found.point)
+        fit = self.refined[found.point]
+        history = (*path_history("filter {}", found, paths, self.refinement.poles), *fit.history)
+        return replace(fit, iterations=found.rounds + fit.iterations, history=history), found, paths
+
+    def _refine(self, point: float) -> Fit:
         """Go on from the minimum of J0, and from where the filter of widest band fits best within half a period."""
-        search = laid_out.filtered
+        search = self.filtered
         # J0 is flat around its minimum where noise, or a model with too long a delay, weighs on the narrow filters.
         nearby = point + search.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE))
-        found = scan(search.costs.behind(self.filters - 1), np.unique(np.clip(nearby, *self.delay_bounds)))
+        delays = np.unique(np.clip(nearby, *self.refinement.delay_bounds)).tolist()
+        found = scan([search.costs[-1]] * len(delays), delays)
         least = int(np.argmin(found.squared_errors))
         # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
         starts = found.thetas[[least, max(least - SHORTER, 0)]]
@@ -262,13 +274,4 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
         if not np.isfinite(found.squared_errors[least]):
             raise DataError(Status.SINGULAR.value)
         ends = [Descent(Minimum(theta, np.nan), np.empty((0, 1)), Status.CONVERGED, 0) for theta in starts]
-        return min((self.refinement._refine(laid_out.unfiltered, end, []) for end in ends), key=lambda fit: fit.cost)
-
-
-class RedundantSearch(NamedTuple):
-    """Where to search, and where to finish."""
-
-    filtered: FilterSearch
-    unfiltered: SampledProblem
-    #: What was refined from which minimum of J0 [s].
-    refined: dict[float, Fit]
+        return min((self.refinement._refine(self.unfiltered, end, []) for end in ends), key=lambda fit: fit.cost)

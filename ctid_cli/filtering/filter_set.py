@@ -26,28 +26,19 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
 from ctid_cli.filtering.lowpass import Lowpass
-from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_integer, require_positive
 
 
-def ideal_cost(delay_error: ArrayLike, cutoff: float, noise_intensity: float = 0.0) -> Array:
+def ideal_cost(delay_error: ArrayLike, cutoff: float) -> Array:
     r"""Cost of a delay error where the low-pass filter and the system together are an ideal low-pass filter.
 
-    The input is white noise of unit intensity.
+    The input is white noise of unit intensity, and there is no output noise.
 
-    Equation (50): ``J(d) = 2 wc/pi - 2 sin(wc d)/(pi d) + lambda wc/pi``, the integral (35) with
-    ``|L G0| = 1`` up to wc. Near d = 0 a series keeps all digits: ``J(d) ~ wc^3 d^2/(3 pi)``.
+    Equation (50): ``J(d) = 2 wc/pi - 2 sin(wc d)/(pi d)``, the integral (35) with ``|L G0| = 1`` up to wc.
     """
     require_positive("cutoff", cutoff, "rad/s")
-    require_not_negative("noise_intensity", noise_intensity, "output unit² s")
-    x = cutoff * np.asarray(delay_error, dtype=float)
-    near = np.abs(x) < 1.0
-    small, large = np.where(near, x, 0.0) ** 2, np.where(near, 1.0, x)
-    # 1 - sin(x)/x = x²/6 (1 - x²/20 (1 - x²/42 (...)))
-    series = np.ones_like(x)
-    for k in range(9, 1, -1):
-        series = 1.0 - small / (2 * k * (2 * k + 1)) * series
-    drop = np.where(near, small / 6 * series, 1.0 - np.sin(large) / large)
-    return np.asarray(2 * cutoff / np.pi * drop + noise_intensity * cutoff / np.pi)
+    # sinc(x) of NumPy is sin(pi x)/(pi x).
+    return np.asarray(2 * cutoff / np.pi * (1.0 - np.sinc(cutoff / np.pi * np.asarray(delay_error, dtype=float))))
 
 
 def extrema(cutoff: float, count: int, exact: bool = False) -> Array:

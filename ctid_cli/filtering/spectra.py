@@ -31,7 +31,7 @@ SHORTEST_STRETCH = 8
 STEP_GROUPS = 64
 
 
-class RecordSpectra:
+class RecordSpectra(NamedTuple):
     """Spectra of a record's output and of its input at any delay.
 
     The input is exact. The output is joined by straight lines between its samples, missing ones left out. That keeps
@@ -41,42 +41,35 @@ class RecordSpectra:
     to finish an estimate in the time domain.
     """
 
-    def __init__(
-        self, record: Record, window: tuple[float, float], count: int, greatest_delay: float, keep_mean: bool = True
-    ) -> None:
-        start, end = window
-        self.window = window
-        self.greatest_delay = greatest_delay
-        self._first = 0 if keep_mean else 1
-        frequencies = 2 * np.pi / (end - start) * np.arange(count + 1, dtype=np.float64)
-        damping = _damping(record, window, frequencies)
-        #: Frequencies [rad/s], shape (K,).
-        self.frequencies: Array = frequencies[self._first :]
-        output = HeldSignal(record.t, record.bridged_y, "foh")
-        #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
-        self.damping: Array = damping[self._first :]
-        joined = _held_spectrum(output, start, end - start, 0.0, count)
-        #: Spectrum of the output [output unit], shape (K,).
-        self.outputs: ComplexArray = joined.at(0.0, 1.0 / damping[1:])[self._first :]
-        #: The input, laid out for its spectrum at any delay.
-        self.input = _held_spectrum(record.input, start, end - start, greatest_delay, count)
+    window: tuple[float, float]
+    #: Frequencies [rad/s], shape (K,).
+    frequencies: Array
+    #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
+    damping: Array
+    #: Spectrum of the output [output unit], shape (K,).
+    outputs: ComplexArray
+    #: The input, laid out for its spectrum at any delay.
+    input: "HeldSpectrum"
+    greatest_delay: float
 
     @property
     def duration(self) -> float:
         """Length of the window [s]."""
         return self.window[1] - self.window[0]
 
-    def inputs(self, delay: float) -> ComplexArray:
-        """Spectrum of the delayed input over the window."""
+    def inputs(self, delay: float, count: int | None = None) -> ComplexArray:
+        """Spectrum of the delayed input over the window, at all frequencies or the first few."""
         if not 0.0 <= delay <= self.greatest_delay:
             raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
-        return self.input.at(delay, np.ones(self.frequencies.size - 1 + self._first))[self._first :]
+        first = int(self.frequencies[0] > 0.0)
+        count = self.frequencies.size if count is None else count
+        return self.input.at(delay, np.ones(count - 1 + first))[first:]
 
 
 def record_spectra(
     record: Record, start: float, highest: float, greatest_delay: float, *, keep_mean: bool = True
 ) -> RecordSpectra:
-    """Lay out the spectra of a record."""
+    """Lay out the spectra of a record from a time after its first input on, up to a highest frequency [rad/s]."""
     present = record.t[record.valid]
     first = max(float(record.input.t[0]) + start, float(present[0]))
     inside = present[present >= first]
@@ -94,7 +87,13 @@ def record_spectra(
             f"{where}the {last - first:g} s from {first:g} s on hold no full period of {highest:g} rad/s; "
             "take a longer record, a smaller greatest delay or a higher frequency"
         )
-    return RecordSpectra(record, (first, last), count, greatest_delay, keep_mean)
+    window, kept = (first, last), slice(0 if keep_mean else 1, None)
+    frequencies = 2 * np.pi / (last - first) * np.arange(count + 1, dtype=np.float64)
+    damping = _damping(record, window, frequencies)
+    joined = _held_spectrum(HeldSignal(record.t, record.bridged_y, "foh"), first, last - first, 0.0, count)
+    outputs = joined.at(0.0, 1.0 / damping[1:])[kept]
+    held = _held_spectrum(record.input, first, last - first, greatest_delay, count)
+    return RecordSpectra(window, frequencies[kept], damping[kept], outputs, held, greatest_delay)
 
 
 def lowpass_weight(frequencies: Array, lowpass: Lowpass | None) -> Array:
@@ -133,9 +132,9 @@ class HeldSpectrum(NamedTuple):
     jumps: Array
     integral: Array
     foh: bool
-    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, 2, count).
+    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, count).
     marks: IntArray
-    sums: Array
+    sums: ComplexArray
     duration: float
 
     def at(self, delay: float, gain: Array) -> ComplexArray:

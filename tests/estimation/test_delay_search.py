@@ -11,7 +11,7 @@ from ctid_cli.estimation.delay_search import (
     LEAST_CURVATURE,
     Limits,
     Minimum,
-    best_of,
+    SampledCost,
     bound_in_the_way,
     delay_step,
     descend,
@@ -120,16 +120,6 @@ def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflec
     assert abs(found.minimum.delay - nearest) <= max(abs(start - nearest), SMALLEST)
 
 
-def test_search_ends_at_its_smallest_step():
-    # No trial closer than 1e-5 of the range of the delay, and the best point reached so far is kept.
-    cost = Artificial(lambda d: 1.0 + abs(d - 5.0), lambda d: 5.0)
-    found = search(cost, 5.0)
-    assert (found.minimum.delay, found.iterations) == (5.0, 0)
-    tried = np.array(cost.asked[1:]) - 5.0
-    np.testing.assert_allclose(tried, 5.0 * 0.5 ** np.arange(tried.size))
-    assert SMALLEST < tried[-1] <= 2 * SMALLEST
-
-
 def test_nothing_at_the_start_is_no_search():
     cost = Artificial(lambda d: math.inf, lambda d: 1.0)
     found = search(cost, 5.0)
@@ -157,8 +147,10 @@ def test_delay_step_follows_the_slope_of_the_profile_cost(model, delay, snr_db):
     n, m = model.order, model.numerator.size - 1
     problem = at_known_delay(data, Structure(n, m))
 
+    cost = SampledCost(problem, Steps(200, 1e-13, "guarded"), ())
+
     def minimum(delay):
-        return best_of(problem, [np.append(theta_of(model), delay)], n, Steps(200, 1e-13, "guarded"))
+        return cost.minimise(delay, np.append(theta_of(model), delay)[None], False)
 
     h = 1e-4
     plus, here, minus = (minimum(delay + side) for side in (h, 0.0, -h))
@@ -172,30 +164,24 @@ def test_delay_step_follows_the_slope_of_the_profile_cost(model, delay, snr_db):
     assert here.step == pytest.approx(expected, rel=1e-4, abs=1e-7)
 
 
-SEARCH = Steps(10, 1e-2, "guarded", 3)
-
-
 def test_cheapest_of_several_starts_is_kept():
     # Whatever the order: the result is that of the best start alone, bit for bit; those that are not finite are none.
-    problem, truth = at_known_delay(filter_data(make_record(CASE_2, snr_db=15, n=2500), 9.0), Structure(4, 1)), 8.0
+    problem = at_known_delay(filter_data(make_record(CASE_2, snr_db=15, n=2500), 9.0), Structure(4, 1))
+    cost = SampledCost(problem, Steps(10, 1e-2, "guarded", 3), (25.0,))
     slow = np.concatenate((np.poly(np.full(4, -0.1))[1:], [1.0, 1.0]))
     near = theta_of(CASE_2)
     starts = np.array([slow, near * 1.02, slow * [-1, 1, -1, 1, 1, 1], near * [1, 1, 1.4, 1, 1, 1], near * np.nan])
-    starts = np.column_stack((starts, np.full(5, truth)))
-    alone = [best_of(problem, [start], 4, SEARCH) for start in starts]
+    starts = np.column_stack((starts, np.full(5, 8.0)))
+    alone = [cost.minimise(8.0, start[None], False) for start in starts]
     costs = [minimum.squared_error for minimum in alone]
     assert costs[4] == np.inf
     assert max(costs[:4]) > 2 * min(costs)
     for order in ([0, 1, 2, 3], [3, 4, 2, 1, 0], [1, 0], [4, 2, 3]):
-        found = best_of(problem, starts[order], 4, SEARCH)
+        found = cost.minimise(8.0, starts[order], False)
         best = alone[min(order, key=costs.__getitem__)]
         assert (found.theta.tolist(), *found[1:]) == (best.theta.tolist(), *best[1:])
-
-
-def test_only_the_denominators_of_the_starts_matter():
-    problem = at_known_delay(filter_data(make_record(snr_db=15, n=1500), 9.0), Structure(2, 0))
-    found = [best_of(problem, [np.array([2.0, 3.0, b, 8.0])], 2, SEARCH).theta.tolist() for b in (1.0, -5.0, 1e6, 0.0)]
-    assert found[1:] == found[:1] * 3
+    own = cost.minimise(8.0, starts[:0], True)
+    assert cost.minimise(8.0, starts[:1], True).squared_error == min(own.squared_error, costs[0])
 
 
 def test_delay_that_the_data_do_not_determine_has_no_step():
@@ -204,7 +190,7 @@ def test_delay_that_the_data_do_not_determine_has_no_step():
     held = HeldSignal(t, np.sin(1.3 * t))
     y = simulate(TransferFunction([2.0], [1.0, 2.0], 1.0), held, t)
     problem = at_known_delay(filter_data(Record(t, y, held), 20.0), Structure(1, 0))
-    found = best_of(problem, [np.array([2.0, 2.0, 1.2])], 1, Steps(100, 1e-9, "guarded"))
+    found = SampledCost(problem, Steps(100, 1e-9, "guarded"), ()).minimise(1.2, np.array([[2.0, 2.0, 1.2]]), False)
     assert np.isfinite(found.squared_error)
     assert np.isnan(found.step)
 

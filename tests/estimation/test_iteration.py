@@ -6,7 +6,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ctid_cli.estimation.iteration import (
-    GAUSS_NEWTON,
     PATIENCE,
     RELAXATIONS,
     SLOW_STEPS,
@@ -17,7 +16,7 @@ from ctid_cli.estimation.iteration import (
     relative_change,
     solve_scaled,
 )
-from ctid_cli.estimation.sampled_problem import SampledProblem, at_known_delay
+from ctid_cli.estimation.sampled_problem import at_known_delay
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.inference.fit import Status
@@ -27,14 +26,10 @@ from tests.estimators.records import CASE_1, CASE_2, make_record, theta_of
 DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}
 
 
-def problem_of(model, regular=True, hold_output="foh", snr_db=15, free_delay=False):
-    """A problem with its delay held or free, and the true parameters."""
+def problem_of(model, regular=True, hold_output="foh", snr_db=15):
+    """A problem with its delay held, and the true parameters."""
     data = filter_data(make_record(model, snr_db=snr_db, regular=regular, n=3000), 12.0, hold_output)
-    structure = DEGREES[model]
-    problem = at_known_delay(data, structure)
-    if free_delay:
-        problem = SampledProblem(data, structure.poles, structure.zeros, True, 0.0, 12.0)
-    return problem, np.append(theta_of(model), model.delay)
+    return at_known_delay(data, DEGREES[model]), np.append(theta_of(model), model.delay)
 
 
 def relative_gradient(equations, free):
@@ -70,27 +65,13 @@ def test_plain_step_is_the_textbook_formula(model, hold_output, regular):
 def test_gradient_vanishes_at_convergence(model, regular):
     # On noisy data: sum psi eps = 0, so the estimate minimises the output error, whatever the rule and the hold of y.
     found = []
-    for rule, hold_output in (("plain", "foh"), ("guarded", "zoh"), ("gauss_newton", "foh")):
+    for rule, hold_output in (("plain", "foh"), ("guarded", "zoh")):
         problem, truth = problem_of(model, regular, hold_output)
         result = iterate(problem, truth, Steps(100, 1e-11, rule))
         assert result.status is Status.CONVERGED
         assert relative_gradient(result.equations, problem.free) < 1e-8
         found.append(result.theta)
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-7)
-
-
-@pytest.mark.parametrize("model", [CASE_1, CASE_2])
-def test_coefficients_and_delay_together_end_in_a_minimum(model):
-    problem, truth = problem_of(model, regular=False, free_delay=True)
-    result = iterate(problem, truth, Steps(100, 1e-11, "guarded"))
-    assert result.status is Status.CONVERGED
-    assert relative_gradient(result.equations, problem.free) < 1e-8
-    # No saddle: every small step costs.
-    for k in range(truth.size):
-        for sign in (1, -1):
-            moved = result.theta.copy()
-            moved[k] += sign * 1e-3 * abs(moved[k])
-            assert problem.equations(moved).squared_error > result.equations.squared_error
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-7)
 
 
 def test_guarded_iteration_never_raises_the_cost():
@@ -105,13 +86,6 @@ def test_guarded_iteration_never_raises_the_cost():
         assert np.diff(guarded).max() <= 1e-12 * guarded[0]
         rises.append(np.diff(plain).max() / plain[-1])
     assert max(rises) > 1.0
-
-
-def test_unstable_starts_are_reflected():
-    problem, truth = problem_of(CASE_1)
-    result = iterate(problem, np.array([-2.8, 4.0, 8.0, 8.0]), Steps(50, 1e-9, "guarded"))
-    assert result.status is Status.CONVERGED
-    np.testing.assert_allclose(result.theta, truth, rtol=0.1)
 
 
 def test_step_of_convergence_is_free_of_units():
@@ -188,7 +162,7 @@ def test_steps_that_give_less_than_they_promise_end_the_iteration():
     sequence = [equations()]
     for k in range(SLOW_STEPS + 5):
         sequence += [equations(cost=2.0)] * 8 + [equations(cost=1.0 - 1e-3 * (k + 1))]
-    result = iterate(Sequence(sequence), np.zeros(1), Steps(100, 1e-8, GAUSS_NEWTON))
+    result = iterate(Sequence(sequence), np.zeros(1), Steps(100, 1e-8, "guarded"))
     assert (result.status, result.iterations) == (Status.STALLED, SLOW_STEPS)
 
 
@@ -245,14 +219,6 @@ def test_relaxed_steps_end_a_cycle_that_full_steps_never_leave(factor):
     np.testing.assert_allclose(ratios, 1.0 + factor * fractions)
 
 
-@pytest.mark.parametrize("factor", [-0.9, 0.95])
-def test_relaxed_steps_that_become_shorter_are_full_ones(factor):
-    # However slowly: every one is shorter than all before.
-    seen, result = path(Scalar(lambda theta: (factor - 1.0) * theta), 1.0, "relaxed", max_iterations=1000)
-    assert result.status is Status.CONVERGED
-    np.testing.assert_allclose(seen, factor ** np.arange(seen.size), rtol=1e-9)
-
-
 def test_cycle_that_is_entered_from_within_is_left_by_the_first_relaxation():
     # From close to the solution, which full steps leave: how short they were there does not matter later.
     seen, result = path(Scalar(lambda theta: -2.7 * np.tanh(theta)), 0.01, "relaxed", max_iterations=500)
@@ -271,15 +237,6 @@ def test_relaxed_steps_into_the_void_are_halved_and_the_cost_may_rise():
     assert seen[1] == 2.0
     assert path(Scalar(four_once, largest=2.5), 1.0, "plain")[1].status is Status.DIVERGED
     assert path(Scalar(four_once, largest=2.5), 1.0, "guarded")[0].tolist() == [1.0]
-
-
-def test_relaxed_iteration_that_finds_nothing_admissible_ends():
-    _, result = path(Scalar(lambda theta: 1e9, largest=2.5), 1.0, "relaxed")
-    assert result.status is Status.DIVERGED
-    assert result.theta.tolist() == [1.0]
-    # Full steps that are too long are no convergence because a small fraction of them is taken.
-    _, result = path(Scalar(lambda theta: 4.0 - theta, largest=2.5), 1.0, "relaxed", tolerance=1e-3)
-    assert result.status is not Status.CONVERGED
 
 
 # Scaled equations ---------------------------------------------------------------------------------------------

@@ -27,20 +27,6 @@ def descend(cost, n):
     return n
 
 
-def recorded(paths):
-    """The same paths, and the list of (path, point) in which they write down their calls."""
-    calls = []
-
-    def path_of(index):
-        def path(point):
-            calls.append((index, point))
-            return paths[index](point)
-
-        return path
-
-    return [path_of(index) for index in range(len(paths))], calls
-
-
 def to(*points):
     return lambda _: list(points)
 
@@ -53,38 +39,6 @@ def test_escapes_where_every_single_cost_is_trapped(choice, start):
     found = minimise_redundantly(start, float, paths, choice=choice, improvement=1e-4, max_rounds=1000)
     assert (found.point, found.cost, found.status) == (0, 0.0, SearchStatus.EXHAUSTED)
     assert found.status.succeeded
-
-
-def test_first_stays_on_a_path_that_improves_and_goes_on_cyclically():
-    halve, stuck = (lambda x: [x / 2] if x > 30 else [x]), (lambda x: [x])
-    step = lambda x: [x - 1] if x in (25.0, 24.0) else [x]  # noqa: E731
-    paths, calls = recorded([stuck, halve, step])
-    found = minimise_redundantly(100.0, float, paths)
-    order = [0, 1, 1, 1, 2, 2, 2, 0, 1]
-    assert [path for path, _ in calls] == order
-    assert [visit.path for visit in found.visits] == [-1, *order]
-    assert [visit.point for visit in found.trajectory] == [100.0, 50.0, 25.0, 24.0, 23.0]
-    assert [visit.path for visit in found.trajectory] == [-1, 1, 1, 2, 2]
-    assert [visit.point for visit in found.switches] == [24.0]
-
-
-def test_best_takes_the_least_candidate_of_all_paths():
-    paths, calls = recorded([lambda x: [x - 1], lambda x: [x - 3, x - 2], lambda x: [x + 5]])
-    found = minimise_redundantly(6.0, lambda x: abs(x) + 0.25, paths, choice="best")
-    # The incumbent, 0, beats the candidates -1, -3, -2 and 5 of the last round, and stays.
-    assert [visit.point for visit in found.trajectory] == [6.0, 3.0, 0.0]
-    assert [path for path, _ in calls] == [0, 1, 2] * 3
-    assert (found.rounds, found.status, found.cost) == (3, SearchStatus.EXHAUSTED, 0.25)
-    rounds = [visit.round for visit in found.visits]
-    assert rounds == [0] + [1] * 4 + [2] * 4 + [3] * 4
-    assert found.switches == ()
-
-
-def test_best_is_content_with_any_decrease_and_first_is_not():
-    paths = [to(0.9999)]
-    assert minimise_redundantly(1.0, float, paths, choice="best").point == 0.9999
-    assert minimise_redundantly(1.0, float, paths, choice="first").point == 1.0
-    assert minimise_redundantly(1.0, float, paths, choice="first", improvement=1e-5).point == 0.9999
 
 
 @pytest.mark.parametrize("choice", CHOICES)

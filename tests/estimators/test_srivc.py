@@ -54,19 +54,6 @@ def test_noise_free_data_return_the_true_model_and_delay(model, estimator, start
     assert_same_model(fit.model, model, 1e-6)
 
 
-@pytest.mark.parametrize("regular", [True, False])
-@pytest.mark.parametrize(
-    ("model", "make", "start"), [(CASE_1, known, None), (CASE_1, searched, 8.05), (CASE_2, searched, 8.05)]
-)
-def test_hold_of_the_output_does_not_move_the_estimate(model, make, start, regular):
-    record = make_record(model, snr_db=15, regular=regular, n=4000)
-    one, two = (
-        make(model, tolerance=1e-11, hold_output=hold).fit(record, start and Start(start)) for hold in ("foh", "zoh")
-    )
-    assert one.status is two.status is Status.CONVERGED
-    assert_same_model(one.model, two.model, 1e-8)
-
-
 @pytest.mark.parametrize("replicate", range(3))
 def test_starts_from_the_record_reach_the_estimate_that_a_good_cutoff_gives(replicate):
     # Two modes, a decade apart: a cut-off of 1 rad/s loses two thirds of such records.
@@ -209,17 +196,6 @@ def test_cost_falls_within_every_stage(lowpass):
     assert fit.history[-1].cost == pytest.approx(fit.cost, rel=1e-12)
     assert fit.history[-1].delay == fit.model.delay
     assert fit.iterations == len(fit.history) - len(stages)
-
-
-@pytest.mark.parametrize("regular", [True, False])
-def test_lowpass_filter_widens_the_region_of_convergence(regular):
-    # From 3 s the plain search is caught by a local minimum; the filtered one finds the true delay.
-    record = make_record(snr_db=15, regular=regular)
-    direct = searched(CASE_1).fit(record, Start(3.0))
-    filtered = searched(CASE_1, lowpass=Lowpass(0.4, 2)).fit(record, Start(3.0))
-    assert abs(direct.model.delay - 8.0) > 1.0
-    assert abs(filtered.model.delay - 8.0) < 0.08
-    assert filtered.cost < 0.5 * direct.cost
 
 
 def test_without_a_start_the_middle_of_the_bounds_is_taken():

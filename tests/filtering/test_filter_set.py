@@ -19,15 +19,12 @@ from ctid_cli.filtering.lowpass import Lowpass
 # The ideal filter -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("error", [1e-4, 0.02, 0.158, 0.16, -0.7, 3.0, 15.0])
-@pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_ideal_cost_is_its_integral(error, noise):
+@pytest.mark.parametrize("error", [0.02, -0.7, 15.0])
+def test_ideal_cost_is_its_integral(error):
     # (35) with |L G0| = |L| = 1 up to the cut-off is (50): no factor lies between them.
     cutoff = 2 * np.pi
-    integral, _ = integrate.quad(
-        lambda w: 2 * np.sin(w * error / 2) ** 2 + noise / 2, -cutoff, cutoff, limit=500, epsabs=0, epsrel=1e-11
-    )
-    assert ideal_cost(error, cutoff, noise) == pytest.approx(integral / np.pi, rel=1e-10)
+    integral, _ = integrate.quad(lambda w: 2 * np.sin(w * error / 2) ** 2, -cutoff, cutoff, limit=500, epsrel=1e-11)
+    assert ideal_cost(error, cutoff) == pytest.approx(integral / np.pi, rel=1e-10)
 
 
 def test_extrema_solve_their_equation_and_alternate():

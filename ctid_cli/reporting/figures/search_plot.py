@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.filtered_costs import FilteredCosts, FilterSearch, percents
+from ctid_cli.estimation.filtered_costs import FilteredCost, FilterSearch, percents
 from ctid_cli.estimators.useful_redundancy import RedundantFit, UsefulRedundancy
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, Drawing, pointed, ramp, spread
 from ctid_cli.simulation.dataset import DataSet
@@ -88,8 +88,8 @@ def landscape(
     )
 
 
-def _least_costs(costs: FilteredCosts, delays: Array, sweeps: int) -> Array:
-    many, size = costs.reach.size, costs.size
+def _least_costs(costs: Sequence[FilteredCost], delays: Array, sweeps: int) -> Array:
+    many, size = len(costs), costs[0].size
     thetas, least = np.zeros((delays.size, many, size)), np.full((delays.size, many), np.inf)
     for sweep in range(sweeps):
         before = None
@@ -101,11 +101,11 @@ def _least_costs(costs: FilteredCosts, delays: Array, sweeps: int) -> Array:
                 starts = np.array([thetas[place] for place in known if np.isfinite(least[place])]).reshape(-1, size)
                 # Least squares on a narrow band is hopeless in noise.
                 own = sweep == 0 and (k == many - 1 or not starts.size)
-                found = costs.behind(k).minimise(float(delays[i]), starts, own)
+                found = costs[k].minimise(float(delays[i]), starts, own)
                 if found.squared_error < least[i, k]:
                     thetas[i, k], least[i, k] = found.theta, found.squared_error
             before = i
-    return percents(least, costs.spreads)
+    return percents(least, np.array([cost.spread for cost in costs]))
 
 
 def _legs(reference_cost: Callable[[float], float], fit: RedundantFit) -> tuple[Leg, ...]:
