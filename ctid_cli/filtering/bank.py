@@ -120,10 +120,15 @@ def modal_pass(
     n = modes.width
     layout = (n if double else 0, 2 * n if double else n, (2 * n + 2 if double else n + 2) if filter_output else 0)
     width = layout[1] + 2 + (n if filter_output else 0) + (0 if instruments is None else 2 * n + 1)
-    gram = NO_ROWS if rows else np.zeros((width if leading is None else leading, width))
-    found = np.zeros((data.count, width)) if rows else NO_ROWS
-    _run(data, modes, delay, layout, states, instruments, gram, found, NOTHING)
-    return found if rows else gram
+    if rows:
+        found = np.zeros((data.count, width))
+        _run(data, modes, delay, layout, states, instruments, NO_ROWS, found, NOTHING)
+        return found
+    # Moments are summed in tiles of two rows and four columns.
+    factors = width if leading is None else leading
+    gram = np.zeros((factors + factors % 2, width + 3))
+    _run(data, modes, delay, layout, states, instruments, gram, NO_ROWS, NOTHING)
+    return gram[:factors, :width]
 
 
 def to_steady_state(poles: ComplexArray, period: float, states: ComplexArray) -> None:
@@ -155,18 +160,15 @@ def _run(
     """Run the pass for the clock of a record."""
     if states is None:
         states = np.zeros((modes.poles.size, 5), np.complex128)
-    output = data.y, data.y_foh
+    grid, clock = None, None
     if data.interval > 0.0:
-        clock = (data.interval, *_place(delay, data.interval))
-        if instruments is None:
-            driving, measured = (data.u, bool(data.input_foh)), NOTHING
-        else:
-            driving, measured = (instruments, False), data.u
-        kernels.regular_pass(*modes, states, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
+        grid = (data.interval, *_place(delay, data.interval))
     else:
         assert not isinstance(delay, tuple)
-        instants, breaks = (data.t, float(delay), data.slack), (data.tu, data.u, data.input_foh)
-        kernels.irregular_pass(*modes, states, instants, breaks, output, data.use, layout, gram, rows, simulated)
+        clock = (data.t, data.tu, float(delay), data.slack)
+    driving, measured = ((data.u, data.input_foh), NOTHING) if instruments is None else ((instruments, False), data.u)
+    output = data.y, data.y_foh
+    kernels.filter_pass(*modes, states, grid, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
 
 
 def _place(delay: Place, interval: float) -> tuple[int, float]:
