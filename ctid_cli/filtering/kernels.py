@@ -824,95 +824,62 @@ def irregular_states(
 # --- loops ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def loop_signals(
     plant: tuple[Array, Array, Array, float, int],
     law: tuple[Array, Array, Array, float],
+    relay: tuple[float, float, float],
     r: Array,
     v: Array,
     before: float,
 ) -> tuple[Array, Array]:
     """Input and noise-free output of a sampled plant ``F, g, c, direct, shift`` in a loop with ``A, B, C, D``.
 
-    ``before`` is the share of r that the controller sees, 1 or 0.
+    The output of a relay of some amplitude, hysteresis and bias is added to that of the law; its amplitude is 0 where
+    there is none. ``before`` is the share of r that the controller sees, 1 or 0.
     """
     F, g, c, direct, shift = plant
     A, B, C, D = law
+    amplitude, hysteresis, bias = relay
     n, m = g.size, B.size
+    # Where plant and law both act at once the input acts on the output that it is made from: solve for it.
+    own = direct if shift == 0 else 0.0
+    closing = 1.0 / (1.0 + D * own)
     u, x = np.empty(r.size), np.empty(r.size)
     z, z_next = np.zeros(n), np.zeros(n)
     s, s_next = np.zeros(m), np.zeros(m)
+    side, free, held = 1.0, 0.0, 0.0
     for k in range(r.size):
-        # x without the input that arrives now, and what the controller's state and the reference put out.
-        free = 0.0
-        for i in range(n):
-            free += c[i] * z[i]
-        error = before * r[k] - v[k]
-        held = (1.0 - before) * r[k]
-        for i in range(m):
-            held += C[i] * s[i]
-        if shift == 0:
-            # The input acts on the output that it is made from: solve for it.
-            arriving = (held + D * (error - free)) / (1.0 + D * direct)
-            x[k] = free + direct * arriving
-            u[k] = arriving
-        else:
-            arriving = u[k - shift] if k >= shift else 0.0
-            x[k] = free + direct * arriving
-            u[k] = held + D * (error - x[k])
-        # Both step on with what they have seen at this sample.
-        error -= x[k]
-        for i in range(n):
-            total = g[i] * arriving
-            for j in range(n):
-                total += F[i, j] * z[j]
-            z_next[i] = total
-        for i in range(m):
-            total = B[i] * error
-            for j in range(m):
-                total += A[i, j] * s[j]
-            s_next[i] = total
-        z, z_next = z_next, z
-        s, s_next = s_next, s
-    return u, x
-
-
-@njit(cache=True, nogil=True)
-def relay_signals(
-    plant: tuple[Array, Array, Array, float, int],
-    r: Array,
-    v: Array,
-    before: float,
-    amplitude: float,
-    hysteresis: float,
-    bias: float,
-) -> tuple[Array, Array]:
-    """Input and noise-free output of a sampled plant in a loop with a relay; ``before`` as in `loop_signals`."""
-    F, g, c, direct, shift = plant
-    n = g.size
-    u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(n), np.zeros(n)
-    side = 1.0
-    for k in range(r.size):
-        # Without a delay nothing of the present input is in the output yet, and `direct` is zero.
+        # x as far as earlier inputs make it.
         arriving = u[k - shift] if 0 < shift <= k else 0.0
-        x[k] = direct * arriving
-        for i in range(n):
-            x[k] += c[i] * z[i]
-        error = before * r[k] - x[k] - v[k]
+        output = free + direct * arriving
+        error = before * r[k] - v[k] - output
         # Within the hysteresis the relay stays as it is.
         if error > hysteresis:
             side = 1.0
         elif error < -hysteresis:
             side = -1.0
-        u[k] = (1.0 - before) * r[k] + bias + amplitude * side
+        value = (held + (1.0 - before) * r[k] + bias + amplitude * side + D * error) * closing
         if shift == 0:
-            arriving = u[k]
+            arriving = value
+        u[k], x[k] = value, output + own * value
+        # Both step on with what they have seen at this sample, to what they put out at the next one.
+        error -= own * value
+        free, held = 0.0, 0.0
         for i in range(n):
-            z_next[i] = g[i] * arriving
+            total = g[i] * arriving
             for j in range(n):
-                z_next[i] += F[i, j] * z[j]
+                total += F[i, j] * z[j]
+            z_next[i] = total
+            free += c[i] * total
+        for i in range(m):
+            total = B[i] * error
+            for j in range(m):
+                total += A[i, j] * s[j]
+            s_next[i] = total
+            held += C[i] * total
         z, z_next = z_next, z
+        s, s_next = s_next, s
     return u, x
 
 
@@ -929,7 +896,7 @@ def loop_input(
 ) -> Array:
     """Input of the noise-free loop of a model in modal form with a discrete controller, from rest, shape (N,).
 
-    The model and its clock are those of `regular_pass`. The controller has polynomials of one length in descending
+    The model and its clock are those of `filter_pass`. The controller has polynomials of one length in descending
     powers of q; the reference enters before or behind it.
     """
     interval, shift, fraction = clock
