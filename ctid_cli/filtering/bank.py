@@ -95,12 +95,7 @@ class ModalForm(NamedTuple):
 def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
     """Return the partial fractions of ``B/(p^l A)``; their condition says whether they can be used."""
     w0, roots = scaled_roots(a)
-    try:
-        return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
-    except ZeroDivisionError:
-        # A pole on the imaginary axis, or products that underflow.
-        nothing = np.zeros(0, np.complex128)
-        return ModalForm(np.inf, nothing, nothing.reshape(0, 2), NO_ROWS)
+    return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
 
 
 def modal_pass(

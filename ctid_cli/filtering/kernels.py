@@ -20,8 +20,6 @@ from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 
-#: Roots whose distance is a smaller fraction of their magnitudes together count as close to each other.
-CLOSE_ROOTS = 0.2
 #: Rows are made in blocks of this many samples, which stay in the first cache of a processor.
 BLOCK = 128
 #: Length of the rows of a block: there is a state behind the last one, and each row begins on a line of the cache.
@@ -42,116 +40,26 @@ TAYLOR_DEGREE = 6
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def simple_roots(coefficients: Array) -> ComplexArray:
-    """Roots of a monic real polynomial, fastest first and conjugates side by side; none where some are close.
-
-    By the Aberth-Ehrlich iteration, which converges cubically to simple roots and slowly to clusters.
-    """
-    n = coefficients.size - 1
-    roots = np.zeros(n, np.complex128)
-    if n == 1:
-        roots[0] = -coefficients[1]
-        return roots
-    if n == 2:
-        half = -0.5 * coefficients[1]
-        discriminant = half * half - coefficients[2]
-        if discriminant < 0.0:
-            roots[0] = complex(half, math.sqrt(-discriminant))
-            roots[1] = complex(half, -math.sqrt(-discriminant))
-        else:
-            large = half - math.sqrt(discriminant) if half < 0.0 else half + math.sqrt(discriminant)
-            roots[0] = large
-            roots[1] = coefficients[2] / large if large != 0.0 else 0.0
-        return roots
-    radius = 1.0
-    for k in range(1, n + 1):
-        radius = max(radius, abs(coefficients[k]) ** (1.0 / k))
-    for i in range(n):
-        # Points without symmetry about the real axis, which conjugate roots could not break.
-        angle = 2.0 * math.pi * i / n + 0.4
-        roots[i] = radius * complex(math.cos(angle), math.sin(angle))
-    settled = False
-    for _ in range(40):
-        settled = True
-        for i in range(n):
-            # A and A' by Horner; the step -A/(A' - A sum 1/(root - other)) takes the other roots out of A.
-            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * roots[i] + value
-                value = value * roots[i] + coefficients[k]
-            if value == 0.0:
-                continue
-            repulsion = complex(0.0, 0.0)
-            for j in range(n):
-                if j != i:
-                    if roots[j] == roots[i]:
-                        return roots[:0]
-                    repulsion += 1.0 / (roots[i] - roots[j])
-            denominator = slope - value * repulsion
-            if denominator == 0.0 or not math.isfinite(denominator.real):
-                return roots[:0]
-            change = value / denominator
-            roots[i] -= change
-            if abs(change) > 1e-14 * abs(roots[i]):
-                settled = False
-        if settled:
-            break
-    if not settled:
-        return roots[:0]
-    for i in range(n):
-        for j in range(i):
-            if abs(roots[i] - roots[j]) < CLOSE_ROOTS * (abs(roots[i]) + abs(roots[j])):
-                return roots[:0]
-    return polished_roots(coefficients, roots)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def polished_roots(coefficients: Array, raw: ComplexArray) -> ComplexArray:
-    """Roots after Newton steps, as exact conjugate pairs, by falling magnitude."""
-    n = raw.size
-    # Newton steps against rounding, which is relative to the *largest* root. Only where the step is small against the
-    # distance to the next root: the members of a cluster are wrong each by itself and right together, and must not be
-    # moved one by one.
-    for i in range(n):
+def polish_roots(coefficients: Array, roots: ComplexArray) -> None:
+    """Improve the roots of a monic real polynomial by Newton steps, in place; a pair stands side by side."""
+    # Against rounding, which is relative to the *largest* root. Only where the step is small against the distance to
+    # the next root: the members of a cluster are wrong each by itself and right together, and must not be moved one by
+    # one.
+    for i in range(roots.size):
         gap = np.inf
-        for j in range(n):
+        for j in range(roots.size):
             if j != i:
-                gap = min(gap, abs(raw[j] - raw[i]))
+                gap = min(gap, abs(roots[j] - roots[i]))
         for _ in range(3):
             value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * raw[i] + value
-                value = value * raw[i] + coefficients[k]
+            for k in range(1, coefficients.size):
+                slope = slope * roots[i] + value
+                value = value * roots[i] + coefficients[k]
             if not abs(value) < 1e-3 * gap * abs(slope):
                 break
-            raw[i] -= value / slope
-    used = np.zeros(n, np.bool_)
-    roots = np.zeros(n, np.complex128)
-    count = 0
-    while count < n:
-        # The largest that is left.
-        i = -1
-        for k in range(n):
-            if not used[k] and (i < 0 or abs(raw[k]) > abs(raw[i])):
-                i = k
-        used[i] = True
-        # A root is real if it is its own nearest conjugate.
-        partner, distance = i, 2.0 * abs(raw[i].imag)
-        for j in range(n):
-            if not used[j]:
-                gap = abs(raw[j] - raw[i].conjugate())
-                if gap < distance:
-                    partner, distance = j, gap
-        if partner == i:
-            roots[count] = raw[i].real
-            count += 1
-        else:
-            used[partner] = True
-            mean = 0.5 * (raw[i] + raw[partner].conjugate())
-            roots[count] = complex(mean.real, abs(mean.imag))
-            roots[count + 1] = complex(mean.real, -abs(mean.imag))
-            count += 2
-    return roots
+            roots[i] -= value / slope
+        if roots[i].imag < 0.0:
+            roots[i] = roots[i - 1].conjugate()
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -182,43 +90,39 @@ def modal_form(
     poles = np.zeros(modes + (1 if origin > 0 else 0), np.complex128)
     residues = np.zeros((poles.size, 2), np.complex128)
     mapping = np.zeros((3 * n + origin + 3, 3 * width + 2))
-    slopes, curvatures = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
+    slopes, curvatures = np.ones(n, np.complex128), np.zeros(n, np.complex128)
     for i in range(n):
-        if roots[i].imag < 0.0:
-            slopes[i], curvatures[i] = slopes[i - 1].conjugate(), curvatures[i - 1].conjugate()
-            continue
-        slope = complex(1.0, 0.0)  # A'(pole), as a product: exact where the polynomial form would cancel
-        curvature = complex(0.0, 0.0)  # A''/A' = 2 sum 1/(pole - other)
+        # A'(pole), as a product: exact where the polynomial form would cancel; and A''/A' = 2 sum 1/(pole - other).
         for j in range(n):
-            if j != i:
-                slope *= roots[i] - roots[j]
-                if roots[j] != roots[i]:
-                    curvature += 2.0 / (roots[i] - roots[j])
-        slopes[i], curvatures[i] = slope, curvature
-        # A pole at the origin has no bandwidth; a slope that is 0, or underflows when squared, belongs to a double one.
-        if slope * slope == 0.0 or roots[i] == 0.0:
+            if roots[j] != roots[i]:
+                slopes[i] *= roots[i] - roots[j]
+                curvatures[i] += 2.0 / (roots[i] - roots[j])
+            elif j != i:
+                return np.inf, poles, residues, mapping
+        # A pole at the origin has no bandwidth; a slope that underflows when squared belongs to a double one.
+        if slopes[i] * slopes[i] == 0.0 or roots[i] == 0.0:
             return np.inf, poles, residues, mapping
     # Rounding matters against the largest gain of p^k/A^2, which lies near the frequency of some pole, or at zero.
     condition = 1.0
-    for k in range(n if n > 1 else 0):
-        peak, spread = 0.0, 0.0
-        for at in range(n + 1):
-            s = complex(0.0, abs(roots[at - 1]) if at > 0 else 0.0)
-            exact, total = 1.0, 0.0
-            for i in range(n):
-                distance = s - roots[i]
-                exact /= abs(distance) ** 2
-                power = roots[i] ** k
-                lower = k * roots[i] ** (k - 1) if k > 0 else complex(0.0, 0.0)
-                square = slopes[i] * slopes[i]
+    peaks, spreads = np.zeros(n), np.zeros(n)
+    for at in range(n + 1 if n > 1 else 0):
+        frequency, gain = abs(roots[at - 1]) if at > 0 else 0.0, 1.0
+        totals = np.zeros(n)
+        for i in range(n):
+            distance, size = abs(complex(0.0, frequency) - roots[i]), abs(roots[i])
+            gain /= distance * distance
+            scale = 1.0 / (abs(slopes[i] * slopes[i]) * distance)
+            for k in range(n):
                 # p^k/A^2 near a double pole of A^2: one term for 1/(s - p)^2, one for 1/(s - p).
-                total += abs(power / (square * distance * distance))
-                total += abs((lower - power * curvatures[i]) / (square * distance))
-            peak = max(peak, exact * abs(s) ** k if k > 0 else exact)
-            spread = max(spread, total)
-        if not peak > 0.0:
+                totals[k] += scale * (1.0 / distance + abs(k / roots[i] - curvatures[i]))
+                scale *= size
+        for k in range(n):
+            peaks[k], spreads[k] = max(peaks[k], gain), max(spreads[k], totals[k])
+            gain *= frequency
+    for k in range(n if n > 1 else 0):
+        if not 0.0 < peaks[k] < np.inf:
             return np.inf, poles, residues, mapping
-        condition = max(condition, spread / peak)
+        condition = max(condition, spreads[k] / peaks[k])
     first_x, first_y, first_e = n + origin + 1, 2 * n + origin + 1, 2 * width + 2
     row, mode = 0, 0
     for i in range(n):
@@ -251,23 +155,22 @@ def modal_form(
         row += 2 if paired else 1
         mode += 1
     if origin > 0:
-        # At the origin, with g = p^k/A or p^k B/A^2: g(0) of 1/p, or g(0) of 1/p^2 and g'(0) of 1/p.
+        # The power series at the origin of 1/A, B/A and B/A^2: their terms are the weights of 1/p and of 1/p^2.
         a0, a1 = a[n], a[n - 1] if n > 0 else 0.0
         b0, b1 = b[b.size - 1], b[b.size - 2] if b.size > 1 else 0.0
-        for k in range(origin):
-            own, own_slope = (1.0 / a0, -a1 / a0**2) if k == 0 else (0.0, 1.0 / a0)
-            driven, driven_slope = (b0 / a0**2, b1 / a0**2 - 2.0 * b0 * a1 / a0**3) if k == 0 else (0.0, b0 / a0**2)
-            mapping[k, row] = own if origin == 1 else own_slope
-            mapping[k, width + row] = 0.0 if origin == 1 else own
-            if k < n:
-                mapping[first_x + k, row] = driven if origin == 1 else driven_slope
-                mapping[first_x + k, width + row] = 0.0 if origin == 1 else driven
-        slope = b1 / a0 - b0 * a1 / a0**2
-        residues[mode, 0], residues[mode, 1] = (b0 / a0, 0.0) if origin == 1 else (slope, b0 / a0)
+        own = (1.0 / a0, -a1 / a0**2)
+        output = (b0 * own[0], b1 * own[0] + b0 * own[1])
+        driven = (output[0] * own[0], output[1] * own[0] + output[0] * own[1])
+        for place in range(origin):
+            residues[mode, place] = output[origin - 1 - place]
+            for k in range(origin - place):
+                mapping[k, row + place * width] = own[origin - 1 - place - k]
+                if k < n:
+                    mapping[first_x + k, row + place * width] = driven[origin - 1 - place - k]
     mapping[n + origin, 2 * width] = 1.0
     mapping[3 * n + origin + 1, 2 * width + 1] = 1.0
     # p x, where p^(n + l)/(p^l A) v = v - sum of a_k p^(n + l - k)/(p^l A) v.
-    for i in range(max(b.size - n - origin, 0), b.size):
+    for i in range(b.size if n + origin > 0 else 0):
         power = b.size - i
         for column in range(mapping.shape[1]):
             mapping[3 * n + origin + 2, column] += b[i] * mapping[power, column]

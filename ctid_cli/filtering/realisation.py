@@ -6,6 +6,7 @@ and because a slow section only ever integrates what a faster one has settled, n
 of the poles. Everything runs in the polynomial's own time unit ``1/w0``, ``w0 = |a_n|^(1/n)``.
 """
 
+from math import copysign, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -36,12 +37,24 @@ def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
 
 
 def polynomial_roots(coefficients: Array) -> ComplexArray:
-    """Return the roots of a monic real polynomial, fastest first and conjugates side by side."""
-    roots: ComplexArray = kernels.simple_roots(coefficients)
-    if roots.size < coefficients.size - 1:
-        # Roots close to each other are left to the eigenvalues, whose errors compensate one another.
-        raw = np.linalg.eigvals(np.vstack((-coefficients[1:], np.eye(coefficients.size - 2, coefficients.size - 1))))
-        roots = kernels.polished_roots(coefficients, raw.astype(np.complex128))
+    """Return the roots of a monic real polynomial, those of a pair side by side with the upper one first."""
+    n = coefficients.size - 1
+    if n == 1:
+        return np.array([complex(-coefficients[1])])
+    if n == 2:
+        half = -0.5 * float(coefficients[1])
+        discriminant = half * half - float(coefficients[2])
+        if discriminant < 0.0:
+            root = complex(half, sqrt(-discriminant))
+            return np.array([root, root.conjugate()])
+        # The larger root has no cancellation, and the product of both is the last coefficient.
+        large = half + copysign(sqrt(discriminant), half)
+        return np.array([large, float(coefficients[2]) / large if large else 0.0], dtype=np.complex128)
+    companion = np.zeros((n, n))
+    companion.flat[n :: n + 1] = 1.0
+    companion[:1] = -coefficients[1:]
+    roots = np.linalg.eigvals(companion).astype(np.complex128)
+    kernels.polish_roots(coefficients, roots)
     return roots
 
 
@@ -54,8 +67,8 @@ class Chain(NamedTuple):
 
 
 def chain(roots: ComplexArray) -> Chain:
-    """Return the chain of unit-gain sections with given poles."""
-    n = roots.size
+    """Return the chain of unit-gain sections with given poles, whose pairs stand side by side; the fastest first."""
+    roots, n = roots[np.argsort(-np.abs(roots), kind="stable")], roots.size
     dynamics, gain = np.zeros((n, n)), np.zeros(n)
     i, last, static = 0, -1, 1.0
     while i < n:

@@ -28,6 +28,7 @@ POLES = [
 def test_roots_of_a_product_are_its_factors(poles):
     expected = sorted(poles, key=lambda p: (-abs(p), -np.imag(p)))
     roots = polynomial_roots(np.poly(poles).real)
+    roots = roots[np.lexsort((-roots.imag, -np.abs(roots).round(9)))]
     np.testing.assert_allclose(roots, expected, rtol=1e-10, atol=1e-15)
     # Conjugates exactly, so that no imaginary part survives in a sum.
     for k in range(len(roots)):
