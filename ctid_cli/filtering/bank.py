@@ -82,6 +82,11 @@ class ModalForm(NamedTuple):
     mapping: Array
 
     @property
+    def width(self) -> int:
+        """Number of rows of z."""
+        return self.modes.width
+
+    @property
     def modes(self) -> Modes:
         """The modes of a model by itself."""
         return Modes(self.poles, np.zeros(self.poles.size, np.int64), self.residues, np.zeros(1))
@@ -90,12 +95,7 @@ class ModalForm(NamedTuple):
 def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
     """Return the partial fractions of ``B/(p^l A)``; their condition says whether they can be used."""
     w0, roots = scaled_roots(a)
-    try:
-        return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
-    except ZeroDivisionError:
-        # A pole on the imaginary axis, or products that underflow.
-        nothing = np.zeros(0, np.complex128)
-        return ModalForm(np.inf, nothing, nothing.reshape(0, 2), NO_ROWS)
+    return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
 
 
 def modal_pass(
@@ -120,10 +120,15 @@ def modal_pass(
     n = modes.width
     layout = (n if double else 0, 2 * n if double else n, (2 * n + 2 if double else n + 2) if filter_output else 0)
     width = layout[1] + 2 + (n if filter_output else 0) + (0 if instruments is None else 2 * n + 1)
-    gram = NO_ROWS if rows else np.zeros((width if leading is None else leading, width))
-    found = np.zeros((data.count, width)) if rows else NO_ROWS
-    _run(data, modes, delay, layout, states, instruments, gram, found, NOTHING)
-    return found if rows else gram
+    if rows:
+        found = np.zeros((data.count, width))
+        _run(data, modes, delay, layout, states, instruments, NO_ROWS, found, NOTHING)
+        return found
+    # Moments are summed in tiles of two rows and four columns.
+    factors = width if leading is None else leading
+    gram = np.zeros((factors + factors % 2, width + 3))
+    _run(data, modes, delay, layout, states, instruments, gram, NO_ROWS, NOTHING)
+    return gram[:factors, :width]
 
 
 def to_steady_state(poles: ComplexArray, period: float, states: ComplexArray) -> None:
@@ -155,18 +160,15 @@ def _run(
     """Run the pass for the clock of a record."""
     if states is None:
         states = np.zeros((modes.poles.size, 5), np.complex128)
-    output = data.y, data.y_foh
+    grid, clock = None, None
     if data.interval > 0.0:
-        clock = (data.interval, *_place(delay, data.interval))
-        if instruments is None:
-            driving, measured = (data.u, bool(data.input_foh)), NOTHING
-        else:
-            driving, measured = (instruments, False), data.u
-        kernels.regular_pass(*modes, states, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
+        grid = (data.interval, *_place(delay, data.interval))
     else:
         assert not isinstance(delay, tuple)
-        instants, breaks = (data.t, float(delay), data.slack), (data.tu, data.u, data.input_foh)
-        kernels.irregular_pass(*modes, states, instants, breaks, output, data.use, layout, gram, rows, simulated)
+        clock = (data.t, data.tu, float(delay), data.slack)
+    driving, measured = ((data.u, data.input_foh), NOTHING) if instruments is None else ((instruments, False), data.u)
+    output = data.y, data.y_foh
+    kernels.filter_pass(*modes, states, grid, clock, driving, measured, output, data.use, layout, gram, rows, simulated)
 
 
 def _place(delay: Place, interval: float) -> tuple[int, float]:
@@ -205,58 +207,83 @@ def chain_states(
     return np.column_stack((states, values + fraction * changes))
 
 
-class DoubleChain(NamedTuple):
-    """A chain ``z1' = w0 (F z1 + g u)`` and a second one behind it, driven by ``x = B/(p^l A) u``."""
+class ChainForm(NamedTuple):
+    """A chain ``z' = w0 (F z + g u)``, and its part in the standard rows with a second chain that x drives."""
 
     w0: float
     dynamics: Array
     gain: Array
-    #: Maps from the states of one chain to ``p^k/(p^l A)`` of what drives it, in s, and to x.
-    powers: Array
+    #: Map from the states to ``x = B/(p^l A) u``.
     output: Array
+    #: The standard rows of the rows ``z, w, v, y - x, e`` of a pass, as those of partial fractions.
+    mapping: Array
 
     @property
-    def order(self) -> int:
+    def width(self) -> int:
         """Number of states of one chain."""
-        return self.output.size
+        return self.gain.size
 
-    def signals(self, states: Array, integrators: int) -> tuple[Array, Array]:
-        """Return ``p^k/(p^l A) u`` and ``p^k/A x`` from the states of both chains, columns."""
-        driven = states[:, : self.order] @ self.powers.T
-        return driven, (states[:, self.order : 2 * self.order] @ self.powers.T)[:, integrators:]
+    @property
+    def double(self) -> tuple[Array, Array]:
+        """Dynamics and gain of both chains in a row."""
+        n = self.width
+        dynamics = np.asarray(np.kron(np.eye(2), self.dynamics), dtype=np.float64)
+        dynamics[n:, :n] = np.outer(self.gain, self.output)
+        return dynamics, np.concatenate((self.gain, np.zeros(n)))
 
     def after_impulse(self, elapsed: Array) -> Array:
         """Return the states of both chains after an impulse of u [s]."""
-        table = transitions(self.dynamics, self.gain, float(elapsed.max()) * self.w0)
+        dynamics, gain = self.double
+        table = transitions(dynamics, gain, float(elapsed.max()) * self.w0)
         breaks = np.zeros(1), np.zeros(1), False
-        initial = self.gain * self.w0
-        return np.asarray(kernels.irregular_states(*table, *breaks, elapsed * self.w0, 0.0, initial))
+        states = kernels.irregular_states(*table, *breaks, elapsed * self.w0, 0.0, gain * self.w0)
+        return np.asarray(states[:, :-2])
 
 
-def double_chain(a: Array, b: Array, integrators: int) -> DoubleChain:
-    """Realise ``1/(p^l A)`` twice in a row."""
-    order = a.size - 1 + integrators
+def chain_form(a: Array, b: Array, integrators: int = 0) -> ChainForm:
+    """Return the chain of ``B/(p^l A)``."""
+    n, order = a.size - 1, a.size - 1 + integrators
     w0, roots = scaled_roots(np.concatenate((a, np.zeros(integrators))))
-    single, entry, powers = chain(roots)
+    dynamics, gain, powers = chain(roots)
     powers = powers * (w0 ** np.arange(-order, 0.0))[:, None]
-    output = b[::-1] @ powers[: b.size]
-    dynamics = np.asarray(np.kron(np.eye(2), single), dtype=np.float64)
-    dynamics[order:, :order] = np.outer(entry, output)
-    return DoubleChain(w0, dynamics, np.concatenate((entry, np.zeros(order))), powers, output)
+    mapping = np.zeros((3 * n + integrators + 3, 3 * order + 2))
+    mapping[:order, :order], mapping[order, 2 * order] = powers, 1.0
+    mapping[order + 1 : order + n + 1, order : 2 * order] = powers[integrators:]
+    mapping[order + n + 1 : order + 2 * n + 1, 2 * order + 2 :] = powers[integrators:]
+    mapping[-2, 2 * order + 1] = 1.0
+    # p x, where p^(n + l)/(p^l A) v = v - sum of a_k p^(n + l - k)/(p^l A) v.
+    highest = mapping[order] - a[1:] @ mapping[order - np.arange(1, n + 1)]
+    mapping[-1] = b[::-1] @ np.vstack((mapping[1:order], highest))[: b.size]
+    return ChainForm(w0, dynamics, gain, b[::-1][:order] @ powers[: b.size], mapping)
 
 
-def _chain_rows(a: Array, b: Array, integrators: int, delay: float, data: FilterData) -> Array:
-    """Return the standard rows for any poles."""
-    both = double_chain(a, b, integrators)
-    n, order = a.size - 1, both.order
-    states = chain_states(both.dynamics, both.gain, both.w0, data, delay)[data.use]
-    of_output = data._replace(u=data.y, tu=data.t, input_foh=data.y_foh)
-    filtered = chain_states(both.dynamics[:order, :order], both.gain[:order], both.w0, of_output, 0.0)[data.use, :order]
-    u, error = states[:, -1:], data.y_used - states[:, :order] @ both.output
-    driven, behind = both.signals(states, integrators)
-    highest = u[:, 0] - driven[:, order - np.arange(1, n + 1)] @ a[1:]
-    slope = np.column_stack((driven[:, 1:], highest))[:, : b.size] @ b[::-1]
-    return np.column_stack((driven, u, behind, (filtered @ both.powers.T)[:, integrators:], error, slope))
+class Chains(NamedTuple):
+    """The chains of one model, or of several submodels, and what each of these passes on at once."""
+
+    forms: tuple[ChainForm, ...]
+    direct: Array
+
+
+def chain_pass(data: FilterData, chains: Chains, delay: float, instruments: Array | None = None) -> Array:
+    """Return the rows of a pass over chains, shape (count, q), those of the chains next to each other."""
+    inputs = [data] if instruments is None else [data._replace(u=instruments, input_foh=False), data]
+    columns: list[list[Array]] = []
+    for driving in inputs:
+        states = [chain_states(*form.double, form.w0, driving, delay) for form in chains.forms]
+        singles = [state[:, : form.width] for form, state in zip(chains.forms, states, strict=True)]
+        doubles = [state[:, form.width : -1] for form, state in zip(chains.forms, states, strict=True)]
+        columns.append([*singles, *doubles, states[0][:, -1:]])
+    # The last are driven by the measured input.
+    u = states[0][:, -1]
+    outputs = [
+        single @ form.output + direct * u
+        for form, single, direct in zip(chains.forms, singles, chains.direct, strict=True)
+    ]
+    error, measured = data.y - np.sum(outputs, axis=0), []
+    for form, output in zip(chains.forms, outputs, strict=True):
+        left = data._replace(u=error + output, tu=data.t, input_foh=data.y_foh)
+        measured.append(chain_states(form.dynamics, form.gain, form.w0, left, 0.0)[:, :-1])
+    return np.column_stack([*columns[0], error, *measured, *(columns[1] if len(columns) > 1 else [])])[data.use]
 
 
 def standard_rows(
@@ -282,5 +309,6 @@ def _standard(data: FilterData, a: Array, b: Array, delay: float, form: Form, in
             found = modal_pass(data, modal.modes, delay, rows=rows)
             mapping = modal.mapping
             return found @ mapping.T if rows else mapping @ found @ mapping.T
-    found = _chain_rows(a, b, integrators, delay, data)
+    chains = Chains((chain_form(a, b, integrators),), np.zeros(1))
+    found = chain_pass(data, chains, delay) @ chains.forms[0].mapping.T
     return found if rows else found.T @ found

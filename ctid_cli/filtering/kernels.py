@@ -20,16 +20,16 @@ from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 
-#: Roots whose distance is a smaller fraction of their magnitudes together count as close to each other.
-CLOSE_ROOTS = 0.2
 #: Rows are made in blocks of this many samples, which stay in the first cache of a processor.
 BLOCK = 128
+#: Length of the rows of a block: there is a state behind the last one, and each row begins on a line of the cache.
+WIDTH = BLOCK + 8
 #: 1/(k + 4)!, k = 0 … 14, of the series for |x| <= 1: what is left out is below rounding.
 SERIES = tuple(1.0 / math.factorial(k + 4) for k in range(15))
 #: Up to |x| = 2^this a block of weights is summed as series of halved steps, and doubled; beyond, exponentials are
 #: faster.
 MOST_DOUBLINGS = 5
-#: Places of the parts of a block of steps, see `_held_steps`.
+#: Places of the parts of a block of steps, see `_weigh`.
 GAP, VALUE, CHANGE, DECAY_RE, DECAY_IM, SINGLE_RE, SINGLE_IM, DOUBLE_RE, DOUBLE_IM, PARTS = range(10)
 #: Digits per level, and Taylor degree, of the transitions of a chain over any step.
 BASE = 16
@@ -40,116 +40,26 @@ TAYLOR_DEGREE = 6
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def simple_roots(coefficients: Array) -> ComplexArray:
-    """Roots of a monic real polynomial, fastest first and conjugates side by side; none where some are close.
-
-    By the Aberth-Ehrlich iteration, which converges cubically to simple roots and slowly to clusters.
-    """
-    n = coefficients.size - 1
-    roots = np.zeros(n, np.complex128)
-    if n == 1:
-        roots[0] = -coefficients[1]
-        return roots
-    if n == 2:
-        half = -0.5 * coefficients[1]
-        discriminant = half * half - coefficients[2]
-        if discriminant < 0.0:
-            roots[0] = complex(half, math.sqrt(-discriminant))
-            roots[1] = complex(half, -math.sqrt(-discriminant))
-        else:
-            large = half - math.sqrt(discriminant) if half < 0.0 else half + math.sqrt(discriminant)
-            roots[0] = large
-            roots[1] = coefficients[2] / large if large != 0.0 else 0.0
-        return roots
-    radius = 1.0
-    for k in range(1, n + 1):
-        radius = max(radius, abs(coefficients[k]) ** (1.0 / k))
-    for i in range(n):
-        # Points without symmetry about the real axis, which conjugate roots could not break.
-        angle = 2.0 * math.pi * i / n + 0.4
-        roots[i] = radius * complex(math.cos(angle), math.sin(angle))
-    settled = False
-    for _ in range(40):
-        settled = True
-        for i in range(n):
-            # A and A' by Horner; the step -A/(A' - A sum 1/(root - other)) takes the other roots out of A.
-            value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * roots[i] + value
-                value = value * roots[i] + coefficients[k]
-            if value == 0.0:
-                continue
-            repulsion = complex(0.0, 0.0)
-            for j in range(n):
-                if j != i:
-                    if roots[j] == roots[i]:
-                        return roots[:0]
-                    repulsion += 1.0 / (roots[i] - roots[j])
-            denominator = slope - value * repulsion
-            if denominator == 0.0 or not math.isfinite(denominator.real):
-                return roots[:0]
-            change = value / denominator
-            roots[i] -= change
-            if abs(change) > 1e-14 * abs(roots[i]):
-                settled = False
-        if settled:
-            break
-    if not settled:
-        return roots[:0]
-    for i in range(n):
-        for j in range(i):
-            if abs(roots[i] - roots[j]) < CLOSE_ROOTS * (abs(roots[i]) + abs(roots[j])):
-                return roots[:0]
-    return polished_roots(coefficients, roots)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def polished_roots(coefficients: Array, raw: ComplexArray) -> ComplexArray:
-    """Roots after Newton steps, as exact conjugate pairs, by falling magnitude."""
-    n = raw.size
-    # Newton steps against rounding, which is relative to the *largest* root. Only where the step is small against the
-    # distance to the next root: the members of a cluster are wrong each by itself and right together, and must not be
-    # moved one by one.
-    for i in range(n):
+def polish_roots(coefficients: Array, roots: ComplexArray) -> None:
+    """Improve the roots of a monic real polynomial by Newton steps, in place; a pair stands side by side."""
+    # Against rounding, which is relative to the *largest* root. Only where the step is small against the distance to
+    # the next root: the members of a cluster are wrong each by itself and right together, and must not be moved one by
+    # one.
+    for i in range(roots.size):
         gap = np.inf
-        for j in range(n):
+        for j in range(roots.size):
             if j != i:
-                gap = min(gap, abs(raw[j] - raw[i]))
+                gap = min(gap, abs(roots[j] - roots[i]))
         for _ in range(3):
             value, slope = complex(1.0, 0.0), complex(0.0, 0.0)
-            for k in range(1, n + 1):
-                slope = slope * raw[i] + value
-                value = value * raw[i] + coefficients[k]
+            for k in range(1, coefficients.size):
+                slope = slope * roots[i] + value
+                value = value * roots[i] + coefficients[k]
             if not abs(value) < 1e-3 * gap * abs(slope):
                 break
-            raw[i] -= value / slope
-    used = np.zeros(n, np.bool_)
-    roots = np.zeros(n, np.complex128)
-    count = 0
-    while count < n:
-        # The largest that is left.
-        i = -1
-        for k in range(n):
-            if not used[k] and (i < 0 or abs(raw[k]) > abs(raw[i])):
-                i = k
-        used[i] = True
-        # A root is real if it is its own nearest conjugate.
-        partner, distance = i, 2.0 * abs(raw[i].imag)
-        for j in range(n):
-            if not used[j]:
-                gap = abs(raw[j] - raw[i].conjugate())
-                if gap < distance:
-                    partner, distance = j, gap
-        if partner == i:
-            roots[count] = raw[i].real
-            count += 1
-        else:
-            used[partner] = True
-            mean = 0.5 * (raw[i] + raw[partner].conjugate())
-            roots[count] = complex(mean.real, abs(mean.imag))
-            roots[count + 1] = complex(mean.real, -abs(mean.imag))
-            count += 2
-    return roots
+            roots[i] -= value / slope
+        if roots[i].imag < 0.0:
+            roots[i] = roots[i - 1].conjugate()
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -180,43 +90,39 @@ def modal_form(
     poles = np.zeros(modes + (1 if origin > 0 else 0), np.complex128)
     residues = np.zeros((poles.size, 2), np.complex128)
     mapping = np.zeros((3 * n + origin + 3, 3 * width + 2))
-    slopes, curvatures = np.zeros(n, np.complex128), np.zeros(n, np.complex128)
+    slopes, curvatures = np.ones(n, np.complex128), np.zeros(n, np.complex128)
     for i in range(n):
-        if roots[i].imag < 0.0:
-            slopes[i], curvatures[i] = slopes[i - 1].conjugate(), curvatures[i - 1].conjugate()
-            continue
-        slope = complex(1.0, 0.0)  # A'(pole), as a product: exact where the polynomial form would cancel
-        curvature = complex(0.0, 0.0)  # A''/A' = 2 sum 1/(pole - other)
+        # A'(pole), as a product: exact where the polynomial form would cancel; and A''/A' = 2 sum 1/(pole - other).
         for j in range(n):
-            if j != i:
-                slope *= roots[i] - roots[j]
-                if roots[j] != roots[i]:
-                    curvature += 2.0 / (roots[i] - roots[j])
-        slopes[i], curvatures[i] = slope, curvature
-        # A pole at the origin has no bandwidth; a slope that is 0, or underflows when squared, belongs to a double one.
-        if slope * slope == 0.0 or roots[i] == 0.0:
+            if roots[j] != roots[i]:
+                slopes[i] *= roots[i] - roots[j]
+                curvatures[i] += 2.0 / (roots[i] - roots[j])
+            elif j != i:
+                return np.inf, poles, residues, mapping
+        # A pole at the origin has no bandwidth; a slope that underflows when squared belongs to a double one.
+        if slopes[i] * slopes[i] == 0.0 or roots[i] == 0.0:
             return np.inf, poles, residues, mapping
     # Rounding matters against the largest gain of p^k/A^2, which lies near the frequency of some pole, or at zero.
     condition = 1.0
-    for k in range(n if n > 1 else 0):
-        peak, spread = 0.0, 0.0
-        for at in range(n + 1):
-            s = complex(0.0, abs(roots[at - 1]) if at > 0 else 0.0)
-            exact, total = 1.0, 0.0
-            for i in range(n):
-                distance = s - roots[i]
-                exact /= abs(distance) ** 2
-                power = roots[i] ** k
-                lower = k * roots[i] ** (k - 1) if k > 0 else complex(0.0, 0.0)
-                square = slopes[i] * slopes[i]
+    peaks, spreads = np.zeros(n), np.zeros(n)
+    for at in range(n + 1 if n > 1 else 0):
+        frequency, gain = abs(roots[at - 1]) if at > 0 else 0.0, 1.0
+        totals = np.zeros(n)
+        for i in range(n):
+            distance, size = abs(complex(0.0, frequency) - roots[i]), abs(roots[i])
+            gain /= distance * distance
+            scale = 1.0 / (abs(slopes[i] * slopes[i]) * distance)
+            for k in range(n):
                 # p^k/A^2 near a double pole of A^2: one term for 1/(s - p)^2, one for 1/(s - p).
-                total += abs(power / (square * distance * distance))
-                total += abs((lower - power * curvatures[i]) / (square * distance))
-            peak = max(peak, exact * abs(s) ** k if k > 0 else exact)
-            spread = max(spread, total)
-        if not peak > 0.0:
+                totals[k] += scale * (1.0 / distance + abs(k / roots[i] - curvatures[i]))
+                scale *= size
+        for k in range(n):
+            peaks[k], spreads[k] = max(peaks[k], gain), max(spreads[k], totals[k])
+            gain *= frequency
+    for k in range(n if n > 1 else 0):
+        if not 0.0 < peaks[k] < np.inf:
             return np.inf, poles, residues, mapping
-        condition = max(condition, spread / peak)
+        condition = max(condition, spreads[k] / peaks[k])
     first_x, first_y, first_e = n + origin + 1, 2 * n + origin + 1, 2 * width + 2
     row, mode = 0, 0
     for i in range(n):
@@ -249,23 +155,22 @@ def modal_form(
         row += 2 if paired else 1
         mode += 1
     if origin > 0:
-        # At the origin, with g = p^k/A or p^k B/A^2: g(0) of 1/p, or g(0) of 1/p^2 and g'(0) of 1/p.
+        # The power series at the origin of 1/A, B/A and B/A^2: their terms are the weights of 1/p and of 1/p^2.
         a0, a1 = a[n], a[n - 1] if n > 0 else 0.0
         b0, b1 = b[b.size - 1], b[b.size - 2] if b.size > 1 else 0.0
-        for k in range(origin):
-            own, own_slope = (1.0 / a0, -a1 / a0**2) if k == 0 else (0.0, 1.0 / a0)
-            driven, driven_slope = (b0 / a0**2, b1 / a0**2 - 2.0 * b0 * a1 / a0**3) if k == 0 else (0.0, b0 / a0**2)
-            mapping[k, row] = own if origin == 1 else own_slope
-            mapping[k, width + row] = 0.0 if origin == 1 else own
-            if k < n:
-                mapping[first_x + k, row] = driven if origin == 1 else driven_slope
-                mapping[first_x + k, width + row] = 0.0 if origin == 1 else driven
-        slope = b1 / a0 - b0 * a1 / a0**2
-        residues[mode, 0], residues[mode, 1] = (b0 / a0, 0.0) if origin == 1 else (slope, b0 / a0)
+        own = (1.0 / a0, -a1 / a0**2)
+        output = (b0 * own[0], b1 * own[0] + b0 * own[1])
+        driven = (output[0] * own[0], output[1] * own[0] + output[0] * own[1])
+        for place in range(origin):
+            residues[mode, place] = output[origin - 1 - place]
+            for k in range(origin - place):
+                mapping[k, row + place * width] = own[origin - 1 - place - k]
+                if k < n:
+                    mapping[first_x + k, row + place * width] = driven[origin - 1 - place - k]
     mapping[n + origin, 2 * width] = 1.0
     mapping[3 * n + origin + 1, 2 * width + 1] = 1.0
     # p x, where p^(n + l)/(p^l A) v = v - sum of a_k p^(n + l - k)/(p^l A) v.
-    for i in range(max(b.size - n - origin, 0), b.size):
+    for i in range(b.size if n + origin > 0 else 0):
         power = b.size - i
         for column in range(mapping.shape[1]):
             mapping[3 * n + origin + 2, column] += b[i] * mapping[power, column]
@@ -324,104 +229,205 @@ def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex,
     return decay, step * decay, step * g, step * f, square * g_slope, square * slope
 
 
-# --- passes over a regular clock ------------------------------------------------------------------------------------
+#: A regular clock: the interval, and shift and fraction of the delay ``(shift - fraction) interval``. Else None.
+Grid = tuple[float, int, float] | None
+#: Any other clock: instants of the samples and of the breaks of the input, the delay, and the time by which a break may
+#: be late and still count as reached. Else None.
+Instants = tuple[Array, Array, float, float] | None
+
+
+# --- passes: steps over which inputs are held, and the modes that they drive ------------------------------------------
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _mode_block(
-    pole: complex, interval: float, fraction: float, held: Array, count: int, state: ComplexArray, rows: Array, w: int
+def _weigh(
+    pole: complex, double: bool, grid: Grid, instants: Instants, longest: float, count: int, steps: Array
 ) -> None:
-    """Advance a mode, and its square, over a block of held inputs; column k receives the read-out at sample k.
+    """Write the decay of a mode over each step of a block, and what the held input adds to it, and to its square too.
 
-    ``rows`` begins with the real and imaginary part of z, those of w stand ``w`` rows below (0: none). ``held`` has the
-    input at the break before each sample and its change up to the next one, and the read-out is a fraction of an
-    interval behind that break. In real arithmetic, so that the state stays in registers.
+    The parts of ``steps``, shape (PARTS, BLOCK): the gaps, the input and its change over them, and what is written. On
+    a grid all gaps are the same; at any instants none is longer than ``longest``.
     """
-    decay, mixed, at_b, at_c, at_f, at_g = step_weights(pole, interval)
-    value, change = held[0], held[1]
-    # The imaginary part of a real mode is zero, and written to where nothing is read.
-    unread = np.empty(BLOCK)
-    paired = pole.imag != 0.0
-    z_row_re, z_row_im = rows[0], rows[1] if paired else unread
-    w_row_re, w_row_im = rows[w], rows[w + 1] if paired else unread
-    z_re, z_im = state[0].real, state[0].imag
-    d_re, d_im, b_re, b_im, c_re, c_im = decay.real, decay.imag, at_b.real, at_b.imag, at_c.real, at_c.imag
-    if w > 0:
-        w_re, w_im = state[1].real, state[1].imag
-        m_re, m_im, f_re, f_im, g_re, g_im = mixed.real, mixed.imag, at_f.real, at_f.imag, at_g.real, at_g.imag
+    if grid is not None:
+        decay, _, at_b, at_c, at_f, at_g = step_weights(pole, steps[GAP, 0])
+        d_re, d_im, b_re, b_im, c_re, c_im = decay.real, decay.imag, at_b.real, at_b.imag, at_c.real, at_c.imag
+        f_re, f_im, g_re, g_im = at_f.real, at_f.imag, at_g.real, at_g.imag
         for k in range(count):
-            z_row_re[k], z_row_im[k], w_row_re[k], w_row_im[k] = z_re, z_im, w_re, w_im
-            # w+ = d w + m z + f value + g change, from z before its step. Summed so that only two of the products wait
-            # for the step before.
-            driven_re = m_re * z_re - m_im * z_im + (f_re * value[k] + g_re * change[k])
-            driven_im = m_re * z_im + m_im * z_re + (f_im * value[k] + g_im * change[k])
+            steps[DECAY_RE, k], steps[DECAY_IM, k] = d_re, d_im
+            steps[SINGLE_RE, k] = b_re * steps[VALUE, k] + c_re * steps[CHANGE, k]
+            steps[SINGLE_IM, k] = b_im * steps[VALUE, k] + c_im * steps[CHANGE, k]
+        for k in range(count if double else 0):
+            steps[DOUBLE_RE, k] = f_re * steps[VALUE, k] + g_re * steps[CHANGE, k]
+            steps[DOUBLE_IM, k] = f_im * steps[VALUE, k] + g_im * steps[CHANGE, k]
+    if instants is not None:
+        size = abs(pole) * longest
+        doublings = max(0, math.ceil(math.log2(size))) if 0.0 < size < np.inf else 0
+        if doublings > MOST_DOUBLINGS:
+            # A step far longer than the mode remembers.
+            for k in range(count):
+                decay, _, at_b, at_c, at_f, at_g = step_weights(pole, steps[GAP, k])
+                single, double = (
+                    at_b * steps[VALUE, k] + at_c * steps[CHANGE, k],
+                    at_f * steps[VALUE, k] + at_g * steps[CHANGE, k],
+                )
+                steps[DECAY_RE, k], steps[DECAY_IM, k] = decay.real, decay.imag
+                steps[SINGLE_RE, k], steps[SINGLE_IM, k] = single.real, single.imag
+                steps[DOUBLE_RE, k], steps[DOUBLE_IM, k] = double.real, double.imag
+            return
+        scale = 0.5**doublings
+        re, im = scale * pole.real, scale * pole.imag
+        # f and f' stand where the weights made of them will.
+        for k in range(count):
+            steps[SINGLE_RE, k], steps[SINGLE_IM, k], steps[DOUBLE_RE, k], steps[DOUBLE_IM, k] = _series(
+                re * steps[GAP, k], im * steps[GAP, k]
+            )
+        for _ in range(doublings):
+            # f(2 x) = (g^2 + 2 f)/4, hence f'(2 x) = (g g' + f')/4. All double equally often: the loop has no branch.
+            for k in range(count):
+                x_re, x_im = re * steps[GAP, k], im * steps[GAP, k]
+                f_re, f_im, slope_re, slope_im = (
+                    steps[SINGLE_RE, k],
+                    steps[SINGLE_IM, k],
+                    steps[DOUBLE_RE, k],
+                    steps[DOUBLE_IM, k],
+                )
+                g_re, g_im = 1.0 + x_re * f_re - x_im * f_im, x_re * f_im + x_im * f_re
+                g_slope_re = f_re + x_re * slope_re - x_im * slope_im
+                g_slope_im = f_im + x_re * slope_im + x_im * slope_re
+                steps[SINGLE_RE, k] = 0.25 * (g_re * g_re - g_im * g_im) + 0.5 * f_re
+                steps[SINGLE_IM, k] = 0.5 * (g_re * g_im + f_im)
+                steps[DOUBLE_RE, k] = 0.25 * (g_re * g_slope_re - g_im * g_slope_im + slope_re)
+                steps[DOUBLE_IM, k] = 0.25 * (g_re * g_slope_im + g_im * g_slope_re + slope_im)
+            re, im = 2.0 * re, 2.0 * im
+        for k in range(count):
+            gap, value, change = steps[GAP, k], steps[VALUE, k], steps[CHANGE, k]
+            x_re, x_im = pole.real * gap, pole.imag * gap
+            f_re, f_im, slope_re, slope_im = (
+                steps[SINGLE_RE, k],
+                steps[SINGLE_IM, k],
+                steps[DOUBLE_RE, k],
+                steps[DOUBLE_IM, k],
+            )
+            g_re, g_im = 1.0 + x_re * f_re - x_im * f_im, x_re * f_im + x_im * f_re
+            steps[DECAY_RE, k], steps[DECAY_IM, k] = 1.0 + x_re * g_re - x_im * g_im, x_re * g_im + x_im * g_re
+            steps[SINGLE_RE, k] = gap * (g_re * value + f_re * change)
+            steps[SINGLE_IM, k] = gap * (g_im * value + f_im * change)
+            if not double:
+                continue
+            g_slope_re = f_re + x_re * slope_re - x_im * slope_im
+            g_slope_im = f_im + x_re * slope_im + x_im * slope_re
+            steps[DOUBLE_RE, k] = gap * gap * (g_slope_re * value + slope_re * change)
+            steps[DOUBLE_IM, k] = gap * gap * (g_slope_im * value + slope_im * change)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _advance(steps: Array, count: int, state: ComplexArray, rows: Array, w: int, paired: bool, begin: int) -> None:
+    """Advance a mode, and its square, over steps; the state after step k is written to column ``begin + k``.
+
+    The rows begin with the real and imaginary part of z, those of w stand ``w`` rows below (0: none). In real
+    arithmetic, so that the state stays in registers. Where ``begin`` is 1, column 0 is the state before all steps.
+    """
+    # The imaginary part of a real mode is zero, and written to the last row, where nothing is read.
+    z_row, w_row = (1, w + 1) if paired else (rows.shape[0] - 1, rows.shape[0] - 1)
+    z_re, z_im, w_re, w_im = state[0].real, state[0].imag, state[1].real, state[1].imag
+    rows[0, 0], rows[z_row, 0] = z_re, z_im
+    if w > 0:
+        rows[w, 0], rows[w_row, 0] = w_re, w_im
+        for k in range(count):
+            # w+ = d (w + gap z) + …, from z before its step. Summed so that only two of the products wait for the step
+            # before.
+            d_re, d_im, gap = steps[DECAY_RE, k], steps[DECAY_IM, k], steps[GAP, k]
+            moved_re, moved_im = gap * z_re, gap * z_im
+            driven_re = d_re * moved_re - d_im * moved_im + steps[DOUBLE_RE, k]
+            driven_im = d_re * moved_im + d_im * moved_re + steps[DOUBLE_IM, k]
             new_re = d_re * w_re + (driven_re - d_im * w_im)
             w_im = d_re * w_im + (driven_im + d_im * w_re)
             w_re = new_re
-            new_re = d_re * z_re + (b_re * value[k] + c_re * change[k] - d_im * z_im)
-            z_im = d_re * z_im + (b_im * value[k] + c_im * change[k] + d_im * z_re)
+            new_re = d_re * z_re + (steps[SINGLE_RE, k] - d_im * z_im)
+            z_im = d_re * z_im + (steps[SINGLE_IM, k] + d_im * z_re)
             z_re = new_re
+            at = begin + k
+            rows[0, at], rows[z_row, at], rows[w, at], rows[w_row, at] = z_re, z_im, w_re, w_im
         state[1] = complex(w_re, w_im)
     else:
         for k in range(count):
-            z_row_re[k], z_row_im[k] = z_re, z_im
-            new_re = d_re * z_re + (b_re * value[k] + c_re * change[k] - d_im * z_im)
-            z_im = d_re * z_im + (b_im * value[k] + c_im * change[k] + d_im * z_re)
+            d_re, d_im = steps[DECAY_RE, k], steps[DECAY_IM, k]
+            new_re = d_re * z_re + (steps[SINGLE_RE, k] - d_im * z_im)
+            z_im = d_re * z_im + (steps[SINGLE_IM, k] + d_im * z_re)
             z_re = new_re
+            rows[0, begin + k], rows[z_row, begin + k] = z_re, z_im
     state[0] = complex(z_re, z_im)
-    if fraction == 0.0:
-        return
-    # From the breaks to where they are read.
-    decay, mixed, at_b, at_c, at_f, at_g = step_weights(pole, fraction * interval)
-    d_re, d_im, b_re, b_im = decay.real, decay.imag, at_b.real, at_b.imag
-    c_re, c_im = fraction * at_c.real, fraction * at_c.imag
-    if w > 0:
-        m_re, m_im, f_re, f_im = mixed.real, mixed.imag, at_f.real, at_f.imag
-        g_re, g_im = fraction * at_g.real, fraction * at_g.imag
-        for k in range(count):
-            z_re, z_im, w_re, w_im = z_row_re[k], z_row_im[k], w_row_re[k], w_row_im[k]
-            w_row_re[k] = d_re * w_re - d_im * w_im + (m_re * z_re - m_im * z_im + f_re * value[k] + g_re * change[k])
-            w_row_im[k] = d_re * w_im + d_im * w_re + (m_re * z_im + m_im * z_re + f_im * value[k] + g_im * change[k])
-    for k in range(count):
-        z_re, z_im = z_row_re[k], z_row_im[k]
-        z_row_re[k] = d_re * z_re - d_im * z_im + b_re * value[k] + c_re * change[k]
-        z_row_im[k] = d_re * z_im + d_im * z_re + b_im * value[k] + c_im * change[k]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"}, inline="always")
-def _output_block(
-    pole: complex,
-    interval: float,
-    values: Array,
-    before: float,
-    begun: bool,
-    foh: bool,
-    state: ComplexArray,
-    count: int,
-    rows: Array,
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _read_out(
+    steps: Array, count: int, path: Array, instants: Instants, passed: IntArray, rows: Array, w: int, paired: bool
 ) -> None:
-    """Advance the mode ``e``, driven by samples that are joined by straight lines, or held; read it at the samples.
+    """Write the states at the samples of a block, each a step behind a state of the path: sample k behind state k.
 
-    The step up to a sample needs the sample before it: of the last block, and of none at the very first.
+    Or, at any instants, behind state ``passed[k]``.
     """
-    decay, _, at_b, at_c, _, _ = step_weights(pole, interval)
-    d_re, d_im = decay.real, decay.imag
-    # b weights the earlier sample and c the one that is reached: the change to it is their difference.
-    c_re, c_im = (at_c.real, at_c.imag) if foh else (0.0, 0.0)
-    b_re, b_im = at_b.real - c_re, at_b.imag - c_im
-    e_re, e_im = state[2].real, state[2].imag
-    row_re = rows[0]
-    row_im = rows[1] if pole.imag != 0.0 else np.empty(BLOCK)
-    first = 0
-    if not begun:
-        row_re[0], row_im[0], before, first = e_re, e_im, values[0], 1
-    for k in range(first, count):
-        new_re = d_re * e_re + (b_re * before + c_re * values[k] - d_im * e_im)
-        e_im = d_re * e_im + (b_im * before + c_im * values[k] + d_im * e_re)
-        e_re = new_re
-        before = values[k]
-        row_re[k], row_im[k] = e_re, e_im
-    state[2] = complex(e_re, e_im)
+    z_row, w_row = (1, w + 1) if paired else (rows.shape[0] - 1, rows.shape[0] - 1)
+    for k in range(count):
+        at = k
+        if instants is not None:
+            at = passed[k]
+        d_re, d_im, z_re, z_im = steps[DECAY_RE, k], steps[DECAY_IM, k], path[0, at], path[1, at]
+        rows[0, k] = steps[SINGLE_RE, k] + d_re * z_re - d_im * z_im
+        rows[z_row, k] = steps[SINGLE_IM, k] + d_re * z_im + d_im * z_re
+    for k in range(count if w > 0 else 0):
+        at = k
+        if instants is not None:
+            at = passed[k]
+        d_re, d_im, gap = steps[DECAY_RE, k], steps[DECAY_IM, k], steps[GAP, k]
+        driven_re, driven_im = path[2, at] + gap * path[0, at], path[3, at] + gap * path[1, at]
+        rows[w, k] = steps[DOUBLE_RE, k] + d_re * driven_re - d_im * driven_im
+        rows[w_row, k] = steps[DOUBLE_IM, k] + d_re * driven_im + d_im * driven_re
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _held(tu: Array, u: Array, foh: bool, at: int) -> tuple[float, float, float]:
+    """Length of the step from a break, the input at its start, and the change over it."""
+    if at + 1 == tu.size:
+        return 0.0, u[at], 0.0
+    return tu[at + 1] - tu[at], u[at], u[at + 1] - u[at] if foh else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _irregular_steps(
+    instants: Instants, u: Array, foh: bool, start: int, last: int, steps: Array, passed: IntArray
+) -> tuple[int, int, int, float]:
+    """Fill in the steps of a block on any clock: from break to break, up to delayed samples, from sample to sample.
+
+    Returns how many samples there are and how many breaks are reached, the last of these, and the longest step.
+    ``passed`` are the breaks of the block before each sample. A block ends when either fills it: where the input has
+    far more breaks than the output samples, some blocks hold no sample. Before the first break the states are zero, and
+    stay so: a step of length zero that nothing drives.
+    """
+    assert instants is not None
+    t, tu, delay, slack = instants
+    breaks, late, samples = steps[0], steps[1], steps[2]
+    count, reached = min(BLOCK, t.size - start), 0
+    gap, value, change = 0.0, 0.0, 0.0
+    longest_gap, latest, longest_interval = 0.0, 0.0, 0.0
+    if last >= 0:
+        gap, value, change = _held(tu, u, foh, last)
+    for k in range(count):
+        instant = t[start + k] - delay
+        while last + 1 < tu.size and tu[last + 1] <= instant + slack:
+            if reached == BLOCK:
+                return k, reached, last, max(longest_gap, latest, longest_interval)
+            breaks[GAP, reached], breaks[VALUE, reached], breaks[CHANGE, reached] = gap, value, change
+            longest_gap = max(longest_gap, gap)
+            reached, last = reached + 1, last + 1
+            gap, value, change = _held(tu, u, foh, last)
+        # Read out on the way to the next break; the states stay at this one.
+        step = max(0.0, instant - tu[last]) if last >= 0 else 0.0
+        passed[k] = reached
+        late[GAP, k], late[VALUE, k], late[CHANGE, k] = step, value, change * (step / gap) if change != 0.0 else 0.0
+        samples[GAP, k] = t[start + k] - t[max(start + k - 1, 0)]
+        latest, longest_interval = max(latest, step), max(longest_interval, samples[GAP, k])
+    return count, reached, last, max(longest_gap, latest, longest_interval)
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -429,7 +435,8 @@ def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, row
     """Add the used columns of a block to the upper part of the moments, or to the rows; returns how many there are.
 
     Moments are the products of some leading rows with all that follow them, two rows with four others at a time: each
-    number that is loaded enters several products, and eight sums do not wait for each other.
+    number that is loaded enters several products, and eight sums do not wait for each other. Block and moments have
+    empty rows and columns behind the others, for whole tiles.
     """
     kept = 0
     for k in range(count):
@@ -438,17 +445,13 @@ def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, row
                 for i in range(block.shape[0]):
                     block[i, kept] = block[i, k]
             kept += 1
-    if rows.size:
-        for k in range(kept):
-            for i in range(block.shape[0]):
-                rows[written + k, i] = block[i, k]
-        return written + kept
-    leading, q = gram.shape
-    for i in range(0, leading - 1, 2):
+    for k in range(kept if rows.size else 0):
+        for i in range(rows.shape[1]):
+            rows[written + k, i] = block[i, k]
+    for i in range(0, gram.shape[0] - 1, 2):
         one, two = block[i], block[i + 1]
         # Below the diagonal of a tile products too many are formed; they are overwritten at the end.
-        tiled = i + (q - i) // 4 * 4
-        for j in range(i, tiled, 4):
+        for j in range(i, gram.shape[1] - 3, 4):
             a, b, c, d = block[j], block[j + 1], block[j + 2], block[j + 3]
             one_a, one_b, one_c, one_d, two_a, two_b, two_c, two_d = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for k in range(kept):
@@ -468,45 +471,18 @@ def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, row
             gram[i + 1, j + 1] += two_b
             gram[i + 1, j + 2] += two_c
             gram[i + 1, j + 3] += two_d
-        for j in range(tiled, q):
-            a, one_a, two_a = block[j], 0.0, 0.0
-            for k in range(kept):
-                one_a += one[k] * a[k]
-                two_a += two[k] * a[k]
-            gram[i, j] += one_a
-            gram[i + 1, j] += two_a
-    # The leading row left over.
-    if leading % 2 == 1:
-        one = block[leading - 1]
-        for j in range(leading - 1, q):
-            a, one_a = block[j], 0.0
-            for k in range(kept):
-                one_a += one[k] * a[k]
-            gram[leading - 1, j] += one_a
     return written + kept
 
 
-@njit(inline="always")
-def _error_row(outputs: Array, y: Array, start: int, count: int, row: Array, simulated: Array) -> None:
-    """Write the output less that of all submodels, and where it is wanted theirs."""
-    for k in range(count):
-        total = y[start + k]
-        for i in range(outputs.shape[0]):
-            total -= outputs[i, k]
-        row[k] = total
-    if simulated.size:
-        for k in range(count):
-            simulated[start + k] = y[start + k] - row[k]
-
-
-@njit(cache=True, nogil=True)
-def regular_pass(
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def filter_pass(
     poles: ComplexArray,
     owner: IntArray,
     residues: ComplexArray,
     direct: Array,
     states: ComplexArray,
-    clock: tuple[float, int, float],
+    grid: Grid,
+    instants: Instants,
     instruments: tuple[Array, bool],
     measured: Array,
     output: tuple[Array, bool],
@@ -516,19 +492,20 @@ def regular_pass(
     rows: Array,
     simulated: Array,
 ) -> None:
-    """Pass over a regular clock for the pooled modes of one model or of several submodels.
+    """Pass over a record for the pooled modes of one model or of several submodels.
 
-    ``clock`` is the interval, and shift and fraction of the delay ``(shift - fraction) interval``; ``instruments`` are
-    the values of v at the breaks and whether straight lines join them; ``measured`` those of u where this is another
-    signal, else empty; ``output`` the samples of y and whether straight lines join them. Mode i belongs to submodel
-    ``owner[i]``, whose output is ``x = sum Re(residues z) + direct u``. The rows of a pass are z; w; v; ``y - sum x``;
-    e, driven by what the other submodels leave of the output; and where u is another signal z, w of u, and u.
-    ``layout`` has the places of w, of v and of e among them (0: not wanted). ``states`` are z, w, e and z, w of u at
-    the first sample, and are left as they are after the last one. ``gram`` receives the products of its leading rows
-    with all, ``rows`` the rows of the used samples, and ``simulated`` the output x at every sample; an empty array is
-    not wanted.
+    On a regular clock ``grid`` is the interval, and shift and fraction of the delay ``(shift - fraction) interval``; on
+    any other it is None, and ``instants`` are those of the samples and of the breaks of the input, the delay, and the
+    time by which a break may be late and still count as reached. What only the other clock needs is not compiled.
+    ``instruments`` are the values of v at the breaks and whether straight lines join them; ``measured`` those of u
+    where this is another signal, else empty; ``output`` the samples of y and whether straight lines join them. Mode i
+    belongs to submodel ``owner[i]``, whose output is ``x = sum Re(residues z) + direct u``. The rows of a pass are z;
+    w; v; ``y - sum x``; e, driven by what the other submodels leave of the output; and where u is another signal z, w
+    of u, and u. ``layout`` has the places of w, of v and of e among them (0: not wanted). ``states`` are z, w, e and z,
+    w of u at the first sample, and are left as they are after the last one. ``gram`` receives the products of its
+    leading rows with all, ``rows`` the rows of the used samples, and ``simulated`` the output x at every sample; an
+    empty array is not wanted.
     """
-    interval, shift, fraction = clock
     v, foh = instruments
     y, y_foh = output
     w_row, v_row, e_row = layout
@@ -536,284 +513,91 @@ def regular_pass(
     for i in range(poles.size):
         first[i + 1] = first[i] + (2 if poles[i].imag != 0.0 else 1)
     n, submodels = first[poles.size], direct.size
-    closed = measured.size > 0
-    u_row = e_row + n if closed else 0
-    u = measured if closed else v
-    last_row = u_row + 2 * n if closed else v_row
-    count_rows = max(rows.shape[1], gram.shape[1], v_row + 2)
-    block = np.zeros((count_rows, BLOCK))
-    held = np.zeros((2, BLOCK))
+    sources = 2 if measured.size > 0 else 1
+    u_row = e_row + n if sources == 2 else 0
+    u_place, u_square = (u_row + 2 * n, n) if sources == 2 else (v_row, w_row)
+    block = np.zeros((max(rows.shape[1], gram.shape[1], v_row + 2) + 3, WIDTH))
     outputs, before = np.zeros((submodels, BLOCK)), np.zeros(submodels)
-    written = 0
-    for start in range(0, y.size, BLOCK):
+    # The steps from break to break, from the last break to a delayed sample, and from sample to sample.
+    steps, path, passed = np.zeros((3, PARTS, BLOCK)), np.zeros((4, WIDTH)), np.zeros(BLOCK, np.int64)
+    breaks, late, samples = steps[0], steps[1], steps[2]
+    start, last, written, longest, part = 0, -1, 0, 0.0, 1.0
+    if grid is not None:
+        part = grid[2]
+        breaks[GAP], late[GAP], samples[GAP] = grid[0], part * grid[0], grid[0]
+    while start < y.size:
         count = min(BLOCK, y.size - start)
-        for source in range(2 if closed else 1):
-            values = v if source == 0 else u
-            # Sample k sees the input from break start + k - shift on: none where that is negative.
+        reached = count
+        for source in range(sources):
+            u = v if source == 0 else measured
+            base, square, place = (0, w_row, v_row) if source == 0 else (u_row, u_square, u_place)
+            if grid is not None:
+                # Sample k sees the input from break start + k - shift on: none where that is negative.
+                for k in range(count):
+                    at = start + k - grid[1]
+                    breaks[VALUE, k] = late[VALUE, k] = u[at] if at >= 0 else 0.0
+                    breaks[CHANGE, k] = u[at + 1] - u[at] if foh and 0 <= at < u.size - 1 else 0.0
+                    late[CHANGE, k] = part * breaks[CHANGE, k]
+            if instants is not None:
+                count, reached, last, longest = _irregular_steps(instants, u, foh, start, last, steps, passed)
             for k in range(count):
-                at = start + k - shift
-                held[0, k] = values[at] if at >= 0 else 0.0
-                held[1, k] = values[at + 1] - values[at] if foh and 0 <= at < values.size - 1 else 0.0
-            base, square = (0, w_row) if source == 0 else (u_row, n)
+                block[place, k] = late[VALUE, k] + late[CHANGE, k]
             for i in range(poles.size):
-                _mode_block(
-                    poles[i], interval, fraction, held, count, states[i, 3 * source :], block[base + first[i] :], square
-                )
-            place = v_row if source == 0 else last_row
-            for k in range(count):
-                block[place, k] = held[0, k] + fraction * held[1, k]
+                paired, state, own = poles[i].imag != 0.0, states[i, 3 * source :], block[base + first[i] :]
+                _weigh(poles[i], square > 0, grid, instants, longest, reached, breaks)
+                if part == 0.0:
+                    _advance(breaks, reached, state, own, square, paired, 1)
+                else:
+                    _advance(breaks, reached, state, path, 2 if square > 0 else 0, True, 1)
+                    _weigh(poles[i], square > 0, grid, instants, longest, count, late)
+                    _read_out(late, count, path, instants, passed, own, square, paired)
         # x of each submodel, and y less the sum of them.
+        error = block[v_row + 1]
+        for k in range(count):
+            error[k] = y[start + k]
         for i in range(submodels):
             for k in range(count):
-                outputs[i, k] = direct[i] * block[last_row, k]
+                outputs[i, k] = direct[i] * block[u_place, k]
         for i in range(poles.size):
-            source, target = u_row + first[i], owner[i]
-            re, im = residues[i, 0].real, residues[i, 0].imag
+            own, x = block[u_row + first[i] :], outputs[owner[i]]
+            single, double = residues[i, 0], residues[i, 1].real
+            for k in range(count):
+                x[k] += single.real * own[0, k]
             if poles[i].imag != 0.0:
                 for k in range(count):
-                    outputs[target, k] += re * block[source, k] - im * block[source + 1, k]
-            else:
+                    x[k] -= single.imag * own[1, k]
+            if double != 0.0:
                 for k in range(count):
-                    outputs[target, k] += re * block[source, k]
-            if residues[i, 1] != 0.0:
-                double, re = source + (n if closed else w_row), residues[i, 1].real
-                for k in range(count):
-                    outputs[target, k] += re * block[double, k]
-        _error_row(outputs, y, start, count, block[v_row + 1], simulated)
+                    x[k] += double * own[u_square, k]
+        for i in range(submodels):
+            for k in range(count):
+                error[k] -= outputs[i, k]
+        if simulated.size:
+            for k in range(count):
+                simulated[start + k] = y[start + k] - error[k]
         if e_row > 0:
             # What the other submodels leave of the output drives e.
             for i in range(submodels):
                 for k in range(count):
-                    outputs[i, k] += block[v_row + 1, k]
+                    outputs[i, k] += error[k]
             for i in range(poles.size):
-                left = outputs[owner[i]]
-                _output_block(
-                    poles[i],
-                    interval,
-                    left,
-                    before[owner[i]],
-                    start > 0,
-                    y_foh,
-                    states[i],
-                    count,
-                    block[e_row + first[i] :],
-                )
-            # The next block's first step starts from here.
-            for i in range(submodels):
-                before[i] = outputs[i, count - 1]
-        if gram.size or rows.size:
-            written = _emit(block, count, use, start, gram, rows, written)
-    # Only the upper part was summed.
-    for i in range(gram.shape[0]):
-        for j in range(i):
-            gram[i, j] = gram[j, i]
-
-
-# --- passes over any clock ------------------------------------------------------------------------------------------
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _held_steps(pole: complex, longest: float, count: int, steps: Array) -> None:
-    """Write the decay of a mode over each gap of a block, and what the held input adds to the mode and to its square.
-
-    No gap is longer than ``longest``. The parts of ``steps``, shape (PARTS, BLOCK): the gaps, the input and its change
-    over them, and what is written.
-    """
-    gaps, values, changes = steps[GAP], steps[VALUE], steps[CHANGE]
-    decays_re, decays_im = steps[DECAY_RE], steps[DECAY_IM]
-    singles_re, singles_im = steps[SINGLE_RE], steps[SINGLE_IM]
-    doubles_re, doubles_im = steps[DOUBLE_RE], steps[DOUBLE_IM]
-    size = abs(pole) * longest
-    doublings = max(0, math.ceil(math.log2(size))) if 0.0 < size < np.inf else 0
-    if doublings > MOST_DOUBLINGS:
-        # A step far longer than the mode remembers.
-        for k in range(count):
-            decay, _, at_b, at_c, at_f, at_g = step_weights(pole, gaps[k])
-            single, double = at_b * values[k] + at_c * changes[k], at_f * values[k] + at_g * changes[k]
-            decays_re[k], decays_im[k] = decay.real, decay.imag
-            singles_re[k], singles_im[k] = single.real, single.imag
-            doubles_re[k], doubles_im[k] = double.real, double.imag
-        return
-    scale = 0.5**doublings
-    re, im = scale * pole.real, scale * pole.imag
-    # f and f' stand where the weights made of them will.
-    for k in range(count):
-        singles_re[k], singles_im[k], doubles_re[k], doubles_im[k] = _series(re * gaps[k], im * gaps[k])
-    for _ in range(doublings):
-        # f(2 x) = (g^2 + 2 f)/4, hence f'(2 x) = (g g' + f')/4. All double equally often: the loop has no branch.
-        for k in range(count):
-            x_re, x_im = re * gaps[k], im * gaps[k]
-            f_re, f_im, slope_re, slope_im = singles_re[k], singles_im[k], doubles_re[k], doubles_im[k]
-            g_re, g_im = 1.0 + x_re * f_re - x_im * f_im, x_re * f_im + x_im * f_re
-            g_slope_re = f_re + x_re * slope_re - x_im * slope_im
-            g_slope_im = f_im + x_re * slope_im + x_im * slope_re
-            singles_re[k] = 0.25 * (g_re * g_re - g_im * g_im) + 0.5 * f_re
-            singles_im[k] = 0.5 * (g_re * g_im + f_im)
-            doubles_re[k] = 0.25 * (g_re * g_slope_re - g_im * g_slope_im + slope_re)
-            doubles_im[k] = 0.25 * (g_re * g_slope_im + g_im * g_slope_re + slope_im)
-        re, im = 2.0 * re, 2.0 * im
-    for k in range(count):
-        gap, value, change = gaps[k], values[k], changes[k]
-        x_re, x_im = pole.real * gap, pole.imag * gap
-        f_re, f_im, slope_re, slope_im = singles_re[k], singles_im[k], doubles_re[k], doubles_im[k]
-        g_re, g_im = 1.0 + x_re * f_re - x_im * f_im, x_re * f_im + x_im * f_re
-        decays_re[k], decays_im[k] = 1.0 + x_re * g_re - x_im * g_im, x_re * g_im + x_im * g_re
-        singles_re[k] = gap * (g_re * value + f_re * change)
-        singles_im[k] = gap * (g_im * value + f_im * change)
-        g_slope_re = f_re + x_re * slope_re - x_im * slope_im
-        g_slope_im = f_im + x_re * slope_im + x_im * slope_re
-        doubles_re[k] = gap * gap * (g_slope_re * value + slope_re * change)
-        doubles_im[k] = gap * gap * (g_slope_im * value + slope_im * change)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _held(tu: Array, u: Array, foh: bool, at: int) -> tuple[float, float, float]:
-    """Length of the step from a break, the input at its start, and the change over it."""
-    if at + 1 == tu.size:
-        return 0.0, u[at], 0.0
-    return tu[at + 1] - tu[at], u[at], u[at + 1] - u[at] if foh else 0.0
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def irregular_pass(
-    poles: ComplexArray,
-    owner: IntArray,
-    residues: ComplexArray,
-    direct: Array,
-    states: ComplexArray,
-    clock: tuple[Array, float, float],
-    instruments: tuple[Array, Array, bool],
-    output: tuple[Array, bool],
-    use: BoolArray,
-    layout: tuple[int, int, int],
-    gram: Array,
-    rows: Array,
-    simulated: Array,
-) -> None:
-    """Pass over any clock, as `regular_pass`, without a second input.
-
-    ``clock`` is the instants of the samples, the delay, and the time by which a break may be late and still count as
-    reached; ``instruments`` are the breaks, the values there, and whether straight lines join them.
-    """
-    t, delay, slack = clock
-    tu, u, foh = instruments
-    y, y_foh = output
-    w_row, v_row, e_row = layout
-    first = np.zeros(poles.size + 1, np.int64)
-    for i in range(poles.size):
-        first[i + 1] = first[i] + (2 if poles[i].imag != 0.0 else 1)
-    submodels = direct.size
-    block = np.zeros((max(rows.shape[1], gram.shape[1], v_row + 2), BLOCK))
-    outputs, before = np.zeros((submodels, BLOCK)), np.zeros(submodels)
-    # The steps from break to break, from the last break to a delayed sample, and from sample to sample.
-    breaks, late, steps = np.zeros((PARTS, BLOCK)), np.zeros((PARTS, BLOCK)), np.zeros((PARTS, BLOCK))
-    passed = np.zeros(BLOCK, np.int64)
-    at_breaks = np.zeros((4, BLOCK + 1))
-    unread = np.empty(BLOCK)
-    start, last, written = 0, -1, 0
-    while start < t.size:
-        # A block ends when either fills it: where the input has far more breaks than the output samples, some blocks
-        # hold no sample. Before the first break the states are zero, and stay so: a step of length zero that nothing
-        # drives.
-        count, reached, longest = min(BLOCK, t.size - start), 0, 0.0
-        gap, value, change = 0.0, 0.0, 0.0
-        if last >= 0:
-            gap, value, change = _held(tu, u, foh, last)
-        for k in range(count):
-            instant = t[start + k] - delay
-            full = False
-            while last + 1 < tu.size and tu[last + 1] <= instant + slack:
-                if reached == BLOCK:
-                    full = True
-                    break
-                breaks[GAP, reached], breaks[VALUE, reached], breaks[CHANGE, reached] = gap, value, change
-                longest = max(longest, gap)
-                reached, last = reached + 1, last + 1
-                gap, value, change = _held(tu, u, foh, last)
-            if full:
-                count = k
-                break
-            # Read out on the way to the next break; the states stay at this one.
-            step = max(0.0, instant - tu[last]) if last >= 0 else 0.0
-            passed[k] = reached
-            late[GAP, k], late[VALUE, k] = step, value
-            late[CHANGE, k] = change * (step / gap) if change != 0.0 else 0.0
-            block[v_row, k] = late[VALUE, k] + late[CHANGE, k]
-            steps[GAP, k] = t[start + k] - t[max(start + k - 1, 0)]
-            longest = max(longest, step, steps[GAP, k])
-        for i in range(submodels):
-            for k in range(count):
-                outputs[i, k] = direct[i] * block[v_row, k]
-        for i in range(poles.size):
-            pole, row = poles[i], first[i]
-            paired = pole.imag != 0.0
-            # The states at the breaks.
-            _held_steps(pole, longest, reached, breaks)
-            z_re, z_im, w_re, w_im = states[i, 0].real, states[i, 0].imag, states[i, 1].real, states[i, 1].imag
-            for k in range(reached):
-                at_breaks[0, k], at_breaks[1, k], at_breaks[2, k], at_breaks[3, k] = z_re, z_im, w_re, w_im
-                d_re, d_im, gap = breaks[DECAY_RE, k], breaks[DECAY_IM, k], breaks[GAP, k]
-                # w+ = d (w + gap z) + …, from z before its step.
-                driven_re, driven_im = w_re + gap * z_re, w_im + gap * z_im
-                w_re = d_re * driven_re + (breaks[DOUBLE_RE, k] - d_im * driven_im)
-                w_im = d_re * driven_im + (breaks[DOUBLE_IM, k] + d_im * driven_re)
-                new_re = d_re * z_re + (breaks[SINGLE_RE, k] - d_im * z_im)
-                z_im = d_re * z_im + (breaks[SINGLE_IM, k] + d_im * z_re)
-                z_re = new_re
-            at_breaks[0, reached], at_breaks[1, reached] = z_re, z_im
-            at_breaks[2, reached], at_breaks[3, reached] = w_re, w_im
-            states[i, 0], states[i, 1] = complex(z_re, z_im), complex(w_re, w_im)
-            # And at the samples.
-            _held_steps(pole, longest, count, late)
-            row_re, row_im = block[row], block[row + 1] if paired else unread
-            square_re, square_im = unread, unread
-            if w_row > 0:
-                square_re = block[w_row + row]
-                square_im = block[w_row + row + 1] if paired else unread
-            for k in range(count):
-                at, gap, d_re, d_im = passed[k], late[GAP, k], late[DECAY_RE, k], late[DECAY_IM, k]
-                z_re, z_im = at_breaks[0, at], at_breaks[1, at]
-                driven_re, driven_im = at_breaks[2, at] + gap * z_re, at_breaks[3, at] + gap * z_im
-                square_re[k] = late[DOUBLE_RE, k] + d_re * driven_re - d_im * driven_im
-                square_im[k] = late[DOUBLE_IM, k] + d_re * driven_im + d_im * driven_re
-                row_re[k] = late[SINGLE_RE, k] + d_re * z_re - d_im * z_im
-                row_im[k] = late[SINGLE_IM, k] + d_re * z_im + d_im * z_re
-            re, im, double, own = residues[i, 0].real, residues[i, 0].imag, residues[i, 1].real, outputs[owner[i]]
-            if not paired:
-                im = 0.0
-            for k in range(count):
-                own[k] += re * row_re[k] - im * row_im[k]
-            if double != 0.0:
-                for k in range(count):
-                    own[k] += double * square_re[k]
-        _error_row(outputs, y, start, count, block[v_row + 1], simulated)
-        if e_row > 0:
-            for i in range(submodels):
-                for k in range(count):
-                    outputs[i, k] += block[v_row + 1, k]
-            for i in range(poles.size):
-                pole, left, row = poles[i], outputs[owner[i]], e_row + first[i]
+                paired, left, own = poles[i].imag != 0.0, outputs[owner[i]], block[e_row + first[i] :]
                 for k in range(count):
                     earlier = left[k - 1] if k > 0 else before[owner[i]]
-                    if start + k == 0:
-                        earlier = left[0]
-                    steps[VALUE, k], steps[CHANGE, k] = earlier, left[k] - earlier if y_foh else 0.0
-                _held_steps(pole, longest, count, steps)
-                row_re, row_im = block[row], block[row + 1] if pole.imag != 0.0 else unread
-                e_re, e_im = states[i, 2].real, states[i, 2].imag
-                for k in range(count):
-                    d_re, d_im = steps[DECAY_RE, k], steps[DECAY_IM, k]
-                    new_re = d_re * e_re + (steps[SINGLE_RE, k] - d_im * e_im)
-                    e_im = d_re * e_im + (steps[SINGLE_IM, k] + d_im * e_re)
-                    e_re = new_re
-                    row_re[k], row_im[k] = e_re, e_im
-                states[i, 2] = complex(e_re, e_im)
+                    samples[VALUE, k], samples[CHANGE, k] = earlier, left[k] - earlier if y_foh else 0.0
+                _weigh(poles[i], False, grid, instants, longest, count, samples)
+                if start == 0 and count > 0:
+                    # No step leads to the very first sample.
+                    samples[DECAY_RE, 0], samples[DECAY_IM, 0] = 1.0, 0.0
+                    samples[SINGLE_RE, 0], samples[SINGLE_IM, 0] = 0.0, 0.0
+                _advance(samples, count, states[i, 2:], own, 0, paired, 0)
             for i in range(submodels):
                 if count > 0:
                     before[i] = outputs[i, count - 1]
         if gram.size or rows.size:
             written = _emit(block, count, use, start, gram, rows, written)
         start += count
+    # Only the upper part was summed.
     for i in range(gram.shape[0]):
         for j in range(i):
             gram[i, j] = gram[j, i]
@@ -943,95 +727,62 @@ def irregular_states(
 # --- loops ----------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def loop_signals(
     plant: tuple[Array, Array, Array, float, int],
     law: tuple[Array, Array, Array, float],
+    relay: tuple[float, float, float],
     r: Array,
     v: Array,
     before: float,
 ) -> tuple[Array, Array]:
     """Input and noise-free output of a sampled plant ``F, g, c, direct, shift`` in a loop with ``A, B, C, D``.
 
-    ``before`` is the share of r that the controller sees, 1 or 0.
+    The output of a relay of some amplitude, hysteresis and bias is added to that of the law; its amplitude is 0 where
+    there is none. ``before`` is the share of r that the controller sees, 1 or 0.
     """
     F, g, c, direct, shift = plant
     A, B, C, D = law
+    amplitude, hysteresis, bias = relay
     n, m = g.size, B.size
+    # Where plant and law both act at once the input acts on the output that it is made from: solve for it.
+    own = direct if shift == 0 else 0.0
+    closing = 1.0 / (1.0 + D * own)
     u, x = np.empty(r.size), np.empty(r.size)
     z, z_next = np.zeros(n), np.zeros(n)
     s, s_next = np.zeros(m), np.zeros(m)
+    side, free, held = 1.0, 0.0, 0.0
     for k in range(r.size):
-        # x without the input that arrives now, and what the controller's state and the reference put out.
-        free = 0.0
-        for i in range(n):
-            free += c[i] * z[i]
-        error = before * r[k] - v[k]
-        held = (1.0 - before) * r[k]
-        for i in range(m):
-            held += C[i] * s[i]
-        if shift == 0:
-            # The input acts on the output that it is made from: solve for it.
-            arriving = (held + D * (error - free)) / (1.0 + D * direct)
-            x[k] = free + direct * arriving
-            u[k] = arriving
-        else:
-            arriving = u[k - shift] if k >= shift else 0.0
-            x[k] = free + direct * arriving
-            u[k] = held + D * (error - x[k])
-        # Both step on with what they have seen at this sample.
-        error -= x[k]
-        for i in range(n):
-            total = g[i] * arriving
-            for j in range(n):
-                total += F[i, j] * z[j]
-            z_next[i] = total
-        for i in range(m):
-            total = B[i] * error
-            for j in range(m):
-                total += A[i, j] * s[j]
-            s_next[i] = total
-        z, z_next = z_next, z
-        s, s_next = s_next, s
-    return u, x
-
-
-@njit(cache=True, nogil=True)
-def relay_signals(
-    plant: tuple[Array, Array, Array, float, int],
-    r: Array,
-    v: Array,
-    before: float,
-    amplitude: float,
-    hysteresis: float,
-    bias: float,
-) -> tuple[Array, Array]:
-    """Input and noise-free output of a sampled plant in a loop with a relay; ``before`` as in `loop_signals`."""
-    F, g, c, direct, shift = plant
-    n = g.size
-    u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(n), np.zeros(n)
-    side = 1.0
-    for k in range(r.size):
-        # Without a delay nothing of the present input is in the output yet, and `direct` is zero.
+        # x as far as earlier inputs make it.
         arriving = u[k - shift] if 0 < shift <= k else 0.0
-        x[k] = direct * arriving
-        for i in range(n):
-            x[k] += c[i] * z[i]
-        error = before * r[k] - x[k] - v[k]
+        output = free + direct * arriving
+        error = before * r[k] - v[k] - output
         # Within the hysteresis the relay stays as it is.
         if error > hysteresis:
             side = 1.0
         elif error < -hysteresis:
             side = -1.0
-        u[k] = (1.0 - before) * r[k] + bias + amplitude * side
+        value = (held + (1.0 - before) * r[k] + bias + amplitude * side + D * error) * closing
         if shift == 0:
-            arriving = u[k]
+            arriving = value
+        u[k], x[k] = value, output + own * value
+        # Both step on with what they have seen at this sample, to what they put out at the next one.
+        error -= own * value
+        free, held = 0.0, 0.0
         for i in range(n):
-            z_next[i] = g[i] * arriving
+            total = g[i] * arriving
             for j in range(n):
-                z_next[i] += F[i, j] * z[j]
+                total += F[i, j] * z[j]
+            z_next[i] = total
+            free += c[i] * total
+        for i in range(m):
+            total = B[i] * error
+            for j in range(m):
+                total += A[i, j] * s[j]
+            s_next[i] = total
+            held += C[i] * total
         z, z_next = z_next, z
+        s, s_next = s_next, s
     return u, x
 
 
@@ -1048,7 +799,7 @@ def loop_input(
 ) -> Array:
     """Input of the noise-free loop of a model in modal form with a discrete controller, from rest, shape (N,).
 
-    The model and its clock are those of `regular_pass`. The controller has polynomials of one length in descending
+    The model and its clock are those of `filter_pass`. The controller has polynomials of one length in descending
     powers of q; the reference enters before or behind it.
     """
     interval, shift, fraction = clock

@@ -23,6 +23,8 @@ from ctid_cli.signals.record import Controller, Enters
 
 #: Below this fraction of its terms, 1 + (direct gain round the loop) is rounding.
 NO_GAIN = 1e-12
+#: No controller beside a relay, and no relay beside a controller.
+NOTHING, NO_RELAY = DiscreteController([0.0], [1.0]), (0.0, 0.0, 0.0)
 
 
 class LoopSignals(NamedTuple):
@@ -36,7 +38,7 @@ class LoopSignals(NamedTuple):
 
 def simulate_loop(
     model: AdditiveModel | TransferFunction,
-    controller: Controller,
+    controller: Controller | Relay,
     reference: ArrayLike,
     noise: ArrayLike,
     interval: float,
@@ -48,7 +50,7 @@ def simulate_loop(
     ----------
     model : AdditiveModel or TransferFunction
         The plant; any proper model, any delay.
-    controller : Controller
+    controller : Controller or Relay
         What makes the input from reference and output.
     reference : array_like, shape (N,)
         r at the sampling instants [output unit; input unit if it enters behind the controller].
@@ -67,8 +69,8 @@ def simulate_loop(
     Raises
     ------
     DataError
-        If the loop has no solution (direct gains of -1 round the loop), the signals outgrow the range of numbers, or
-        reference and noise do not match.
+        If the loop has no solution (direct gains of -1 round the loop), a relay meets a model that acts at once, the
+        signals outgrow the range of numbers, or reference and noise do not match.
     ValueError
         If the interval is not positive or it is not said where the reference enters.
 
@@ -88,17 +90,30 @@ def simulate_loop(
             f"reference and noise of a loop must be lists of equal length; got shapes {r.shape} and {v.shape}"
         )
     plant = sampled_model(model, interval)
-    discrete = _realised(controller)
-    _require_solvable(plant, discrete)
-    A, B, C, D = discrete.state_space()
-    law = plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
-    u, x = kernels.loop_signals((*plant,), law, r, v, float(enters == "controller"))
+    if isinstance(controller, Relay):
+        if plant.shift == 0 and plant.direct != 0.0:
+            text = "a relay needs a model that does not act at once: give it a delay, or fewer zeros than poles"
+            raise DataError(text)
+        law, relay = law_of(NOTHING), (controller.amplitude, controller.hysteresis, controller.bias)
+    else:
+        discrete = _realised(controller)
+        _require_solvable(plant, discrete)
+        law, relay = law_of(discrete), NO_RELAY
+    u, x = kernels.loop_signals((*plant,), law, relay, r, v, float(enters == "controller"))
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
+        if isinstance(controller, Relay):
+            raise DataError("the signals of the loop with the relay are not finite; check the system and the reference")
         raise DataError(
             "the signals of the closed loop are not finite; check reference, noise and stability: its largest pole has "
             f"the magnitude {loop_radius(model, controller, interval):.6g}"
         )
     return LoopSignals(u, x)
+
+
+def law_of(controller: DiscreteController) -> tuple[Array, Array, Array, float]:
+    """Return a controller as the kernel takes it."""
+    A, B, C, D = controller.state_space()
+    return plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
 
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
@@ -133,22 +148,3 @@ def _require_solvable(plant: SampledModel, controller: DiscreteController) -> No
             "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
             "the gain of the controller, or give the model a delay or fewer zeros"
         )
-
-
-def simulate_relay(
-    model: AdditiveModel | TransferFunction,
-    relay: Relay,
-    reference: Array,
-    noise: Array,
-    interval: float,
-    enters: Enters = "controller",
-) -> LoopSignals:
-    """Input and noise-free output of a loop with a relay that is at rest before the first sample."""
-    plant = sampled_model(model, interval)
-    if plant.shift == 0 and plant.direct != 0.0:
-        raise DataError("a relay needs a model that does not act at once: give it a delay, or fewer zeros than poles")
-    before = float(enters == "controller")
-    u, x = kernels.relay_signals((*plant,), reference, noise, before, relay.amplitude, relay.hysteresis, relay.bias)
-    if not np.isfinite(x).all():
-        raise DataError("the signals of the loop with the relay are not finite; check the system and the reference")
-    return LoopSignals(u, x)

@@ -6,6 +6,7 @@ and because a slow section only ever integrates what a faster one has settled, n
 of the poles. Everything runs in the polynomial's own time unit ``1/w0``, ``w0 = |a_n|^(1/n)``.
 """
 
+from math import copysign, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -36,12 +37,24 @@ def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
 
 
 def polynomial_roots(coefficients: Array) -> ComplexArray:
-    """Return the roots of a monic real polynomial, fastest first and conjugates side by side."""
-    roots: ComplexArray = kernels.simple_roots(coefficients)
-    if roots.size < coefficients.size - 1:
-        # Roots close to each other are left to the eigenvalues, whose errors compensate one another.
-        raw = np.linalg.eigvals(np.vstack((-coefficients[1:], np.eye(coefficients.size - 2, coefficients.size - 1))))
-        roots = kernels.polished_roots(coefficients, raw.astype(np.complex128))
+    """Return the roots of a monic real polynomial, those of a pair side by side with the upper one first."""
+    n = coefficients.size - 1
+    if n == 1:
+        return np.array([complex(-coefficients[1])])
+    if n == 2:
+        half = -0.5 * float(coefficients[1])
+        discriminant = half * half - float(coefficients[2])
+        if discriminant < 0.0:
+            root = complex(half, sqrt(-discriminant))
+            return np.array([root, root.conjugate()])
+        # The larger root has no cancellation, and the product of both is the last coefficient.
+        large = half + copysign(sqrt(discriminant), half)
+        return np.array([large, float(coefficients[2]) / large if large else 0.0], dtype=np.complex128)
+    companion = np.zeros((n, n))
+    companion.flat[n :: n + 1] = 1.0
+    companion[:1] = -coefficients[1:]
+    roots = np.linalg.eigvals(companion).astype(np.complex128)
+    kernels.polish_roots(coefficients, roots)
     return roots
 
 
@@ -54,55 +67,30 @@ class Chain(NamedTuple):
 
 
 def chain(roots: ComplexArray) -> Chain:
-    """Return the chain of unit-gain sections with given poles."""
-    n = roots.size
+    """Return the chain of unit-gain sections with given poles, whose pairs stand side by side; the fastest first."""
+    roots, n = roots[np.argsort(-np.abs(roots), kind="stable")], roots.size
     dynamics, gain = np.zeros((n, n)), np.zeros(n)
-    # Static gain of the chain up to and including the section in which a state lies.
-    cumulative, product = np.ones(n), 1.0
-    sections: list[tuple[int, int]] = []
-    i = 0
+    i, last, static = 0, -1, 1.0
     while i < n:
         # A pair w^2/(s^2 + 2 d s + w^2): z1' = w z2, z2' = w v - w z1 - 2 d z2. A real pole r/(s + r): z' = r v - r z.
         # An integrator has no static gain to bring to 1: its rate is 1.
+        rate = float(abs(roots[i])) or 1.0
+        entry = i
         if roots[i].imag != 0.0:
-            rate = float(abs(roots[i]))
-            dynamics[i, i + 1], dynamics[i + 1, i], dynamics[i + 1, i + 1] = rate, -rate, 2.0 * roots[i].real
-            entry, size, product = i + 1, 2, product * rate * rate
+            entry, static = i + 1, static * rate
+            dynamics[i, entry], dynamics[entry, i], dynamics[entry, entry] = rate, -rate, 2.0 * roots[i].real
         else:
-            rate = float(abs(roots[i])) or 1.0
             dynamics[i, i] = roots[i].real
-            entry, size, product = i, 1, product * rate
-        if sections:
-            dynamics[entry, sections[-1][0]] = rate
-        else:
+        if last < 0:
             gain[entry] = rate
-        cumulative[i : i + size] = product
-        sections.append((i, size))
-        i += size
-    powers = np.array([_read_off(np.eye(n)[n - 1 - k], roots, sections, cumulative) for k in range(n)])
-    return Chain(dynamics, gain, powers.reshape(n, n))
-
-
-def _read_off(polynomial: Array, roots: ComplexArray, sections: list[tuple[int, int]], cumulative: Array) -> Array:
-    """Return what reads ``polynomial/A`` off the states: divide by the slowest section, keep the remainder, go on."""
-    quotient, reading = polynomial.tolist(), np.zeros(roots.size)
-    for i, size in reversed(sections):
-        # Q = q (s^2 + s1 s + s0) + remainder: q goes on to the faster sections, and the remainder is read off this one,
-        # whose states are 1/(s^2 + s1 s + s0) and s/(s^2 + s1 s + s0) of what it receives, up to their gains.
-        pole = complex(roots[i])
-        if size == 2:
-            s1, s0 = -2.0 * pole.real, pole.real**2 + pole.imag**2
-            for k in range(len(quotient) - 2):
-                quotient[k + 1] -= s1 * quotient[k]
-                quotient[k + 2] -= s0 * quotient[k]
-            reading[i] = quotient.pop() / cumulative[i]
-            if quotient:
-                reading[i + 1] = quotient.pop() * np.sqrt(s0) / cumulative[i]
         else:
-            for k in range(len(quotient) - 1):
-                quotient[k + 1] += pole.real * quotient[k]
-            reading[i] = quotient.pop() / cumulative[i]
-    return reading
+            dynamics[entry, last] = rate
+        i, last, static = entry + 1, i, static * rate
+    # The last section puts out 1/A v, up to the static gain, and the derivative of p^k/A v is p^(k+1)/A v.
+    powers = np.zeros((n, n))
+    for k in range(n):
+        powers[k] = powers[k - 1] @ dynamics if k > 0 else np.eye(n)[last] / static
+    return Chain(dynamics, gain, powers)
 
 
 class HeldStep(NamedTuple):

@@ -7,9 +7,16 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, chain_states, modal_form, modal_output
+from ctid_cli.filtering.bank import (
+    MODAL_CONDITION_LIMIT,
+    Chains,
+    chain_form,
+    chain_states,
+    modal_form,
+    modal_output,
+)
 from ctid_cli.filtering.filter_data import FilterData, clock_slack, plain_array, split_delay
-from ctid_cli.filtering.realisation import chain, held_step, scaled_roots
+from ctid_cli.filtering.realisation import held_step
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.band_limited import FINER
@@ -101,11 +108,8 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
     modal = modal_form(a, b)
     if modal.condition < MODAL_CONDITION_LIMIT:
         return modal_output(data, modal.modes, delay)
-    w0, roots = scaled_roots(a)
-    dynamics, gain, powers = chain(roots)
-    n = gain.size
-    reading = (b / w0 ** np.arange(1.0, n + 1))[::-1] @ powers
-    return np.asarray(chain_states(dynamics, gain, w0, data, delay)[:, :n] @ reading)
+    form = chain_form(a, b)
+    return np.asarray(chain_states(form.dynamics, form.gain, form.w0, data, delay)[:, :-1] @ form.output)
 
 
 class SampledModel(NamedTuple):
@@ -142,32 +146,26 @@ def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> S
     """
     require_positive("the sampling interval", interval, "s")
     parts = [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
-    shift, fraction = split_delay(model.delay, interval)
-    n = sum(part.order for part in parts)
-    transition, from_input, output, direct = np.zeros((n, n)), np.zeros(n), np.zeros(n), 0.0
-    first = 0
-    for part in parts:
-        place = slice(first, first + part.order)
-        transition[place, place], from_input[place], output[place], at_once = _part(part, interval, fraction)
-        direct += at_once
-        first += part.order
-    return SampledModel(transition, from_input, output, direct, shift)
+    split = [feedthrough(part) for part in parts]
+    forms = [
+        chain_form(plain_array(part.denominator), plain_array(rest))
+        for part, (_, rest) in zip(parts, split, strict=True)
+    ]
+    return sampled_chains(Chains(tuple(forms), np.array([direct for direct, _ in split])), interval, model.delay)
 
 
-def _part(part: TransferFunction, interval: float, fraction: float) -> tuple[Array, Array, Array, float]:
-    """One-interval map of an undelayed transfer function, read out a fraction of the interval after each sample."""
-    n = part.order
-    direct, strictly_proper = feedthrough(part)
-    if not n:
-        return np.zeros((0, 0)), np.zeros(0), np.zeros(0), direct
-    w0, roots = scaled_roots(plain_array(part.denominator))
-    dynamics, gain, powers = chain(roots)
-    output = (strictly_proper / w0 ** np.arange(1, n + 1))[::-1] @ powers
-    transition, from_input, _ = held_step(dynamics, gain, interval * w0)
-    if fraction:
-        part_way, from_held, _ = held_step(dynamics, gain, fraction * interval * w0)
-        output, direct = output @ part_way, float(output @ from_held) + direct
-    return transition, from_input, output, direct
+def sampled_chains(chains: Chains, interval: float, delay: float) -> SampledModel:
+    """Return the equivalent of chains."""
+    shift, fraction = split_delay(delay, interval)
+    size, first, at_once = sum(form.width for form in chains.forms), 0, float(chains.direct.sum())
+    transition, from_input, output = np.zeros((size, size)), np.zeros(size), np.zeros(size)
+    for form in chains.forms:
+        place = slice(first, first + form.width)
+        transition[place, place], from_input[place], _ = held_step(form.dynamics, form.gain, interval * form.w0)
+        part_way, from_held, _ = held_step(form.dynamics, form.gain, fraction * interval * form.w0)
+        output[place], at_once = form.output @ part_way, at_once + float(form.output @ from_held)
+        first += form.width
+    return SampledModel(transition, from_input, output, at_once, shift)
 
 
 def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:

@@ -19,23 +19,26 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.errors import DataError
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import (
     MODAL_CONDITION_LIMIT,
     MOST_MODAL_INTEGRATORS,
+    ChainForm,
+    Chains,
     Equations,
+    Form,
     ModalForm,
     Modes,
-    double_chain,
+    chain_form,
+    chain_pass,
     modal_form,
     modal_pass,
-    standard_rows,
     to_steady_state,
 )
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
-from ctid_cli.filtering.loop import simulate_loop
-from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.filtering.loop import NO_RELAY, law_of
+from ctid_cli.filtering.simulate import sampled_chains
+from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import DiscreteController
 
 #: State of the filters at the first sample.
@@ -87,16 +90,15 @@ class Part:
         return cls(term, highest, a, rest if rest.size else np.zeros(1), direct)
 
     def modal(self) -> ModalForm | None:
-        """Return the partial fractions; None where they amplify rounding, or a pole is lost."""
-        if not self.term.order:
-            # A pure gain has no modes; of the standard rows it has the input and the output error.
-            mapping = np.zeros((3, 2))
-            mapping[0, 0] = mapping[1, 1] = 1.0
-            return ModalForm(1.0, np.zeros(0, complex), np.zeros((0, 2), complex), mapping)
+        """Return the partial fractions; None where they amplify rounding."""
         if self.term.integrators > MOST_MODAL_INTEGRATORS:
             return None
         form = modal_form(plain_array(self.a), plain_array(self.b), self.term.integrators)
         return form if form.condition < MODAL_CONDITION_LIMIT else None
+
+    def chain(self) -> ChainForm:
+        """Return the chain, which repeated poles have too."""
+        return chain_form(plain_array(self.a), plain_array(self.b), self.term.integrators)
 
     def output(self, driven: Array, u: Array) -> Array:
         """Return the output from ``p^k/(p^l A) u``, columns, and u."""
@@ -124,9 +126,8 @@ class Part:
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
-    All submodels are filtered in one compiled pass of their pooled modes. Submodels with (nearly) repeated poles go
-    through :func:`ctid_cli.filtering.bank.standard_rows` submodel by submodel,
-    several times slower.
+    All submodels are filtered in one compiled pass of their pooled modes. Where one has (nearly) repeated poles all go
+    through chains, several times slower.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class SubmodelFilter:
         self.periodic = initial_state == "periodic"
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
         self.size = sum(term.size for term in terms)
-        self._everywhere = np.ones(data.y.size, dtype=bool)
+        self._controller = DiscreteController(loop.numerator, loop.denominator)
         if self.periodic and data.interval == 0.0:
             raise ValueError("initial_state periodic needs input and output on one regular clock")
 
@@ -159,16 +160,18 @@ class SubmodelFilter:
         return moments if finite else None
 
     def _moments(self, theta: Array) -> Equations | None:
-        pooled = None if self.free else self._pooled(theta)
-        if pooled is None:
+        if self.free:
             rows = self.rows(theta)
             if rows is None:
                 return None
             psi, phi, error, output = rows
             return Equations(psi.T @ phi, psi.T @ error, psi.T @ psi, float(error @ error), float(output @ output))
+        pooled = self._pooled(theta)
+        if pooled is None:
+            return None
         psi, phi, output = pooled.psi, pooled.phi, pooled.output
         # psi and the model output are made of the rows up to that of the error.
-        leading = 2 * pooled.modes.width + 2
+        leading = 2 * pooled.width + 2
         gram = self._pass(self.data, pooled, rows=False, leading=leading)
         products = psi[:leading].T @ gram
         power = output[:leading] @ gram @ output
@@ -176,58 +179,63 @@ class SubmodelFilter:
         error = products[:, leading - 1].copy()
         return Equations(products @ phi, error, products @ psi, squared, float(power))
 
-    def rows(self, theta: Array) -> tuple[Array, Array, Array, Array] | None:
+    def rows(self, theta: Array, form: Form = "auto") -> tuple[Array, Array, Array, Array] | None:
         """Return instruments, regressors, output error and model output at the used samples."""
-        if not self.free:
-            return self._rows(self.data, theta)
-        data = self.data
-        parameters, initial = theta[: self.size], theta[self.size :]
-        response = free_response(parameters, initial, self.terms, data.t - data.t[0])
-        if response is None:
-            return None
-        x, by_theta, by_free = response
-        forced = self._rows(data._replace(y=plain_array(data.y - x)), parameters)
-        if forced is None:
-            return None
-        psi, phi, error, output = forced
-        by_theta, by_free = by_theta[data.use], by_free[data.use]
-        return (
-            np.column_stack((psi + by_theta, by_free)),
-            np.column_stack((phi + by_theta, by_free)),
-            error,
-            output + x[data.use],
-        )
-
-    def _rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """Return the rows without a free response."""
-        pooled = self._pooled(theta)
-        if pooled is None:
-            return self._general_rows(data, theta)
-        rows = self._pass(data, pooled, rows=True, leading=None)
-        return rows @ pooled.psi, rows @ pooled.phi, rows[:, 2 * pooled.modes.width + 1].copy(), rows @ pooled.output
-
-    def _pooled(self, theta: Array) -> "Pooled | None":
-        """Return the partial fractions of all submodels; None where one has none."""
-        parts, forms = [], []
-        for part in _parts(theta, self.terms):
-            form = part.modal() if part is not None else None
-            if part is None or form is None:
+        data, parameters = self.data, theta[: self.size]
+        pooled = self._pooled(parameters, form)
+        response = None
+        if self.free:
+            response = free_response(parameters, theta[self.size :], self.terms, data.t - data.t[0])
+            if response is None:
                 return None
-            parts.append(part)
-            forms.append(form)
-        return pooled_modes(parts, forms, self.loop.closed)
+            data = data._replace(y=plain_array(data.y - response[0]))
+        if pooled is None:
+            return None
+        rows = self._pass(data, pooled, rows=True, leading=None)
+        psi, phi, output = rows @ pooled.psi, rows @ pooled.phi, rows @ pooled.output
+        error = rows[:, 2 * pooled.width + 1].copy()
+        if response is None:
+            return psi, phi, error, output
+        x, by_theta, by_free = (part[data.use] for part in response)
+        return np.column_stack((psi + by_theta, by_free)), np.column_stack((phi + by_theta, by_free)), error, output + x
+
+    def _pooled(self, theta: Array, form: Form = "auto") -> "Pooled | None":
+        """Return all submodels for one pass; None where there is none."""
+        parts = _parts(theta, self.terms) if np.isfinite(theta).all() else None
+        if parts is None:
+            return None
+        direct = np.array([part.direct for part in parts])
+        forms = [None if form == "chain" else part.modal() for part in parts]
+        modal = [each for each in forms if each is not None]
+        if len(modal) == len(parts):
+            return pooled_forms(parts, modal, pooled_modes(modal, direct), self.loop.closed)
+        if self.periodic:
+            return None
+        chains = Chains(tuple(part.chain() for part in parts), direct)
+        return pooled_forms(parts, chains.forms, chains, self.loop.closed)
 
     def _pass(self, data: FilterData, pooled: "Pooled", *, rows: bool, leading: int | None) -> Array:
         """Return the rows of the pass, or their moments."""
-        modes, delay = pooled.modes, self.delay
+        model, delay = pooled.model, self.delay
+        instruments = self._loop_input(model) if self.loop.closed else None
+        if isinstance(model, Chains):
+            found = chain_pass(data, model, delay, instruments)
+            return found if rows else found[:, :leading].T @ found
+        states = None
         if self.periodic:
-            data, delay, states = self._in_steady_state(data, modes)
-            return modal_pass(data, modes, delay, rows=rows, leading=leading, states=states)
-        if not self.loop.closed:
-            return modal_pass(data, modes, delay, rows=rows, leading=leading)
-        clock = (data.interval, *split_delay(delay, data.interval))
-        v = kernels.loop_input(modes.poles, modes.residues, float(modes.direct.sum()), clock, *self.loop)
-        return modal_pass(data, modes, delay, rows=rows, leading=leading, instruments=v)
+            data, delay, states = self._in_steady_state(data, model)
+        return modal_pass(data, model, delay, rows=rows, leading=leading, states=states, instruments=instruments)
+
+    def _loop_input(self, model: Modes | Chains) -> Array:
+        """Return the input of the noise-free loop of a model."""
+        interval, reference = self.data.interval, self.loop.reference
+        if isinstance(model, Modes):
+            clock = (interval, *split_delay(self.delay, interval))
+            direct = float(model.direct.sum())
+            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop))
+        plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
+        signals = reference, np.zeros(reference.size), float(self.loop.at_controller)
+        return np.asarray(kernels.loop_signals((*plant,), law, NO_RELAY, *signals)[0])
 
     def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
         """Return the record with its input late by whole intervals, the delay left, and states that come back."""
@@ -250,84 +258,50 @@ class SubmodelFilter:
         initial[:, 2] = states[:, 2] / -np.expm1(modes.poles * period)
         return data, delay, initial
 
-    def _general_rows(self, data: FilterData, theta: Array) -> tuple[Array, Array, Array, Array] | None:
-        """Return psi, phi, eps and the model output driven by z, submodel by submodel; any clock, repeated poles."""
-        if self.periodic or not np.isfinite(theta).all():
-            return None
-        try:
-            source = data._replace(u=self._loop_input(data, theta)) if self.loop.closed else data
-        except (DataError, np.linalg.LinAlgError, ZeroDivisionError):
-            # Coefficients that make no model, or a loop whose signals overflow.
-            return None
-        parts = [part for part in _parts(theta, self.terms) if part is not None]
-        if len(parts) < len(self.terms):
-            return None
-        everywhere = data._replace(use=self._everywhere)
-        outputs = []
-        for part in parts:
-            rows, order = self._standard(everywhere, part), part.term.order
-            outputs.append(part.output(rows[:, :order], rows[:, order]))
-        error = data.y - np.sum(outputs, axis=0)
-        psi, phi, total = [], [], np.zeros(data.count)
-        for part, output in zip(parts, outputs, strict=True):
-            left = plain_array(error + output)
-            order, n = part.term.order, part.term.poles
-            driven, measured = (self._standard(each._replace(y=left), part) for each in (source, data))
-            psi.append(part.instruments(driven[:, :order], driven[:, order], driven[:, order + 1 : order + n + 1]))
-            filtered = measured[:, order + n + 1 : order + 2 * n + 1]
-            phi.append(part.regressors(measured[:, :order], measured[:, order], filtered, left[data.use]))
-            total += part.output(driven[:, :order], driven[:, order])
-        return np.hstack(psi), np.hstack(phi), error[data.use], total
 
-    def _standard(self, data: FilterData, part: Part) -> Array:
-        """Return the standard rows of one submodel; of a pure gain the input alone."""
-        if not part.term.order:
-            return standard_rows(data, np.ones(2), np.zeros(1), self.delay, "chain")[:, 1:2]
-        return standard_rows(data, part.a, part.b, self.delay, "chain", part.term.integrators)
-
-    def _loop_input(self, data: FilterData, theta: Array) -> Array:
-        """Return the input of the noise-free loop of a model."""
-        model = AdditiveModel.from_theta(theta, self.terms, self.delay)
-        controller = DiscreteController(self.loop.numerator, self.loop.denominator)
-        enters: Literal["controller", "input"] = "controller" if self.loop.at_controller else "input"
-        nothing = np.zeros(data.y.size)
-        return plain_array(simulate_loop(model, controller, self.loop.reference, nothing, data.interval, enters).u)
-
-
-def _parts(theta: Array, terms: Sequence[Term]) -> list[Part | None]:
-    """Return the submodels of parameters; None for one that has lost a pole."""
-    parts: list[Part | None] = []
+def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
+    """Return the submodels of parameters; None where one has lost a pole."""
+    parts: list[Part] = []
     first = 0
     for term in terms:
         own = theta[first : first + term.size]
-        parts.append(Part.of(own, term) if not term.poles or own[term.poles - 1] != 0.0 else None)
+        if term.poles and own[term.poles - 1] == 0.0:
+            return None
+        parts.append(Part.of(own, term))
         first += term.size
     return parts
 
 
 class Pooled(NamedTuple):
-    """The modes of all submodels, and psi, phi and the model output driven by z as maps of the rows of a pass."""
+    """All submodels in one pass, and psi, phi and the model output driven by z as maps of its rows."""
 
-    modes: Modes
+    model: Modes | Chains
+    #: Number of rows of z.
+    width: int
     #: Shapes (q, p), (q, p) and (q,).
     psi: Array
     phi: Array
     output: Array
 
 
-def pooled_modes(parts: Sequence[Part], forms: Sequence[ModalForm], closed: bool) -> Pooled:
-    """Return the modes of all submodels as those of one pass."""
-    poles = np.concatenate([form.poles for form in forms])
-    owner = np.repeat(np.arange(len(parts)), [form.poles.size for form in forms]).astype(np.int64)
-    residues = np.concatenate([form.residues for form in forms])
-    modes = Modes(poles, owner, residues, np.array([part.direct for part in parts]))
-    n = modes.width
+def pooled_modes(forms: Sequence[ModalForm], direct: Array) -> Modes:
+    """Return the modes of all submodels."""
+    owner = np.repeat(np.arange(len(forms)), [form.poles.size for form in forms]).astype(np.int64)
+    poles, residues = (np.concatenate(parts) for parts in zip(*[form[1:3] for form in forms], strict=True))
+    return Modes(poles, owner, residues, direct)
+
+
+def pooled_forms(
+    parts: Sequence[Part], forms: Sequence[ModalForm | ChainForm], model: Modes | Chains, closed: bool
+) -> Pooled:
+    """Return what is made of the rows of one pass over all submodels."""
+    n = sum(form.width for form in forms)
     v, error, u = 2 * n, 2 * n + 1, 5 * n + 2 if closed else 2 * n
     width = u + 1 if closed else 3 * n + 2
     psi, phi, output = [], [], np.zeros(width)
     first = 0
     for part, form in zip(parts, forms, strict=True):
-        own, order, poles_of = form.modes.width, part.term.order, part.term.poles
+        own, order, poles_of = form.width, part.term.order, part.term.poles
         # Columns of the standard rows from the rows of the pass, driven by z and by the measured input.
         z, w = first + np.arange(own), n + first + np.arange(own)
         places = np.concatenate((z, w, [v, error], 2 * n + 2 + z))
@@ -348,7 +322,7 @@ def pooled_modes(parts: Sequence[Part], forms: Sequence[ModalForm], closed: bool
         )
         output += part.output(driven[:, :order], driven[:, order])
         first += own
-    return Pooled(modes, np.hstack(psi), np.hstack(phi), output)
+    return Pooled(model, n, np.hstack(psi), np.hstack(phi), output)
 
 
 # --- free responses -------------------------------------------------------------------------------------------------
@@ -379,9 +353,10 @@ def free_response(
         own, last = theta[first : first + term.poles], first_free + term.order
         if term.order:
             driving = Term(term.poles, term.order - 1, term.integrators)
-            (part,) = _parts(np.concatenate((own, free[first_free:last])), [driving])
-            if part is None:
+            parts = _parts(np.concatenate((own, free[first_free:last])), [driving])
+            if parts is None:
                 return None
+            (part,) = parts
             driven, behind = _impulse_responses(part, elapsed)
             nothing = np.zeros(elapsed.size)
             derivatives = part.instruments(driven, nothing, behind)
@@ -394,15 +369,16 @@ def free_response(
 
 def _impulse_responses(part: Part, elapsed: Array) -> tuple[Array, Array]:
     """Return ``p^k/(p^l A)`` of an impulse, and ``p^k/A`` of what B/(p^l A) makes of it, columns."""
-    n, order, form = part.term.poles, part.term.order, part.modal()
-    if form is None:
-        both = double_chain(part.a, part.b, part.term.integrators)
-        return both.signals(both.after_impulse(elapsed), part.term.integrators)
-    # z and w of each mode.
-    singles: list[Array] = []
-    for pole in form.poles:
-        response = np.exp(pole * elapsed)
-        singles += [response.real, response.imag] if pole.imag else [response.real]
-    impulse = np.column_stack([*singles, *(elapsed * single for single in singles)])
+    n, order = part.term.poles, part.term.order
+    form = part.modal() or part.chain()
+    if isinstance(form, ChainForm):
+        impulse = form.after_impulse(elapsed)
+    else:
+        # z and w of each mode.
+        singles: list[Array] = []
+        for pole in form.poles:
+            response = np.exp(pole * elapsed)
+            singles += [response.real, response.imag] if pole.imag else [response.real]
+        impulse = np.column_stack([*singles, *(elapsed * single for single in singles)])
     rows = impulse @ form.mapping[:, : impulse.shape[1]].T
     return rows[:, :order], rows[:, order + 1 : order + 1 + n]

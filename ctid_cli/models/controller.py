@@ -75,13 +75,8 @@ class DiscreteController:
         The sampling interval h is part of the gains: those of a continuous-time controller with integral time Ti and
         derivative time Td are ``ki = kp h/Ti`` and ``kd = kp Td/h``.
         """
-        for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)):
-            require_finite(name, gain, "input unit/output unit")
-        summing = np.array([1.0, -1.0]) if ki else np.ones(1)
-        lag = np.array([1.0, 0.0]) if kd else np.ones(1)
-        denominator = np.polymul(summing, lag)
-        integrating, differencing = np.polymul([ki, 0.0], lag), np.polymul([kd, -kd], summing)
-        return cls(np.polyadd(np.polyadd(kp * denominator, integrating), differencing), denominator)
+        # What it is at a sampling interval of 1 s.
+        return ContinuousPid(kp, ki=ki, kd=kd).discrete(1.0)
 
     @property
     def order(self) -> int:

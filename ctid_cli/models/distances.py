@@ -37,32 +37,17 @@ def _product(one: TransferFunction, other: TransferFunction) -> float:
     It begins with the later one: ``c1 exp(A1 d) X c2'`` with ``A1 X + X A2' = -b1 b2'`` and the difference d of the
     delays.
     """
+    from scipy.linalg import companion, expm  # slow to import
+
     if one.delay > other.delay:
         one, other = other, one
-    (A1, b1, c1), (A2, b2, c2) = _realised(one), _realised(other)
-    # Orders are small: the equation as one linear system takes less time than the decompositions of a solver.
-    size = one.order * other.order
-    sylvester = (
-        A1[:, None, :, None] * np.eye(other.order)[:, None, :] + np.eye(one.order)[:, None, :, None] * A2[:, None]
-    )
-    X = np.linalg.solve(sylvester.reshape(size, size), -np.outer(b1, b2).ravel()).reshape(one.order, other.order)
-    apart = other.delay - one.delay
-    return float(c1 @ (_exponential(A1 * apart) @ X if apart else X) @ c2)
-
-
-def _exponential(A: Array) -> Array:
-    from scipy.linalg import expm
-
-    return np.asarray(expm(A))
-
-
-def _realised(model: TransferFunction) -> tuple[Array, Array, Array]:
-    """Controllable canonical form."""
-    n = model.order
-    A = np.eye(n, k=-1)
-    A[0] = -model.denominator[1:]
-    c = np.concatenate([np.zeros(n - model.numerator.size), model.numerator])
-    return A, np.eye(n)[0], c
+    n, m = one.order, other.order
+    A1, A2 = companion(one.denominator), companion(other.denominator)
+    c1, c2 = (np.pad(model.numerator, (model.relative_degree - 1, 0)) for model in (one, other))
+    # Both inputs enter the first state. Orders are small: the equation as one linear system takes less time than the
+    # decompositions of a solver.
+    X = np.linalg.solve(np.kron(A1, np.eye(m)) + np.kron(np.eye(n), A2), -np.eye(n * m, 1)).reshape(n, m)
+    return float(c1 @ expm(A1 * (other.delay - one.delay)) @ X @ c2)
 
 
 def hinf_distance(system: TransferFunction, model: TransferFunction) -> float:

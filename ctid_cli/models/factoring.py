@@ -13,6 +13,7 @@ from itertools import islice
 from typing import TypeVar
 
 import numpy as np
+from numpy.polynomial.polynomial import polyfromroots
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, ComplexArray
@@ -101,9 +102,7 @@ def _slope_at_roots(p: ComplexArray) -> ComplexArray:
 
 def _shifted(polynomial: NDArray[Number], places: int, length: int) -> NDArray[Number]:
     """Coefficients in rising powers times ``p^places``, at a given length."""
-    result = np.zeros(length, dtype=polynomial.dtype)
-    result[places : places + polynomial.size] = polynomial
-    return result
+    return np.pad(polynomial, (places, length - places - polynomial.size))
 
 
 def _joined(submodels: Sequence[Submodel]) -> tuple[Array, Array]:
@@ -207,18 +206,12 @@ def _collected(fractions: _PartialFractions, group: _Group) -> Submodel:
     places, shift = list(group.places), group.integrators
     T, g = -1.0 / fractions.poles[places], fractions.gains[places]
     size = T.size + shift + 1
-
-    def product(left_out: int | None = None) -> ComplexArray:
-        result = np.ones(1, dtype=complex)
-        for k in range(T.size):
-            if k != left_out:
-                result = np.convolve(result, [1.0, T[k]])
-        return result
-
-    # Constant terms first. What multiplies the whole denominator: the powers of 1/s and the direct feedthrough.
-    a, b = product(), np.zeros(size, dtype=complex)
+    # Constant terms first: the product of 1 + T_k s is that of s + T_k with its terms turned round. What multiplies the
+    # whole denominator: the powers of 1/s and the direct feedthrough.
+    a, b = np.asarray(polyfromroots(-T)[::-1], dtype=complex), np.zeros(size, dtype=complex)
     for k in range(T.size):
-        b += g[k] * _shifted(product(k), shift, size)
+        others = np.asarray(polyfromroots(-np.delete(T, k))[::-1], dtype=complex)
+        b += g[k] * _shifted(others, shift, size)
     for k, value in enumerate((*fractions.at_origin[:shift], *fractions.direct[: int(group.direct)])):
         b += value * _shifted(a, k, size)
     length = size if group.direct else size - 1

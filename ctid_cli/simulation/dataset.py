@@ -140,7 +140,7 @@ class SimulatedSource:
         return DataSet(record, true_model=None if isinstance(self.system, OwnSystem) else self.system)
 
     def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
-        from ctid_cli.filtering.loop import simulate_loop, simulate_relay
+        from ctid_cli.filtering.loop import simulate_loop
 
         assert not isinstance(self.system, OwnSystem)
         interval = regular_interval(times)
@@ -149,13 +149,9 @@ class SimulatedSource:
         # The noise comes before the output, because the output answers to it.
         noise = self._drawn(times, np.zeros(times.size), replicate)
         controller = loop.at(interval).controller
-        signals = (reference, noise, interval, loop.enters)
-        if isinstance(controller, Relay):
-            u, x = simulate_relay(self.system, controller, *signals)
-            closed = None  # estimators know the loops of linear controllers only
-        else:
-            u, x = simulate_loop(self.system, controller, *signals)
-            closed = Loop(reference, controller, loop.enters)
+        u, x = simulate_loop(self.system, controller, reference, noise, interval, loop.enters)
+        # Estimators know the loops of linear controllers only.
+        closed = None if isinstance(controller, Relay) else Loop(reference, controller, loop.enters)
         y = self._with_losses(self.recorder.rounded(x + noise), replicate)
         return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
 

@@ -3,8 +3,6 @@
 import mpmath as mp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import signal
 
 from ctid_cli.errors import DataError
@@ -51,18 +49,6 @@ def test_equals_another_simulator_on_a_grid_that_holds_everything(name, hold):
     result = simulate(TransferFunction(numerator, denominator, STEP * delay), held, STEP * instants)
     assert np.abs(result - expected).max() <= 1e-9 * np.abs(expected).max()
     assert (result[position < 0] == 0.0).all()
-
-
-@given(st.sampled_from(sorted(SYSTEMS)), st.sampled_from(["zoh", "foh"]), st.floats(0, 30), st.integers(0, 2**31))
-def test_irregular_instants_and_regular_ones_give_the_same(name, hold, delay, seed):
-    # One instant off the grid selects the irregular code; the others are then computed by both.
-    u = np.random.default_rng(seed).standard_normal(300)
-    t = 0.1 * np.arange(300)
-    model = TransferFunction(*SYSTEMS[name], delay)
-    held = HeldSignal(t, u, hold)
-    regular = simulate(model, held, t)
-    irregular = simulate(model, held, np.append(t, t[-1] + 0.037))[:-1]
-    assert np.abs(irregular - regular).max() <= 1e-10 * np.abs(regular).max()
 
 
 @pytest.mark.parametrize("regular", [True, False])

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctid_cli.filtering.bank import Chains, Modes
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.kernels import BLOCK
 from ctid_cli.filtering.loop import simulate_loop
@@ -109,8 +110,8 @@ def test_compiled_pass_is_the_general_route_for_any_sum(draw, delay, hold_output
     data = filter_data(record(seed, n=200), delay, hold_output)
     loop = feedback(WEAK, 200, seed=seed) if closed else OPEN_LOOP
     submodels, theta = SubmodelFilter(data, terms, delay, loop), np.array(theta)
-    assert submodels._pooled(theta) is not None
-    assert_rows(submodels.rows(theta), submodels._general_rows(data, theta), 1e-7)
+    assert isinstance(submodels._pooled(theta).model, Modes)
+    assert_rows(submodels.rows(theta), submodels.rows(theta, "chain"), 1e-7)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 0.5371])
@@ -196,9 +197,9 @@ def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
     theta = np.array([*(polynomial / polynomial[-1])[-2::-1], 1.0, 0.2, 0.1, 0.05, 0.4])
     terms = [Term(2, 1), Term(2, 0)]
     submodels = SubmodelFilter(filter_data(record()), terms, 0.0, feedback(WEAK, 300) if closed else OPEN_LOOP)
-    assert_rows(submodels.rows(theta), submodels._general_rows(submodels.data, theta), 1e-6)
+    assert_rows(submodels.rows(theta), submodels.rows(theta, "chain"), 1e-6)
     if gap == 0.0:
-        assert submodels._pooled(theta) is None
+        assert isinstance(submodels._pooled(theta).model, Chains)
 
 
 PERIODIC = {name: SUMS[name] for name in ("real pole", "mode", "biproper", "gain", "two modes", "mixed")}

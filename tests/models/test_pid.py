@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.models.controller import ContinuousPid, DiscreteController
+from ctid_cli.models.controller import ContinuousPid
 
 FULL = {"kp": 2.0, "ti": 5.0, "td": 0.4, "filter_time": 0.05}
 
@@ -20,24 +20,6 @@ def test_the_rule_puts_its_map_in_the_place_of_s(rule, options):
     filtered = pid.derivative_gain * s / (pid.filter_time * s + 1)
     expected = pid.kp + pid.integral_gain / s + filtered
     np.testing.assert_allclose(pid.discrete(h).frequency_response(w, h), expected, rtol=1e-12)
-
-
-def test_both_rules_approach_the_continuous_controller():
-    w, h = np.array([0.05, 0.7, 3.0]), 1e-4
-    s = 1j * w
-    expected = 2 * (1 + 1 / (5 * s) + 0.4 * s / (0.05 * s + 1))
-    for rule, tolerance in (("backward_euler", 1e-3), ("tustin", 1e-6)):
-        found = ContinuousPid(**FULL, discretisation=rule).discrete(h).frequency_response(w, h)
-        np.testing.assert_allclose(found, expected, rtol=tolerance)
-
-
-def test_backward_euler_without_filter_is_the_form_per_sample():
-    h = 0.05
-    found = ContinuousPid(kp=2.0, ti=4.0, td=0.3).discrete(h)
-    expected = DiscreteController.from_pid(2.0, 2.0 * h / 4.0, 2.0 * 0.3 / h)
-    np.testing.assert_allclose(found.numerator, expected.numerator, rtol=1e-13)
-    np.testing.assert_allclose(found.denominator, expected.denominator, atol=1e-15)
-    assert ContinuousPid(kp=3.0).discrete(h).order == 0
 
 
 @pytest.mark.parametrize(
