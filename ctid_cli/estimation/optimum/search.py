@@ -1,7 +1,7 @@
 """Descent to a local minimum of the projected squared error, and what kind of minimum it is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -56,12 +56,22 @@ class Ending(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Where a search is: the point, the least squares there, gradient and curvature of half the squared error."""
+    """Where a search is: the point, the least squares there, gradient and curvature of half the squared error.
+
+    The fields from ``ending`` on are those of a settled minimum.
+    """
 
     point: Point
     projected: Projected
     gradient: Array
     curvature: Array
+    ending: Ending | None = None
+    #: Fall that Newton's step promises, as a fraction of the squared error.
+    promise: float = np.inf
+    #: Coordinates held at a bound.
+    held: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    #: Whether the delay sits in a kink of the cost, at a sample.
+    pinned: bool = False
 
     @property
     def squared_error(self) -> float:
@@ -88,20 +98,6 @@ class Freedom(NamedTuple):
         moved = np.zeros((self.free.size, *inner.shape[1:]))
         moved[self.free] = (inner.T / self.unit).T
         return moved
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A local minimum and its kind."""
-
-    local: Local
-    ending: Ending
-    #: Fall that Newton's step promises, as a fraction of the squared error.
-    promise: float
-    #: Coordinates held at a bound.
-    held: BoolArray
-    #: Whether the delay sits in a kink of the cost, at a sample.
-    pinned: bool
 
 
 class Descent:
@@ -269,7 +265,7 @@ class Descent:
                 break
         return 0.5 * (whole + whole.T)
 
-    def settle(self, here: Local) -> Judged:
+    def settle(self, here: Local) -> Local:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
         kinked = False
         second: Array | None = None
@@ -345,7 +341,7 @@ class Descent:
         ends = [self.local(moved_by(here.point, sign * step, self.box)).gradient[-1] for sign in (-1.0, 1.0)]
         return bool(ends[0] <= 0 <= ends[1])
 
-    def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Judged:
+    def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
         pinned, bound = False, held.copy()
         if self.box.delay_free and held[-1]:
@@ -357,7 +353,7 @@ class Descent:
             ending = Ending.RIDGE
         elif promise <= CONVERGED:
             ending = Ending.AT_BOUND if bound.any() else Ending.CONVERGED
-        return Judged(here, ending, promise, held, pinned)
+        return replace(here, ending=ending, promise=promise, held=held, pinned=pinned)
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
         """Whether the squared error moves by less than the residual's variance as far as the set reaches.
