@@ -26,10 +26,6 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
-#: The same for the fall over the last few steps: between kinks, on an irregular clock, steps promise more than they do.
-CRAWLING, REMEMBERED = 300.0, 7
-#: A step of the greatest length is another one if it differs by more than this.
-ANOTHER = 0.01
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -182,7 +178,7 @@ class Descent:
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
-        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf] * REMEMBERED
+        damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
@@ -194,17 +190,12 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = not scale.size or promise <= near * max(here.squared_error, self.floor)
-            fallen = sum(falls) if self.box.cell == 0.0 else np.inf
-            if arrived or _hopeless(taken, here.squared_error, promise, fallen, lowest):
+            if arrived or _hopeless(taken, here.squared_error, promise, lowest):
                 break
-            lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
                 step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
-                length = float(np.abs(step).max())
-                step /= max(1.0, length)
-                # Where steps are cut to their greatest length, more damping hardly changes them at first.
-                if length <= 1.0 or np.abs(step - rejected).max() > ANOTHER:
-                    lower, rejected = self._lower(here, self._whole_and_to_edge(here.point, step)), step
+                step /= max(1.0, float(np.abs(step).max()))
+                lower = self._lower(here, self._whole_and_to_edge(here.point, step))
                 if lower is not None:
                     break
                 damping, factor = damping * factor, factor * 2.0
@@ -216,7 +207,6 @@ class Descent:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
-            falls = [*falls[1:], fall]
             same = np.array_equal(trial.damping < 0, here.point.damping < 0)
             here = self.local(trial, found)
             if not same:
@@ -421,9 +411,9 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < CLOSE)
 
 
-def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
+def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
     """Whether a search will not come down to the lowest known minimum."""
-    too_flat = taken >= FIRST_STEPS and squared_error - min(HOPELESS * promise, CRAWLING * fallen) > lowest
+    too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 
