@@ -28,10 +28,12 @@ CLOSE = 0.01
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
+#: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
+SURE = 10.0
 #: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
 RIDGE = float(np.log(2.0))
-#: Least first step along negative curvature.
-SADDLE = 0.1
+#: Least first step along negative curvature, and longest one over which second derivatives are kept.
+SADDLE, SHORT = 0.1, 0.01
 
 
 class Ending(Enum):
@@ -226,54 +228,69 @@ class Descent:
     def hessian(self, here: Local) -> Array:
         """Second derivatives of half the squared error, by differences of its exact gradient.
 
-        With known coefficients of the denominator those of the Lagrangian, which count along the constraint.
+        With known coefficients of the denominator those of the Lagrangian, which count along the constraint. To one
+        side first: how far that is from symmetric tells its error, and whether the other side is needed.
         """
         size = here.gradient.size
         forces = self._forces(here)
         steps = np.full(size, DIFFERENCE)
         if self.box.delay_free and self.box.cell > 0:
             steps[-1] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
-        rows, widths = np.zeros((size, size)), np.zeros(size)
-        for step in np.vstack((np.diag(steps), np.diag(-steps))):
-            # Across a sample the delay has other derivatives: stay in its cell.
-            beyond = _unbounded(here.point, step, self.box)
-            if beyond is not None:
-                change = self.local(beyond).gradient - here.gradient
-                if forces.size:
-                    change += forces @ (self.known.slopes(beyond, size) - self.known.slopes(here.point, size))
-                i = int(np.flatnonzero(step)[0])
-                rows[i] += np.sign(step[i]) * change
-                widths[i] += steps[i]
-        whole = rows / widths[:, None]
-        return np.asarray(0.5 * (whole + whole.T))
+        rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
+        for side in (1.0, -1.0):
+            for i in range(size):
+                # Across a sample the delay has other derivatives: stay in its cell.
+                beyond = _unbounded(here.point, side * steps[i] * np.eye(size)[i], self.box)
+                if beyond is not None:
+                    change = self.local(beyond).gradient - here.gradient
+                    if forces.size:
+                        change += forces @ (self.known.slopes(beyond, size) - self.known.slopes(here.point, size))
+                    rows[i] += side * change
+                    widths[i] += steps[i]
+            if not (widths > 0).all():
+                continue
+            whole = rows / widths[:, None]
+            error = np.linalg.norm((whole - whole.T) / np.outer(unit, unit))
+            if np.linalg.eigvalsh(0.5 * (whole + whole.T) / np.outer(unit, unit))[0] > SURE * (error + DIFFERENCE):
+                break
+        return 0.5 * (whole + whole.T)
 
     def settle(self, here: Local) -> Local:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
         kinked = False
+        second: Array | None = None
         for _ in range(MOST_NEWTON):
             here = self._faced(here)
             ways = self._freedom(here, _lengths(here), kinked)
             free = ways.free
             if not ways.basis.shape[1]:
                 return self._judged(here, free, 0.0, None)
-            scaled, slope = ways.reduced(here.gradient, self.hessian(here))
+            fresh = second is None
+            second = self.hessian(here) if second is None else second
+            scaled, slope = ways.reduced(here.gradient, second)
             promise, values, vectors = _promise(scaled, slope)
             saddle = bool(values[0] < -FLAT * values[-1])
             promise = np.inf if saddle else promise / max(here.squared_error, self.floor)
             modes = values, ways.whole(vectors)
             if promise <= AIM:
-                break
+                return self._judged(here, free, promise, modes)
             step = ways.whole(_newton_step(values, vectors, slope))
             length = float(np.abs(step).max())
             # At a saddle the gradient says nothing about how far to go.
             step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
             lower = self._lower_along(here, step, saddle)
             if lower is not None:
+                # After a short step the second derivatives are still good enough to tell that it was the last.
+                same = np.array_equal(lower[1].damping < 0, here.point.damping < 0)
+                short = float(np.abs(lower[0]).max()) < SHORT
                 here = self.local(*lower[1:])
+                second = second if fresh and same and short else None
+            elif not fresh:
+                second = None
             elif free[-1] and self._in_a_kink(here, float(abs(step[-1]))):
                 kinked = True
             else:
-                break
+                return self._judged(here, free, promise, modes)
         return self._judged(here, free, promise, modes)
 
     def _lower_along(self, here: Local, step: Array, both: bool) -> tuple[Array, Point, Projected] | None:
