@@ -226,7 +226,6 @@ def variants():
             [otherwise(best_model, "_least", lambda f, nest, n, m, *_, **__: f(nest, n, m, False))],
         ),
         "coordinates at Nyquist": ({"regular"}, without_edges()),
-        "stop of a crawl": ({"delay", "irregular"}, [patch.object(search, "CRAWLING", 1e300)]),
         "stop where hopeless": (set(), [patch.object(search, "_hopeless", lambda *_: False)]),
         "stop at known minima": (set(), [patch.object(search, "_alike", lambda *_: False)]),
         "other side of a sample": ({"delay", "regular"}, [patch.object(Descent, "_faced", lambda _, here: here)]),
