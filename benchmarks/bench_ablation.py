@@ -30,11 +30,11 @@ from scipy.optimize import least_squares
 
 from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
 from ctid_cli.estimation import profile_search
+from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum import best_model, box, search, starts
-from ctid_cli.estimation.optimum.best_model import Ladder
+from ctid_cli.estimation.optimum.best_model import best_of_orders
 from ctid_cli.estimation.optimum.search import Descent
-from ctid_cli.estimation.optimum.starts import Nest
-from ctid_cli.estimation.profile_refinement import Refinement
+from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
@@ -124,8 +124,8 @@ def solved(options, record, way):
     """The least squared error that was found."""
     if way == "orders":
         problem = options.prepare(record).laid_out.problem
-        found = Ladder(Nest(problem, box.box_of(problem, options.delay_bounds), 0, 0))
-        return found.best(options.poles, options.zeros).squared_error
+        searched = StructureSearch(problem, box.box_of(problem, options.delay_bounds), effort=QUICK)
+        return best_of_orders(searched, options.poles, options.zeros).squared_error
     fit = replace(options, nested=way == "nested").fit(record)
     return fit.cost * fit.count
 
@@ -208,19 +208,24 @@ def variants():
     """What is left out: what a problem must have for that to matter, and the patches that do so."""
     return {
         "nothing": (set(), []),
-        "poles by themselves": (set(), [otherwise(Nest, "_alone", lambda f, s, m, n: f(s, m, n) if n == 1 else [])]),
-        "poles added": (set(), [patch.object(Nest, "_grown", nothing)]),
-        "delays of the best start": ({"delay"}, [patch.object(Nest, "_along_delay", lambda _, __, points: points)]),
-        "resonances": ({"nested"}, [patch.object(Nest, "resonances", nothing)]),
-        "close delays": ({"nested", "delay", "irregular"}, [patch.object(Nest, "close_delays", nothing)]),
-        "cells beside": ({"delay", "regular"}, [patch.object(Nest, "_beside", nothing)]),
-        "random points": (set(), [patch.object(Nest, "random_points", nothing)]),
+        "poles by themselves": (
+            set(),
+            [otherwise(StructureSearch, "_alone", lambda f, s, m, n: f(s, m, n) if n == 1 else [])],
+        ),
+        "poles added": (set(), [patch.object(StructureSearch, "_grown", nothing)]),
+        "delays of the best start": (
+            {"delay"},
+            [patch.object(StructureSearch, "along_delay", lambda _, __, points: points)],
+        ),
+        "resonances": ({"nested"}, [patch.object(StructureSearch, "resonances", nothing)]),
+        "close delays": ({"nested", "delay", "irregular"}, [patch.object(StructureSearch, "close_delays", nothing)]),
+        "cells beside": ({"delay", "regular"}, [patch.object(StructureSearch, "_beside", nothing)]),
+        "random points": (set(), [patch.object(StructureSearch, "random_points", nothing)]),
         "fewer poles": (
             set(),
-            [otherwise(best_model, "least", lambda f, nest, n, m, *_, **__: f(nest, n, m, False))],
+            [otherwise(best_model, "_least", lambda f, nest, n, m, *_, **__: f(nest, n, m, False))],
         ),
         "coordinates at Nyquist": ({"regular"}, without_edges()),
-        "stop of a crawl": ({"delay", "irregular"}, [patch.object(search, "CRAWLING", 1e300)]),
         "stop where hopeless": (set(), [patch.object(search, "_hopeless", lambda *_: False)]),
         "stop at known minima": (set(), [patch.object(search, "_alike", lambda *_: False)]),
         "other side of a sample": ({"delay", "regular"}, [patch.object(Descent, "_faced", lambda _, here: here)]),
@@ -238,7 +243,7 @@ def variants():
         ),
         "profile where nested": (
             {"nested"},
-            [otherwise(Refinement, "best", lambda f, s, a, nested: f(s, [] if nested else a, nested))],
+            [otherwise(MeasuredRecords, "best", lambda f, s, a, nested: f(s, [] if nested else a, nested))],
         ),
         "our descent (SciPy's instead)": (set(), [patch.object(Descent, "descend", by_scipy)]),
     }

@@ -9,29 +9,34 @@ C are the initial state, whatever happened before. C and the offset c belong to 
 from collections.abc import Sequence
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
-from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
+from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
+from ctid_cli.estimation.optimum.box import ANYWHERE, box_of, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
-from ctid_cli.estimation.optimum.pilot import liveliest_parts
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.input_response import output_bandwidth
+from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset, OutputHold
+
+#: Random starts, this number and as many again for each pole.
+RANDOM_STARTS = 2
 
 
 @dataclass(frozen=True)
@@ -146,14 +151,35 @@ class Treatment(NamedTuple):
     integrators: int = 0
 
 
-class MeasuredRecords:
-    """Records of one system, laid out for filtering."""
+@dataclass(frozen=True, eq=False)
+class AppliedModel:
+    """A given model on records that it need not have been estimated from."""
 
-    def __init__(self, records: Sequence[Record], structure: Structure, treatment: Treatment) -> None:
+    #: Output errors at the used samples of each experiment [output unit].
+    residuals: tuple[Array, ...] = field(repr=False)
+    used: tuple[BoolArray, ...] = field(repr=False)
+    initial_states: tuple[Array, ...]
+    #: Output offset of each experiment [output unit].
+    offsets: tuple[float, ...]
+    #: Derivatives of the output at the used samples to all parameters, the delay and what is each experiment's among
+    #: them, shape (count, p).
+    sensitivities: tuple[Array, ...] = field(repr=False)
+
+
+class MeasuredRecords:
+    """Records of one system, laid out for estimation, and their output-error cost over all parameters."""
+
+    def __init__(
+        self,
+        records: Sequence[Record],
+        structure: Structure,
+        treatment: Treatment,
+        known: KnownCoefficients = NOTHING,
+    ) -> None:
         if not records:
             raise DataError("there is no record to estimate from")
         self.structure = structure
-        self.treatment = treatment
+        self.treatment, self.known = treatment, known
         free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
         # The free response of an integrator is a constant.
         offset = treatment.offset == "estimate" and not (free_state and integrators)
@@ -183,8 +209,7 @@ class MeasuredRecords:
         other = copy(self)
         other.structure = structure
         other.layout = replace(self.layout, structure=structure)
-        for name in ("options", "problem"):
-            other.__dict__.pop(name, None)
+        other.problem = self.problem._replace(zeros=structure.zeros)
         return other
 
     @property
@@ -216,21 +241,17 @@ class MeasuredRecords:
         return filter_data(record, known_after, treatment.hold_output, periodic=periodic)
 
     @cached_property
-    def options(self) -> SearchOptions:
-        """What is estimated beside the coefficients."""
-        periodic = self.treatment.initial_state == "periodic"
-        return SearchOptions(
-            delays=self.treatment.delay_bounds,
-            free_response=self.layout.initial_state,
-            offset=self.layout.offset,
-            integrators=self.layout.integrators,
-            periods=[_period(record) for record in self.records] if periodic else (),
-        )
-
-    @cached_property
     def problem(self) -> Problem:
         """The records and what is eliminated with them."""
-        return problem_of(self.data, self.structure.zeros, self.options)
+        if self.treatment.initial_state == "periodic":
+            periods = tuple(_period(record) for record in self.records)
+            data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
+        else:
+            periods, data = (0.0,) * len(self.data), tuple(self.data)
+        layout, integrators = self.layout, self.treatment.integrators
+        return Problem(
+            data, self.structure.zeros, layout.initial_state, layout.offset, periods, integrators=integrators
+        )
 
     def part(self) -> "MeasuredRecords | None":
         """The liveliest parts of long records, each from a state of its own; None where they tell too little."""
@@ -255,6 +276,118 @@ class MeasuredRecords:
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""
         return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
+
+    # --- the least output error ----------------------------------------------------------------------
+
+    def with_outputs(self, outputs: Sequence[Array]) -> "MeasuredRecords":
+        """The same with other outputs at the used samples of each record."""
+        records = []
+        for data, values in zip(self.problem.records, outputs, strict=True):
+            y = data.y.copy()
+            y[data.use] = values
+            records.append(data._replace(y=y))
+        other = copy(self)
+        other.problem = self.problem._replace(records=tuple(records))
+        return other
+
+    def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "MeasuredRecords":
+        """The records whose least squares are, near the estimate, what its loss is."""
+        if weighting is None:
+            return self
+        each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
+        return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
+
+    def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
+        """The least output error from denominators and delays, and if nested of smaller models and at random too.
+
+        A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
+        """
+        return best_output_error(
+            self.problem,
+            self.structure.poles - self.problem.integrators,
+            self.treatment.delay_bounds,
+            starts,
+            nested=nested or not self.plain or self.known is not NOTHING,
+            fewer_poles=nested,
+            random_starts=RANDOM_STARTS if nested or self.plain else 0,
+            known=self.known,
+        )
+
+    def local(self, near: Optimum) -> Optimum:
+        """Return the least output error in the basin of an optimum of other outputs."""
+        starts, delays = [(near.denominator, near.delay)], self.treatment.delay_bounds
+        poles = near.denominator.size - 1
+        return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
+
+    def parameters(self, found: Optimum) -> tuple[Layout, Array]:
+        """Which numbers an optimum has, and what they are."""
+        layout = self.layout_of(found.model.order, self.structure.delay)
+        theta = layout.theta(found.model)
+        for k in range(layout.experiments):
+            state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
+            theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
+        return layout, theta
+
+    def simulated(self, found: Optimum) -> list[Array]:
+        """Outputs of an optimum at the used samples of each record."""
+        parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
+        return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
+
+    def squared_error_at(self, model: TransferFunction, delay: float) -> float:
+        """Least sum of squared output errors at a given delay, in the basin of a model."""
+        return local_minimum(
+            self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
+        ).squared_error
+
+    def squared_error_with(
+        self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
+    ) -> float:
+        """Return the least sum of squared output errors if an initial state or an offset were estimated too.
+
+        Among the models that are admissible without them: in a smaller set the cost might be higher.
+        """
+        problem, bounds = self.problem, self.treatment.delay_bounds
+        more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
+        box = box_of(problem, bounds)
+        return local_minimum(more, self.free_poles(model), model.delay, bounds, box=box, known=self.known).squared_error
+
+    def errors_of(self, model: TransferFunction) -> AppliedModel:
+        """Errors of a given model on these records, each with its own best initial state and offset."""
+        layout = self.layout_of(model.order, delay=True)
+        theta, residuals = layout.theta(model), []
+        found = sensitivities(self.problem, layout, theta, model.delay)
+        for k, (psi, eps) in enumerate(found):
+            own = slice(layout.first(k), layout.first(k) + layout.own)
+            theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
+            bridged = self.problem.records[k].y_used
+            residuals.append(eps - psi[:, own] @ theta[own] + (self.outputs[k] - bridged))
+        slopes = tuple(psi for psi, _ in found)
+        return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
+
+    def free_poles(self, model: TransferFunction) -> ComplexArray:
+        """The poles of a model but its integrators."""
+        return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
+
+    @property
+    def given(self) -> BoolArray:
+        """Which of the coefficients of the structure are known, those that integrators make zero among them."""
+        zeros = self.structure.zeros + 1
+        if self.known is NOTHING:
+            free = self.structure.poles - self.problem.integrators
+            of_a, of_b = np.zeros(free, dtype=bool), np.zeros(zeros, dtype=bool)
+        else:
+            of_a, of_b = np.isfinite(self.known.denominator), np.isfinite(self.known.numerator)
+        return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
+
+    def layout_of(self, poles: int, delay: bool) -> Layout:
+        """Layout of the parameters for a number of poles, integrators among them."""
+        return replace(self.layout, structure=Structure(poles, self.structure.zeros, delay))
+
+    def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
+        """Initial states and offsets of the experiments, means that were subtracted included."""
+        own = [layout.own_of(theta, k) for k in range(layout.experiments)]
+        offsets = tuple(y0 + c for y0, (_, c) in zip(self.offsets, own, strict=True))
+        return tuple(state for state, _ in own), offsets
 
 
 def _bridged(record: Record) -> Record:
@@ -286,3 +419,12 @@ def without_means(record: Record) -> tuple[Record, float, float]:
 def _period(record: Record) -> float:
     """Period of a record that repeats: its duration and one more interval."""
     return record.duration + (record.interval or float(np.median(np.diff(record.t))))
+
+
+def _one_period(data: FilterData, period: float) -> FilterData:
+    """Return the record with the breaks of its input within one period."""
+    within = data.tu < data.tu[0] + period * (1 - 1e-9)
+    if within.all():
+        return data
+    # A regular pass takes a break for each sample.
+    return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)

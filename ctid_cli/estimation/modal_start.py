@@ -20,8 +20,8 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.additive_problem import AdditiveProblem
 from ctid_cli.estimation.iteration import solve_scaled
-from ctid_cli.estimation.optimum.best_model import SearchOptions, problem_of
 from ctid_cli.estimation.optimum.box import Point, box_of, point_of
+from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Descent
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.submodels import OPEN_LOOP
@@ -130,8 +130,7 @@ class _Search:
         self.direct = any(term.zeros == term.order for term in terms)
         # Of one period the state at the first sample is unknown, too.
         unknown = problem.initial_state != "rest"
-        options = SearchOptions(delays, free_response=unknown, integrators=self.integrators)
-        self.problem = problem_of([data], 0, options)
+        self.problem = Problem((data,), 0, unknown, False, (0.0,), integrators=self.integrators)
         self.box = box_of(self.problem, delays)
 
     def descent(self, poles: int) -> Descent:

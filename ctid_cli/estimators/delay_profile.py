@@ -9,12 +9,12 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
-from ctid_cli.estimation.measured_records import Layout, MeasuredRecords, Treatment, sensitivities
+from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement, RobustFit, robust_fit
 from ctid_cli.estimation.profile_search import Profile, search_delay
+from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
@@ -171,7 +171,7 @@ class FittedSamples(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DelayProfile(Estimator[Refinement, MeasuredFit]):
+class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     """Global search over the delay, refined on the output-error cost together with initial state and offset.
 
     Parameters
@@ -279,9 +279,10 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         """Number of poles, integrators included."""
         return self.poles + self.integrators
 
-    def _lay_out(self, records: Record | Sequence[Record]) -> Refinement:
+    def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
         low, high = self.delay_bounds
-        measured = MeasuredRecords(
+        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
+        return MeasuredRecords(
             [records] if isinstance(records, Record) else list(records),
             Structure(self.order, self.zeros, delay=low < high),
             Treatment(
@@ -292,20 +293,19 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
                 bridge=self.loss != "squares",
                 integrators=self.integrators,
             ),
+            KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING,
         )
-        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
-        return Refinement(measured, KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING)
 
-    def _estimate(self, refinement: Refinement, start: Start | None) -> MeasuredFit:
-        for minima, profile in search_delay(refinement.measured, self.svf_cutoff, self.nested):
+    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        for minima, profile in search_delay(measured, self.svf_cutoff, self.nested):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
                 if self.loss == "squares":
-                    fit = fitted(refinement, refinement.best(starts, self.nested), profile, None)
+                    fit = fitted(measured, measured.best(starts, self.nested), profile, None)
                 else:
-                    robust = robust_fit(refinement, self.loss, starts, self.nested)
-                    fit = fitted(refinement, robust.found, profile, robust)
+                    robust = robust_fit(measured, self.loss, starts, self.nested)
+                    fit = fitted(measured, robust.found, profile, robust)
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
@@ -315,31 +315,30 @@ class DelayProfile(Estimator[Refinement, MeasuredFit]):
         """The record with what acts on the output from outside."""
         return record
 
-    def _samples(self, fit: MeasuredFit, refinement: Any) -> FittedSamples:
+    def _samples(self, fit: MeasuredFit, measured: Any) -> FittedSamples:
         """What a fit says of each used sample, from its parameters."""
-        return samples_at(refinement, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
+        return samples_at(measured, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
 
-    def _applied(self, fit: MeasuredFit, refinement: Any) -> AppliedModel:
+    def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
-        found: AppliedModel = refinement.errors_of(fit.model)
+        found: AppliedModel = measured.errors_of(fit.model)
         return found
 
-    def _lowered(self, fit: MeasuredFit, refinement: Any) -> dict[str, float]:
+    def _lowered(self, fit: MeasuredFit, measured: Any) -> dict[str, float]:
         """Sums of squared errors if an initial state or an offset that were taken as zero were estimated too."""
         tried = {"initial_state": self.initial_state == "rest", "offset": self.offset == "none"}
-        return {name: refinement.squared_error_with(fit.model, **{name: True}) for name in tried if tried[name]}
+        return {name: measured.squared_error_with(fit.model, **{name: True}) for name in tried if tried[name]}
 
 
 def fitted(
-    refinement: Refinement,
+    measured: MeasuredRecords,
     found: Optimum,
     profile: Profile | None,
     robust: RobustFit | None,
 ) -> MeasuredFit:
     """The result of a refinement, but for its covariance."""
-    measured = refinement.measured
-    layout, theta = refinement.parameters(found)
-    samples = samples_at(refinement, found.model, theta, None if robust is None else robust.losses)
+    layout, theta = measured.parameters(found)
+    samples = samples_at(measured, found.model, theta, None if robust is None else robust.losses)
     residuals, law = samples.residuals, samples.linear
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
@@ -350,8 +349,8 @@ def fitted(
     values = quality(equations, float(outputs @ outputs), count)
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
-    states, offsets = refinement.own(layout, theta)
-    given = _given(layout, refinement)
+    states, offsets = measured.own(layout, theta)
+    given = _given(layout, measured)
     return MeasuredFit(
         model=found.model,
         parameter_names=layout.names,
@@ -373,31 +372,31 @@ def fitted(
         held_poles=tuple(found.held_poles.tolist()),
         tangent=_tangent(layout, found, given),
         known=tuple(np.array(layout.names)[given].tolist()),
-        regular=all(nearly_regular(data.t) for data in refinement.problem.records),
+        regular=all(nearly_regular(data.t) for data in measured.problem.records),
         **values,
     )
 
 
 def samples_at(
-    refinement: Refinement, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
+    measured: MeasuredRecords, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
 ) -> FittedSamples:
     """The samples of the records at an estimate, whose losses are those of squares where none are given."""
-    layout = refinement.layout_of(model.order, refinement.structure.delay)
-    psi, errors = zip(*sensitivities(refinement.problem, layout, theta, model.delay), strict=True)
-    used = refinement.measured.used()
+    layout = measured.layout_of(model.order, measured.structure.delay)
+    psi, errors = zip(*sensitivities(measured.problem, layout, theta, model.delay), strict=True)
+    used = measured.used()
     if losses is None:
         return FittedSamples(errors, psi, used, None)
     # Outliers are bridged where sensitivities are computed; here they are what was measured.
-    each = zip(refinement.measured.outputs, refinement.problem.records, errors, strict=True)
+    each = zip(measured.outputs, measured.problem.records, errors, strict=True)
     errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
     return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
 
 
-def _given(layout: Layout, refinement: Refinement) -> BoolArray:
+def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
     """Which parameters are known."""
     fixed = np.zeros(layout.size, dtype=bool)
     # Poles that have run to infinity are missing among the first coefficients.
-    given = refinement.given[refinement.structure.poles - layout.structure.poles :]
+    given = measured.given[measured.structure.poles - layout.structure.poles :]
     fixed[: given.size] = given
     return fixed
 

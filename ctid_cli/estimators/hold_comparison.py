@@ -9,7 +9,6 @@ import numpy as np
 
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.signal_features import input_moves
@@ -38,7 +37,7 @@ class OtherHold:
     interval: float = math.nan
 
 
-def best_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
+def best_other_hold(measured: MeasuredRecords, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
     """The best other hold; None where there is none to try.
 
     The steps of an input that moves a few times only show their shape themselves, and an input that jumps between
@@ -49,11 +48,11 @@ def best_other_hold(refinement: Refinement, fit: MeasuredFit, records: Sequence[
         return None
     most = MOST // len(records)
     short = [beginning(record, most) for record in records]
-    given, delay = _least(refinement, fit, short)
+    given, delay = _least(measured, fit, short)
     tried: list[Hold] = [hold for hold in get_args(Hold) if hold != records[0].input.hold]
     if kinds != {"continuous"} or any(regular_interval(record.input.t) is None for record in short):
         tried = [hold for hold in tried if hold != "band-limited"]
-    found = {hold: _least(refinement, fit, [_held(record, hold) for record in short]) for hold in tried}
+    found = {hold: _least(measured, fit, [_held(record, hold) for record in short]) for hold in tried}
     best = min(tried, key=lambda hold: found[hold][0])
     cost, changed = found[best]
     interval = float(np.median(np.diff(records[0].t)))
@@ -70,13 +69,11 @@ def decisive(given: float, other: float, fit: MeasuredFit, records: Sequence[Rec
     return fall if fall > WORTHWHILE and -0.5 * count * np.log1p(-fall) > DECISIVE else 0.0
 
 
-def _least(refinement: Refinement, fit: MeasuredFit, records: Sequence[Record]) -> tuple[float, float]:
+def _least(measured: MeasuredRecords, fit: MeasuredFit, records: Sequence[Record]) -> tuple[float, float]:
     """Least sum of squared output errors near a fit, and its delay."""
-    measured = MeasuredRecords(records, refinement.structure, refinement.measured.treatment)
-    bounds = measured.treatment.delay_bounds
-    found = local_minimum(
-        measured.problem, refinement.free_poles(fit.model), fit.model.delay, bounds, known=refinement.known
-    )
+    own = MeasuredRecords(records, measured.structure, measured.treatment)
+    bounds, poles = own.treatment.delay_bounds, measured.free_poles(fit.model)
+    found = local_minimum(own.problem, poles, fit.model.delay, bounds, known=measured.known)
     return found.squared_error, found.point.delay.seconds
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
-from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
+from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
@@ -181,7 +181,7 @@ def identify(
     fit = replace(fit, covariance=uncertainty.covariance, law=uncertainty)
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
     linear, laid_out = fit.linear, prepared.laid_out
-    if isinstance(laid_out, Refinement):
+    if isinstance(laid_out, MeasuredRecords):
         laid_out = laid_out.near(fit.residuals, fit.weighting)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
@@ -199,7 +199,7 @@ def identify(
     if not answer.seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
     interval = None
-    if isinstance(laid_out, Refinement) and "delay" in fit.parameter_names and "delay" not in unclear:
+    if isinstance(laid_out, MeasuredRecords) and "delay" in fit.parameter_names and "delay" not in unclear:
         interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
     judged = None
     if checked is not None and validation is not None:
@@ -306,7 +306,7 @@ def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 
 def _other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
     """The best other hold of the input; None where the holds cannot be compared."""
-    if isinstance(laid_out, Refinement):
+    if isinstance(laid_out, MeasuredRecords):
         return best_other_hold(laid_out, fit, records) if options.loss == "squares" else None
     assert isinstance(options, MeasuredSubmodels)
     if options.closed:
@@ -323,14 +323,14 @@ def _other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: 
 # --- the delay -------------------------------------------------------------------------------------
 
 
-def _delay_interval(refinement: Refinement, fit: MeasuredFit, uncertainty: Uncertainty) -> DelayInterval | None:
+def _delay_interval(measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
-    profile, reach, error = _cost_of_delay(refinement, fit, uncertainty)
+    profile, reach, error = _cost_of_delay(measured, fit, uncertainty)
     return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
 
 
 def _cost_of_delay(
-    refinement: Refinement, fit: MeasuredFit, uncertainty: Uncertainty
+    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty
 ) -> tuple[CostOfDelay, float, float]:
     """The cost about a delay, how many standard errors its interval reaches, and the standard error."""
     place = fit.parameter_names.index("delay")
@@ -342,12 +342,12 @@ def _cost_of_delay(
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
     profile = CostOfDelay(
-        cache(lambda trial: refinement.squared_error_at(fit.model, trial)),
+        cache(lambda trial: measured.squared_error_at(fit.model, trial)),
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,
         fit.theta.size - len(fit.known),
-        refinement.measured.treatment.delay_bounds,
+        measured.treatment.delay_bounds,
         max(variance / white, np.finfo(float).tiny),
     )
     reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
@@ -372,7 +372,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     if "delay" not in fit.parameter_names or not (np.isfinite([item.low, item.high]).all() and fit.cost > 0):
         return None
     laid_out = result.options.prepare(result.records).laid_out
-    if not isinstance(laid_out, Refinement):
+    if not isinstance(laid_out, MeasuredRecords):
         return None
     profile, reach, _ = _cost_of_delay(
         laid_out.near(result.fit.residuals, result.fit.weighting), fit, result.uncertainty

@@ -12,8 +12,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_problem import Instruments
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
-from ctid_cli.estimation.measured_records import without_means
-from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
+from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
 from ctid_cli.filtering.filter_data import used_samples
@@ -275,4 +274,4 @@ def _padded(b: Array, size: int) -> Array:
 
 #: Estimators of measured records, and records as each of them lays them out.
 Options = DelayProfile | MeasuredSubmodels
-LaidOut = Refinement | LaidOutSubmodels
+LaidOut = MeasuredRecords | LaidOutSubmodels

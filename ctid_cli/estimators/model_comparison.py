@@ -7,8 +7,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
-from ctid_cli.estimation.profile_refinement import AppliedModel, Refinement
+from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel
@@ -163,4 +162,4 @@ def _treated(
     model = parametric.fraction
     structure = Structure(model.order, parametric.zeros)
     treatment = Treatment((model.delay, model.delay), state, shift, "foh")
-    return Refinement(MeasuredRecords([record], structure, treatment)).errors_of(model)
+    return MeasuredRecords([record], structure, treatment).errors_of(model)

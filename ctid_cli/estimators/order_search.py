@@ -7,10 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.optimum.best_model import Ladder
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
-from ctid_cli.estimation.optimum.starts import Nest
-from ctid_cli.estimation.profile_refinement import Refinement
+from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted
 from ctid_cli.estimators.identification import laid_out_validation, tests_of, validated
 from ctid_cli.inference import criteria as criteria_of
@@ -237,10 +237,10 @@ def search_orders(
         *(poles[1], 0, delay_bounds), initial_state=initial_state, offset=offset, integrators=integrators
     )
     search = _search(records, poles, zeros, whole, ends_early)
-    checked: Refinement | None = None
+    checked: MeasuredRecords | None = None
     if validation is not None:
         laid_out = laid_out_validation(search.options(poles[1], 0), validation)
-        assert isinstance(laid_out, Refinement)
+        assert isinstance(laid_out, MeasuredRecords)
         checked = laid_out
     orders = [search.judged(each, checked, validation) for each in search.ranked()]
     return search.result(orders)
@@ -296,25 +296,25 @@ class _Search:
     def __init__(self, records: list[Record], whole: DelayProfile) -> None:
         self.records, self.whole = records, whole
         # Of the most poles, so that a record that is too short for them is refused before anything is fitted.
-        self.laid_out: Refinement = whole.prepare(records).laid_out
-        self.measured, problem = self.laid_out.measured, self.laid_out.problem
-        self.ladder = Ladder(Nest(problem, box_of(problem, whole.delay_bounds), 0, 0))
+        self.measured: MeasuredRecords = whole.prepare(records).laid_out
+        problem = self.measured.problem
+        self.searched = StructureSearch(problem, box_of(problem, whole.delay_bounds), effort=QUICK)
         self.found: list[FittedOrder] = []
 
     def options(self, poles: int, zeros: int) -> DelayProfile:
         """A structure, treated like the others."""
         return replace(self.whole, poles=poles, zeros=zeros)
 
-    def _refinement(self, laid_out: Refinement, options: DelayProfile) -> Refinement:
-        """Laid out records for a structure."""
-        structure = Structure(options.order, options.zeros, delay=self.ladder.box.delay_free)
-        problem = laid_out.problem._replace(zeros=options.zeros)
-        return Refinement(laid_out.measured.with_structure(structure), problem=problem)
+    def _for_structure(self, measured: MeasuredRecords, options: DelayProfile) -> MeasuredRecords:
+        """Return laid out records for a structure."""
+        return measured.with_structure(Structure(options.order, options.zeros, delay=self.searched.box.delay_free))
 
     def fit(self, poles: int, zeros: int) -> None:
         """Add a structure."""
         options = self.options(poles, zeros)
-        found = fitted(self._refinement(self.laid_out, options), self.ladder.best(poles, zeros), None, None)
+        found = fitted(
+            self._for_structure(self.measured, options), best_of_orders(self.searched, poles, zeros), None, None
+        )
         nothing = criteria_of.information_criteria(found.cost * found.count, found.count, 0)
         self.found.append(FittedOrder(options, found, nothing))
         self.__dict__.pop("noise", None)
@@ -335,10 +335,10 @@ class _Search:
         squared = squared_innovations(fit.residuals, free, self.noise)
         # A pole that has run to infinity was one that could be chosen.
         own = self.measured.layout.own * len(self.records)
-        size = each.options.poles + each.options.zeros + 1 + int(self.ladder.box.delay_free) + own
+        size = each.options.poles + each.options.zeros + 1 + int(self.searched.box.delay_free) + own
         return criteria_of.information_criteria(squared, innovations_count(fit.residuals, self.noise), size)
 
-    def judged(self, each: FittedOrder, checked: Refinement | None, validation: Record | None) -> FittedOrder:
+    def judged(self, each: FittedOrder, checked: MeasuredRecords | None, validation: Record | None) -> FittedOrder:
         """A structure with everything that is printed of it."""
         fit = each.fit
         white = fit.uncertainty("white")
@@ -352,7 +352,7 @@ class _Search:
         total = np.concatenate([y - y.mean() for y in output])
         other = None
         if checked is not None and validation is not None:
-            applied = self._refinement(checked, each.options).errors_of(fit.model)
+            applied = self._for_structure(checked, each.options).errors_of(fit.model)
             other = validated(applied, validation).fit_percent
         return replace(
             each,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.profile_refinement import Refinement
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.measured_submodels import LaidOut, Options
 from ctid_cli.inference.noise_model import fit_noise_model
@@ -45,9 +45,9 @@ class Clock:
 
 def another_order(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Richer | None:
     """One more pole, and a zero if that does better; None where it cannot be tried."""
-    if not isinstance(laid_out, Refinement) or fit.known or fit.weighting is not None or fit.model.order >= 12:
+    if not isinstance(laid_out, MeasuredRecords) or fit.known or fit.weighting is not None or fit.model.order >= 12:
         return None
-    problem, bounds = laid_out.problem, laid_out.measured.treatment.delay_bounds
+    problem, bounds = laid_out.problem, laid_out.treatment.delay_bounds
     longest = max(float(np.ptp(data.t)) for data in problem.records)
     shortest = min(float(np.median(np.diff(data.t))) for data in problem.records)
     found = []
@@ -65,7 +65,7 @@ def another_order(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Rich
 
 def another_delay(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Richer | None:
     """The best delay outside the range that was searched; None where it cannot be tried."""
-    if not isinstance(laid_out, Refinement) or fit.weighting is not None:
+    if not isinstance(laid_out, MeasuredRecords) or fit.weighting is not None:
         return None
     low, high = options.delay_bounds
     longest = max(float(np.ptp(data.t)) for data in laid_out.problem.records)
@@ -81,7 +81,7 @@ def another_delay(laid_out: LaidOut, fit: MeasuredFit, options: Options) -> Rich
     return Richer(options.poles, options.zeros, best.point.delay.seconds, _fall(best.squared_error, fit))
 
 
-def _slowest(laid_out: Refinement, fit: MeasuredFit) -> float:
+def _slowest(laid_out: MeasuredRecords, fit: MeasuredFit) -> float:
     """Least magnitude of a pole but the integrators [rad/s]; infinite where there is none."""
     return float(np.abs(laid_out.free_poles(fit.model)).min(initial=np.inf))
 

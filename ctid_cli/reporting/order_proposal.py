@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum.pilot import liveliest
+from ctid_cli.estimation.optimum.best_model import liveliest
 from ctid_cli.estimators.order_search import recommend_order
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.inference.response_test import AnswerTest

@@ -207,9 +207,9 @@ def test_squared_errors_around_the_estimate():
     fit = prepared.fit()
     lowest = fit.cost * fit.count
     assert prepared.laid_out.squared_error_at(fit.model, fit.model.delay) == pytest.approx(lowest)
-    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.measured.records)
+    known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.records)
     assert prepared.laid_out.squared_error_at(fit.model, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
-    better = replace(options, offset="estimate").fit(prepared.laid_out.measured.records)
+    better = replace(options, offset="estimate").fit(prepared.laid_out.records)
     assert prepared.laid_out.squared_error_with(fit.model, offset=True) == pytest.approx(
         better.cost * better.count, rel=1e-6
     )

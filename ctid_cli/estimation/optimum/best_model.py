@@ -8,47 +8,20 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum.box import Box, box_of, point_of, widened
+from ctid_cli.estimation.optimum.box import Box, Point, box_of, point_of, widened
 from ctid_cli.estimation.optimum.chain import numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
-from ctid_cli.estimation.optimum.pilot import part_of
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.optimum.search import Ending, Judged
-from ctid_cli.estimation.optimum.starts import QUICK, SAME, Nest
+from ctid_cli.estimation.optimum.search import Ending, Local
+from ctid_cli.estimation.optimum.starts import SAME, StructureSearch
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
 
 #: A model found from a part of the records is one of all of them if its mean squared error there is at most so many
 #: times that in the part, and so large a share of the output's variance is explained.
 AS_GOOD, EXPLAINED = 1.5, 0.05
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """What is estimated beside the coefficients, and where the searches start."""
-
-    #: Least and greatest delay [s]; two equal numbers are a known delay.
-    delays: tuple[float, float] = (0.0, 0.0)
-    free_response: bool = False
-    offset: bool = False
-    #: Poles at the origin, besides those that are searched. With free responses these hold the offset, too; no record
-    #: may repeat itself.
-    integrators: int = 0
-    #: Period [s] of each record that repeats for ever, 0 for another; by default none repeats.
-    periods: Sequence[float] = ()
-    #: Denominators and delays [s] that other estimators have found.
-    starts: Sequence[tuple[ArrayLike, float]] = ()
-    #: Whether the smaller models that the structure contains are fitted too: their optima are starts. Without them only
-    #: the given starts are refined.
-    nested: bool = True
-    #: Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
-    fewer_poles: bool = True
-    #: Further starts at random, so many and so many for each pole, also of the smaller models. Where these are left
-    #: out: only if the given starts do not agree.
-    random_starts: int = 10
-    seed: int = 0
-    #: Coefficients that are known.
-    known: KnownCoefficients = NOTHING
+#: Records of more samples than this are long, and so many of them are a part.
+LONG, PART = 100_000, 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,130 +63,149 @@ class Optimum:
         return TransferFunction(self.numerator, np.append(self.denominator, np.zeros(self.integrators)), self.delay)
 
 
-def best_output_error(records: Sequence[FilterData], poles: int, zeros: int, options: SearchOptions) -> Optimum:
-    """Least sum of squared output errors of a structure and of all that it contains.
+def best_output_error(
+    problem: Problem,
+    poles: int,
+    delays: tuple[float, float] = (0.0, 0.0),
+    starts: Sequence[tuple[ArrayLike, float]] = (),
+    *,
+    nested: bool = True,
+    fewer_poles: bool = True,
+    random_starts: int = 10,
+    seed: int = 0,
+    known: KnownCoefficients = NOTHING,
+) -> Optimum:
+    """Return the least sum of squared output errors of a structure and of all that it contains.
 
-    As many zeros as poles need a known delay. Free responses begin at the first used sample of each record.
+    Parameters
+    ----------
+    problem : Problem
+        The records, the degree of the numerator, and what is eliminated with it. Free responses begin at the first used
+        sample of each record.
+    poles : int
+        Number of poles that are searched; as many zeros need a known delay.
+    delays : tuple of float
+        Least and greatest delay [s]; two equal numbers are a known delay.
+    starts : sequence of tuple
+        Denominators and delays [s] that other estimators have found.
+    nested : bool
+        Whether the smaller models that the structure contains are fitted too: their minima are starts. Without them
+        only the given starts are refined.
+    fewer_poles : bool
+        Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
+    random_starts : int
+        Further starts at random, this number and as many again for each pole, also of the smaller models. Where these
+        are left out: only if the given starts do not agree.
+    seed : int
+        Seed of these.
+    known : KnownCoefficients
+        Coefficients that are known.
     """
-    problem = problem_of(records, zeros, options)
-    box = box_of(problem, options.delays)
-    if options.known is not NOTHING:
-        return _with_known(problem, box, poles, options)
-    if options.nested and (part := part_of(problem, options.delays[1])) is not None:
-        found = _from_part(problem, part, box, poles, options)
-        if found is not None:
-            return found
-    nest = Nest(problem, box, options.random_starts, options.seed)
-    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
-    if options.nested or not points:
-        nest.optima(poles, zeros)
-        points += nest.resonances(poles, zeros)
-    nest.refine(poles, zeros, points)
-    if options.nested:
-        nest.refine(poles, zeros, nest.close_delays(poles, zeros))
-    found = least(nest, poles, zeros, options.nested and options.fewer_poles)
-    in_doubt = (found.tried > 1 and found.agree == 1) or not found.ending.optimal
-    if options.nested or not in_doubt:
-        return found
-    nest.refine(poles, zeros, nest.random_points(poles))
-    return least(nest, poles, zeros, False)
-
-
-def _with_known(problem: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum:
-    """Return the least output error of the models that have known coefficients."""
-    zeros, known = problem.zeros, options.known
+    zeros, box = problem.zeros, box_of(problem, delays)
     if known.all_poles:
         box = widened(box, known.poles)
-    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in options.starts]
-    part = part_of(problem, options.delays[1]) if options.nested else None
-    if options.nested and part is None:
-        free = Nest(problem, box, options.random_starts, options.seed)
-        nest = free.with_known(poles, zeros, known, points)
-        if nest.optima(poles, zeros):
-            nest.refine(poles, zeros, nest.close_delays(poles, zeros))
-    else:
+    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in starts]
+    search = StructureSearch(problem, box, random_starts, seed)
+    part = part_of(problem, delays[1]) if nested else None
+    if known is not NOTHING:
         if part is not None:
-            there = _with_known(part, box_of(part, options.delays), poles, options)
-            points = [point_of(there.model.poles, there.delay, box)]
-        nest = Nest(problem, box, 0, options.seed, known=known)
-        moved = (known.met(point, box) for point in points)
-        nest.refine(poles, zeros, [point for point in moved if point is not None])
-    if not nest.optima(poles, zeros):
+            there = best_output_error(part, poles, delays, starts, random_starts=random_starts, seed=seed, known=known)
+            points, nested = [point_of(there.model.poles, there.delay, box)], False
+        search = _with_known(search, poles, points, nested, known)
+        return _least(search, poles, zeros, False)
+    if part is not None:
+        pilot = StructureSearch(part, box_of(part, delays), random_starts, seed)
+        found = _from_part(StructureSearch(problem, box, pilot=pilot), pilot, poles, fewer_poles)
+        if found is not None:
+            return found
+    if nested or not points:
+        search.climb(poles, zeros)
+        points += search.resonances(poles, zeros)
+    search.refine(poles, zeros, points)
+    if nested:
+        search.refine(poles, zeros, search.close_delays(poles, zeros))
+        return _least(search, poles, zeros, fewer_poles)
+    found = _least(search, poles, zeros, False)
+    if (found.tried > 1 and found.agree == 1) or not found.ending.optimal:
+        search.refine(poles, zeros, search.random_points(poles))
+        found = _least(search, poles, zeros, False)
+    return found
+
+
+def _with_known(
+    free: StructureSearch, poles: int, points: list[Point], nested: bool, known: KnownCoefficients
+) -> StructureSearch:
+    """Return the search of the models that have known coefficients, from points moved to where they hold.
+
+    If nested, these are also all that is found without the known coefficients, and points at random.
+    """
+    zeros, box = free.problem.zeros, free.box
+    search = StructureSearch(free.problem, box, known=known)
+    if nested and known.all_poles:
+        points = [point_of(known.poles, 0.5 * sum(box.delays), box)]
+    elif nested:
+        free.climb(poles, zeros)
+        points += [local.point for local in free.minima(poles, zeros)] + free.from_below(poles, zeros)
+        points += free.resonances(poles, zeros) + free.random_points(poles)
+    points = [point for point in (known.met(start, box) for start in points) if point is not None]
+    if nested:
+        points = search.along_delay(zeros, search.descent(zeros).sorted(points))
+    search.refine(poles, zeros, points)
+    if not search.minima(poles, zeros):
         given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
         raise DataError(
             f"no model with the fixed {given} has all its poles where they are searched: {box.in_words()}; "
             "change or drop the fixed value"
         )
-    return least(nest, poles, zeros, False)
+    if nested:
+        search.refine(poles, zeros, search.close_delays(poles, zeros))
+    return search
 
 
-def _from_part(problem: Problem, part: Problem, box: Box, poles: int, options: SearchOptions) -> Optimum | None:
-    """The search of a part, followed on the whole records; None where they say more, or something else, than it."""
-    zeros, fewer = problem.zeros, options.fewer_poles
-    pilot = Nest(part, box_of(part, options.delays), options.random_starts, options.seed)
-    expected = least(pilot, poles, zeros, fewer)
-    found = least(Nest(problem, box, options.random_starts, options.seed, pilot), poles, zeros, fewer)
-    count, part_count = (sum(data.count for data in one.records) for one in (problem, part))
+def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
+    """Return what the search of a part leads to; None where the whole records say more, or something else."""
+    problem, found = search.problem, []
+    for one in (pilot, search):
+        one.climb(poles, problem.zeros)
+        found.append(_least(one, poles, problem.zeros, fewer_poles))
+    expected, whole = found
+    count, part_count = (sum(data.count for data in one.problem.records) for one in (search, pilot))
     power = sum(data.count * float(np.var(data.y_used)) for data in problem.records)
-    if found.squared_error > min(AS_GOOD * expected.squared_error * count / part_count, (1 - EXPLAINED) * power):
+    if whole.squared_error > min(AS_GOOD * expected.squared_error * count / part_count, (1 - EXPLAINED) * power):
         return None
-    return replace(found, tried=expected.tried, agree=expected.agree)
+    return replace(whole, tried=expected.tried, agree=expected.agree)
 
 
-def least(nest: Nest, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
-    """The least squared error that a nest knows of a structure."""
+def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
+    """Return the least squared error of one of many structures, which share a search, and of those in its closure."""
+    search.climb(poles, zeros)
+    return _least(search, poles, zeros, True)
+
+
+def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
+    """Return the least squared error that a search knows of a structure."""
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
-    integrators = nest.problem.integrators
-    fewest = max(zeros + int(nest.box.delay_free) - integrators, int(not integrators)) if fewer_poles else poles
-    found = [nest.settled(n, zeros) for n in range(poles, fewest - 1, -1)] or [nest.settled(poles, zeros)]
-    errors = [judged.local.squared_error for judged in found]
+    fewest = max(zeros - search.most_zeros, int(not search.problem.integrators)) if fewer_poles else poles
+    found = [search.settled(n, zeros) for n in range(poles, min(fewest, poles) - 1, -1)]
+    errors = [local.squared_error for local in found]
     # Such a pole costs nothing: a smaller model must be worse by more than rounding to lose.
     lost = next(k for k, error in enumerate(errors) if error <= min(errors) * (1 + 1e-9))
-    ends = np.array(nest.ends(poles - lost, zeros))
+    ends = np.array(search.ends(poles - lost, zeros))
     level = max(min(errors), float(ends.min()))
-    agree = int(np.count_nonzero(ends <= level * (1 + SAME) + nest.descent(zeros).floor))
-    return _optimum(found[lost], lost, ends.size, agree, nest)
+    agree = int(np.count_nonzero(ends <= level * (1 + SAME) + search.descent(zeros).floor))
+    return _optimum(found[lost], lost, ends.size, agree, search)
 
 
-class Ladder(Nest):
-    """The optima of a range of structures, each from those below it, with few starts and none at random."""
-
-    def __init__(self, nest: Nest) -> None:
-        super().__init__(nest.problem, nest.box, 0, nest.seed, effort=QUICK)
-
-    def best(self, poles: int, zeros: int) -> Optimum:
-        """The least squared error of a structure and of those with fewer poles that are in its closure."""
-        return least(self, poles, zeros, fewer_poles=True)
-
-
-def problem_of(records: Sequence[FilterData], zeros: int, options: SearchOptions) -> Problem:
-    """The records and what is eliminated with them."""
-    periods = tuple(options.periods) or (0.0,) * len(records)
-    data = tuple(_one_period(*pair) if pair[1] else pair[0] for pair in zip(records, periods, strict=True))
-    integrators = options.integrators
-    if integrators and any(periods):
-        raise ValueError("what an integrator makes of a periodic input need not repeat itself")
-    return Problem(data, zeros, options.free_response, options.offset, periods, integrators=integrators)
-
-
-def _one_period(data: FilterData, period: float) -> FilterData:
-    """The record with the breaks of its input within one period."""
-    within = data.tu < data.tu[0] + period * (1 - 1e-9)
-    if within.all():
-        return data
-    # A regular pass takes a break for each sample.
-    return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)
-
-
-def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Optimum:
-    """The model in coefficients of polynomials."""
-    point, projected = best.local.point, best.local.projected
-    a, known, n = point.denominator, nest.known, point.poles.size
-    over = numerators(*nest.problem.sections(point.speed, point.damping))
+def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
+    """Return the model in coefficients of polynomials."""
+    assert best.ending is not None
+    point, projected = best.point, best.projected
+    a, known, n = point.denominator, search.known, point.poles.size
+    over = numerators(*search.problem.sections(point.speed, point.damping))
     held = best.held[:n]
     b = projected.output @ over
     if projected.direct:
-        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(nest.problem.integrators))
+        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(search.problem.integrators))
     slopes = point.denominator_slopes()[:, ~held]
     if known is not NOTHING:
         # The same up to rounding.
@@ -228,17 +220,60 @@ def _optimum(best: Judged, lost: int, tried: int, agree: int, nest: Nest) -> Opt
         delay=point.delay.seconds,
         free_responses=projected.free @ over,
         offsets=projected.offset,
-        squared_error=best.local.squared_error,
+        squared_error=best.squared_error,
         ending=best.ending,
         promise=best.promise,
         poles_at_infinity=lost,
         pole_slopes=slopes,
         held_poles=point.poles[point.whole_sections(held)],
-        delay_at_bound=nest.box.delay_free and bool(best.held[-1]) and not best.pinned,
+        delay_at_bound=search.box.delay_free and bool(best.held[-1]) and not best.pinned,
         pinned=best.pinned,
         tried=tried,
         agree=agree,
-        evaluations=nest.evaluations,
-        box=nest.box,
-        integrators=nest.problem.integrators,
+        evaluations=search.evaluations,
+        box=search.box,
+        integrators=search.problem.integrators,
     )
+
+
+# --- a part of long records, on which searches find out where to start on the whole -------------------
+
+
+def part_of(problem: Problem, latest: float) -> Problem | None:
+    """The liveliest part of each record, with a free response; None where the records are not long.
+
+    The input of a part is known for delays up to ``latest`` [s].
+    """
+    parts = liveliest_parts(problem.records, latest)
+    if parts is None or any(problem.periods):
+        return None
+    records = tuple(_cut(data, part, latest) for data, part in zip(problem.records, parts, strict=True))
+    return problem._replace(records=records, free_response=True, periods=(0.0,) * len(records))
+
+
+def liveliest_parts(records: Sequence[FilterData], latest: float) -> list[slice] | None:
+    """Samples of each record around which the input moves and the output varies most; None where none is long."""
+    if sum(data.t.size for data in records) <= LONG or not all(data.common_clock for data in records):
+        return None
+    # What comes before the latest delay tells nothing.
+    sizes = [PART // len(records) + int(latest * data.t.size / (data.t[-1] - data.t[0])) for data in records]
+    return [liveliest(data.u, data.y, size) for data, size in zip(records, sizes, strict=True)]
+
+
+def liveliest(u: Array, y: Array, size: int) -> slice:
+    """So many samples around which the input moves and the output varies most."""
+    if y.size <= size:
+        return slice(None)
+    moves, spread = np.abs(np.diff(u, append=u[-1])), np.abs(y - y.mean())
+    life = np.cumsum(moves / max(moves.mean(), 1e-300) + spread / max(spread.mean(), 1e-300))
+    begins = np.arange(0, y.size - size + 1, size // 4)
+    begin = int(begins[np.argmax(life[begins + size - 1] - life[begins])])
+    return slice(begin, begin + size)
+
+
+def _cut(data: FilterData, part: slice, latest: float) -> FilterData:
+    """A part, whose samples do not count while the input is unknown."""
+    if part == slice(None):
+        return data
+    t, y, u = (values[part].copy() for values in (data.t, data.y, data.u))
+    return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u)

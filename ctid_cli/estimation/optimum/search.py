@@ -1,7 +1,7 @@
 """Descent to a local minimum of the projected squared error, and what kind of minimum it is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -26,10 +26,6 @@ CLOSE = 0.01
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
-#: The same for the fall over the last few steps: between kinks, on an irregular clock, steps promise more than they do.
-CRAWLING, REMEMBERED = 300.0, 7
-#: A step of the greatest length is another one if it differs by more than this.
-ANOTHER = 0.01
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9
 #: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
@@ -56,12 +52,22 @@ class Ending(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Where a search is: the point, the least squares there, gradient and curvature of half the squared error."""
+    """Where a search is: the point, the least squares there, gradient and curvature of half the squared error.
+
+    The fields from ``ending`` on are those of a settled minimum.
+    """
 
     point: Point
     projected: Projected
     gradient: Array
     curvature: Array
+    ending: Ending | None = None
+    #: Fall that Newton's step promises, as a fraction of the squared error.
+    promise: float = np.inf
+    #: Coordinates held at a bound.
+    held: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    #: Whether the delay sits in a kink of the cost, at a sample.
+    pinned: bool = False
 
     @property
     def squared_error(self) -> float:
@@ -88,20 +94,6 @@ class Freedom(NamedTuple):
         moved = np.zeros((self.free.size, *inner.shape[1:]))
         moved[self.free] = (inner.T / self.unit).T
         return moved
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A local minimum and its kind."""
-
-    local: Local
-    ending: Ending
-    #: Fall that Newton's step promises, as a fraction of the squared error.
-    promise: float
-    #: Coordinates held at a bound.
-    held: BoolArray
-    #: Whether the delay sits in a kink of the cost, at a sample.
-    pinned: bool
 
 
 class Descent:
@@ -186,7 +178,7 @@ class Descent:
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
-        damping, factor, slow, falls = 1e-3, 2.0, 0, [np.inf] * REMEMBERED
+        damping, factor, slow = 1e-3, 2.0, 0
         scale = np.zeros(here.gradient.size)
         for taken in range(most_steps):
             here = self._faced(here)
@@ -198,17 +190,12 @@ class Descent:
             scaled, slope = ways.reduced(here.gradient, here.curvature)
             promise = _promise(scaled, slope)[0] if slope.size else 0.0
             arrived = not scale.size or promise <= near * max(here.squared_error, self.floor)
-            fallen = sum(falls) if self.box.cell == 0.0 else np.inf
-            if arrived or _hopeless(taken, here.squared_error, promise, fallen, lowest):
+            if arrived or _hopeless(taken, here.squared_error, promise, lowest):
                 break
-            lower, rejected = None, np.full(here.gradient.size, np.inf)
             for _ in range(MOST_REJECTIONS):
                 step = ways.whole(np.linalg.solve(scaled + damping * np.eye(slope.size), -slope))
-                length = float(np.abs(step).max())
-                step /= max(1.0, length)
-                # Where steps are cut to their greatest length, more damping hardly changes them at first.
-                if length <= 1.0 or np.abs(step - rejected).max() > ANOTHER:
-                    lower, rejected = self._lower(here, self._whole_and_to_edge(here.point, step)), step
+                step /= max(1.0, float(np.abs(step).max()))
+                lower = self._lower(here, self._whole_and_to_edge(here.point, step))
                 if lower is not None:
                     break
                 damping, factor = damping * factor, factor * 2.0
@@ -220,7 +207,6 @@ class Descent:
             damping *= max(1.0 / 3.0, 1.0 - (2.0 * fall / promised - 1.0) ** 3) if promised > 0 else 1.0
             damping, factor = max(damping, 1e-12), 2.0
             slow = slow + 1 if fall < 1e-9 * here.squared_error else 0
-            falls = [*falls[1:], fall]
             same = np.array_equal(trial.damping < 0, here.point.damping < 0)
             here = self.local(trial, found)
             if not same:
@@ -269,7 +255,7 @@ class Descent:
                 break
         return 0.5 * (whole + whole.T)
 
-    def settle(self, here: Local) -> Judged:
+    def settle(self, here: Local) -> Local:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
         kinked = False
         second: Array | None = None
@@ -345,7 +331,7 @@ class Descent:
         ends = [self.local(moved_by(here.point, sign * step, self.box)).gradient[-1] for sign in (-1.0, 1.0)]
         return bool(ends[0] <= 0 <= ends[1])
 
-    def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Judged:
+    def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
         pinned, bound = False, held.copy()
         if self.box.delay_free and held[-1]:
@@ -357,7 +343,7 @@ class Descent:
             ending = Ending.RIDGE
         elif promise <= CONVERGED:
             ending = Ending.AT_BOUND if bound.any() else Ending.CONVERGED
-        return Judged(here, ending, promise, held, pinned)
+        return replace(here, ending=ending, promise=promise, held=held, pinned=pinned)
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
         """Whether the squared error moves by less than the residual's variance as far as the set reaches.
@@ -425,9 +411,9 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < CLOSE)
 
 
-def _hopeless(taken: int, squared_error: float, promise: float, fallen: float, lowest: float) -> bool:
+def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
     """Whether a search will not come down to the lowest known minimum."""
-    too_flat = taken >= FIRST_STEPS and squared_error - min(HOPELESS * promise, CRAWLING * fallen) > lowest
+    too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 

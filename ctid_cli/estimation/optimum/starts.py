@@ -10,7 +10,7 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import LIMITS, Box, Point, point_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
-from ctid_cli.estimation.optimum.search import Descent, Judged, Local
+from ctid_cli.estimation.optimum.search import Descent, Local
 
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
@@ -52,80 +52,80 @@ THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, den
 QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2)
 
 
-class Nest:
-    """The optima of a structure and of all that it contains, each found from those below it."""
+class StructureSearch:
+    """The lowest minima of structures, each found from those of the smaller ones that it contains."""
 
     def __init__(
         self,
         problem: Problem,
         box: Box,
-        random_starts: int,
-        seed: int,
-        pilot: "Nest | None" = None,
-        known: KnownCoefficients = NOTHING,
+        random_starts: int = 0,
+        seed: int = 0,
+        *,
         effort: Effort = THOROUGH,
+        known: KnownCoefficients = NOTHING,
+        pilot: "StructureSearch | None" = None,
     ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
         self.effort = effort
         #: Known coefficients; with these only the one structure is searched that has them.
         self.known = known
-        #: The same for a part of the records, from whose optima the searches start.
+        #: The search of a part of the records, from whose minima this one starts.
         self.pilot = pilot
-        self.evaluations = 0
-        self._found: dict[tuple[int, int], list[Local]] = {}
+        self._descents: dict[int, Descent] = {}
+        self._minima: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
-        self._judged: dict[Local, Judged] = {}
 
     def descent(self, zeros: int) -> Descent:
-        """Searches with a numerator of that degree."""
-        return Descent(self.problem._replace(zeros=zeros), self.box, self.known)
+        """Return the local searches with a numerator of that degree."""
+        if zeros not in self._descents:
+            self._descents[zeros] = Descent(self.problem._replace(zeros=zeros), self.box, self.known)
+        return self._descents[zeros]
 
-    def optima(self, poles: int, zeros: int) -> list[Local]:
-        """The lowest minima of a structure that are known, the lowest first."""
-        key = poles, zeros
-        if key not in self._found:
-            if self.pilot is not None:
-                self.refine(poles, zeros, self._from_pilot(self.pilot, poles, zeros))
-            else:
-                # A larger structure must meet whatever this one finds by itself, at random too.
-                self.refine(poles, zeros, self._from_below(poles, zeros) + self.random_points(poles))
-        return self._found[key]
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the cost and of its gradient."""
+        return sum(descent.evaluations for descent in self._descents.values())
 
-    def _from_pilot(self, pilot: "Nest", poles: int, zeros: int) -> list[Point]:
-        """What a part of the records says, and the models that the structure contains exactly."""
-        there = pilot.optima(poles, zeros)[0].point
-        points = [point_of(there.poles, there.delay.seconds, self.box)]
-        if zeros > 0:
-            points.append(self.optima(poles, zeros - 1)[0].point)
-        if poles > 1 and zeros > 0:
-            within = self.optima(poles - 1, zeros - 1)[0].point
-            added = [-np.sqrt(self.box.spread[0] * self.box.fastest)]
-            points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
-        return points
+    @property
+    def most_zeros(self) -> int:
+        """Degree of the numerator less the number of searched poles, at most."""
+        return self.problem.integrators - int(self.box.delay_free)
 
-    def _alone(self, zeros: int, poles: int) -> list[Point]:
-        """The best single poles, or single pairs."""
-        middle = 0.5 * sum(self.box.delays)
-        if poles > 1:
-            middle = self.optima(1, 0)[0].point.delay.seconds
-        return self._extended(zeros, np.zeros(0, dtype=complex), middle, poles, self.effort.alone, self.effort.denser)
+    def climb(self, poles: int, zeros: int) -> None:
+        """Search a structure and all that it contains, the smallest first."""
+        for n in range(min(poles, int(not self.problem.integrators)), poles + 1):
+            for m in range(min(zeros, n + self.most_zeros) + 1):
+                if (n, m) in self._minima:
+                    continue
+                if self.pilot is not None:
+                    self.refine(n, m, self._from_pilot(self.pilot, n, m))
+                else:
+                    # A larger structure must meet whatever this one finds by itself, at random too.
+                    self.refine(n, m, self.from_below(n, m) + self.random_points(n))
+
+    def minima(self, poles: int, zeros: int) -> list[Local]:
+        """Return the lowest minima of a structure that are known, the lowest first."""
+        return self._minima.get((poles, zeros), [])
+
+    def best(self, poles: int, zeros: int) -> Point:
+        """Return where the lowest minimum of a structure is."""
+        return self._minima[poles, zeros][0].point
 
     def ends(self, poles: int, zeros: int) -> list[float]:
-        """Squared errors at which the searches for a structure have ended."""
+        """Return the squared errors at which the searches for a structure have ended."""
         return self._ends[poles, zeros]
 
-    def settled(self, poles: int, zeros: int) -> Judged:
+    def settled(self, poles: int, zeros: int) -> Local:
         """Return the lowest minimum of a structure to all digits, and its kind."""
-        lowest = self.optima(poles, zeros)[0]
-        if lowest not in self._judged:
-            descent = self.descent(zeros)
-            self._judged[lowest] = descent.settle(lowest)
-            self.evaluations += descent.evaluations
-        return self._judged[lowest]
+        minima = self._minima[poles, zeros]
+        if minima[0].ending is None:
+            minima[0] = self.descent(zeros).settle(minima[0])
+        return minima[0]
 
     def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
         """Search from points, and keep the lowest minima."""
-        descent, kept = self.descent(zeros), self._found.setdefault((poles, zeros), [])
+        descent, kept = self.descent(zeros), self._minima.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
         queue, cells = list(points), set[int]()
         while queue:
@@ -139,8 +139,24 @@ class Nest:
         for local in kept:
             if not distinct or local.squared_error > distinct[-1].squared_error * (1 + SAME):
                 distinct.append(local)
-        self._found[poles, zeros] = distinct[:KEPT]
-        self.evaluations += descent.evaluations
+        self._minima[poles, zeros] = distinct[:KEPT]
+
+    def _from_pilot(self, pilot: "StructureSearch", poles: int, zeros: int) -> list[Point]:
+        """Return what a part of the records says, and the models that the structure contains exactly."""
+        there = pilot.best(poles, zeros)
+        points = [point_of(there.poles, there.delay.seconds, self.box)]
+        if zeros > 0:
+            points.append(self.best(poles, zeros - 1))
+        if poles > 1 and zeros > 0:
+            within = self.best(poles - 1, zeros - 1)
+            added = [-np.sqrt(self.box.spread[0] * self.box.fastest)]
+            points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
+        return points
+
+    def _alone(self, zeros: int, poles: int) -> list[Point]:
+        """Return the best single poles, or single pairs."""
+        delay = self.best(1, 0).delay.seconds if poles > 1 else 0.5 * sum(self.box.delays)
+        return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
     def _beside(self, point: Point, cells: set[int]) -> list[Point]:
         """Starts in the cells of the delay beside that of a minimum, where they are not yet among these cells.
@@ -161,47 +177,25 @@ class Nest:
                 points += [point_of(point.poles, tau, self.box, cell) for tau in ((cell + 0.5) * width, border)]
         return points
 
-    def _from_below(self, poles: int, zeros: int) -> list[Point]:
-        """Starts from smaller models, and along the delay."""
-        effort = self.effort
+    def from_below(self, poles: int, zeros: int) -> list[Point]:
+        """Return starts from smaller models, and along the delay."""
         if poles == 0:
-            return self._along_delay(
-                zeros, [point_of(np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays), self.box)]
-            )
+            middle = point_of(np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays), self.box)
+            return self.along_delay(zeros, [middle])
         contained = self._alone(zeros, poles) if poles <= 2 else []
         others: list[Point] = []
         if zeros > 0:
-            contained.append(self.optima(poles, zeros - 1)[0].point)
+            contained.append(self.best(poles, zeros - 1))
         if poles > 1 and zeros > 0:
             # Contained in this structure whatever the added pole is, as is the one before.
             grown = self._grown(poles - 1, zeros - 1, zeros, 1)
             contained, others = contained + grown[:1], grown[1:]
-        most_zeros = int(not self.box.delay_free) + self.problem.integrators
         for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
-            if n > 0 and 0 <= m < n + most_zeros:
+            if n > 0 and 0 <= m <= n + self.most_zeros:
                 others += self._grown(n, m, zeros, poles - n)
         descent = self.descent(zeros)
-        points = descent.sorted(contained) + descent.sorted(others)[: effort.refined]
-        self.evaluations += descent.evaluations
-        return self._along_delay(zeros, points) if poles <= effort.along_delay else points
-
-    def with_known(self, poles: int, zeros: int, known: KnownCoefficients, points: Iterable[Point]) -> "Nest":
-        """Return a nest of the models of a structure that have known coefficients.
-
-        Started from all that was found without them, moved to where they hold, from further points and at random.
-        """
-        nest = Nest(self.problem, self.box, self.random_starts, self.seed, known=known)
-        if known.all_poles:
-            starts = [point_of(known.poles, 0.5 * sum(self.box.delays), self.box)]
-        else:
-            starts = [*points, *(local.point for local in self.optima(poles, zeros)), *self._from_below(poles, zeros)]
-            starts += self.resonances(poles, zeros) + nest.random_points(poles)
-        moved = [point for point in (known.met(start, self.box) for start in starts) if point is not None]
-        descent = nest.descent(zeros)
-        moved = descent.sorted(moved)
-        nest.evaluations += descent.evaluations
-        nest.refine(poles, zeros, nest._along_delay(zeros, moved))
-        return nest
+        points = descent.sorted(contained) + descent.sorted(others)[: self.effort.refined]
+        return self.along_delay(zeros, points) if poles <= self.effort.along_delay else points
 
     def resonances(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with a pair of the least damping, beside the poles of a smaller model.
@@ -217,7 +211,7 @@ class Nest:
             return []
         roots, delay = np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays)
         if poles > 2:
-            smaller = self.optima(poles - 2, min(zeros, poles - 3))[0].point
+            smaller = self.best(poles - 2, min(zeros, poles - 3))
             roots, delay = smaller.poles, smaller.delay.seconds
         zeta = self.box.least_damping
         frequencies = np.linspace(resolution, highest, count).tolist()
@@ -241,13 +235,12 @@ class Nest:
         self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, float]]
     ) -> list[tuple[float, float, Point]]:
         """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
-        descent, frequencies, points = self.descent(zeros), [], []
+        frequencies, points = [], []
         for w, zeta, tau in places:
             pair = w * complex(-zeta, 1.0)
             frequencies.append(w)
             points.append(point_of(np.concatenate((roots, [pair, pair.conjugate()])), tau, self.box))
-        errors = descent.squared_errors(points).tolist()
-        self.evaluations += descent.evaluations
+        errors = self.descent(zeros).squared_errors(points).tolist()
         return list(zip(errors, frequencies, points, strict=True))
 
     def close_delays(self, poles: int, zeros: int) -> list[Point]:
@@ -257,7 +250,7 @@ class Nest:
         """
         if self.box.cell > 0 or not self.box.delay_free:
             return []
-        best = self.optima(poles, zeros)[0].point
+        best = self.best(poles, zeros)
         interval = LIMITS["fastest"].rest / self.box.fastest
         delays = best.delay.seconds + interval * np.concatenate((-CLOSE_DELAYS, CLOSE_DELAYS))
         inside = np.unique(np.clip(delays, *self.box.delays))
@@ -265,7 +258,7 @@ class Nest:
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
-        point = self.optima(poles, zeros)[0].point
+        point = self.best(poles, zeros)
         return self._extended(new_zeros, point.poles, point.delay.seconds, added, self.effort.looked_at)
 
     def _extended(
@@ -285,25 +278,19 @@ class Nest:
                 new = [pole, pole.conjugate()] if added == 2 else [complex(-w)]
                 where.append((np.log(w), np.log(zeta)))
                 points.append(point_of(np.concatenate((roots, new)), delay, box))
-        descent, chosen = self.descent(zeros), list[int]()
-        order = np.argsort(descent.squared_errors(points), kind="stable").tolist()
-        self.evaluations += descent.evaluations
-        for k in order:
+        chosen: list[int] = []
+        for k in np.argsort(self.descent(zeros).squared_errors(points), kind="stable").tolist():
             apart = all(np.abs(np.subtract(where[k], where[other])).max() > APART for other in chosen)
             if apart and len(chosen) < most:
                 chosen.append(k)
         return [points[k] for k in chosen]
 
-    def _along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
-        """Further starts at the minima of the profile over the delay, for the poles of the best start."""
+    def along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
+        """Return also starts at the minima of the profile over the delay, for the poles of the best start."""
         if not self.box.delay_free or not points:
             return points
-        descent = self.descent(zeros)
-        best = points[0]
-        trials = [point_of(best.poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
-        errors = descent.squared_errors(trials)
-        self.evaluations += descent.evaluations
-        return points + [trials[k] for k in _lowest_minima(errors, KEPT)]
+        trials = [point_of(points[0].poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
+        return points + [trials[k] for k in _lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
 
     def _delays(self, most: int) -> list[float]:
         """Delays that are spread over the whole range, at most one for each of its cells; none of a known delay."""

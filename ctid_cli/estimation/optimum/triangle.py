@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dgeqrf
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
@@ -84,16 +85,24 @@ def rows_of(
         yield rows
 
 
+def _reduced(triangle: Array | None, rows: Array) -> Array:
+    """Return the triangle of rows, transposed and overwritten, below another triangle: R <- qr[R; rows]."""
+    q, whole = len(rows), rows if triangle is None else np.hstack((triangle.T, rows))
+    # The transpose has the order of LAPACK: nothing is copied, unlike in ``numpy.linalg.qr``.
+    factors = dgeqrf(whole.T, lwork=32 * q, overwrite_a=True)[0][:q]
+    result = np.zeros((q, q))
+    result[: len(factors)] = np.triu(factors)
+    return result
+
+
 def triangle_of(form: Form, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
+    # Memory is that of one piece, however long the record.
     triangle: Array | None = None
     for rows in rows_of(form, columns, delay, data, period):
-        # R <- qr[R; piece]: memory is that of one piece, however long the record.
-        whole = rows if triangle is None else np.hstack((triangle.T, rows))
-        triangle = np.asarray(np.linalg.qr(whole.T, mode="r"))
+        triangle = _reduced(triangle, rows)
     assert triangle is not None
-    missing = columns.size - len(triangle)
-    return np.pad(triangle, ((0, missing), (0, 0))) if missing else triangle
+    return triangle
 
 
 def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
@@ -110,13 +119,10 @@ def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: Filte
     chosen += [n + 2 + z] if columns.free else []
     chosen += [np.tile(others[2:], (len(forms), 1))] if columns.offset else []
     rows_of_forms = np.hstack(chosen)
-    triangles = np.zeros((len(forms), 0, columns.size))
+    triangles: list[Array | None] = [None] * len(forms)
     for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period):
-        own = rows[rows_of_forms].transpose(0, 2, 1)
-        whole_piece = np.concatenate((triangles, own), axis=1) if triangles.size else own
-        triangles = np.asarray(np.linalg.qr(whole_piece, mode="r"))
-    missing = columns.size - triangles.shape[1]
-    return np.pad(triangles, ((0, 0), (0, missing), (0, 0)))
+        triangles = [_reduced(*pair) for pair in zip(triangles, rows[rows_of_forms], strict=True)]
+    return np.array(triangles)
 
 
 def _record(delay: Delay, data: FilterData, period: float) -> Record:

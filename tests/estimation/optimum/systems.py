@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ctid_cli.estimation.optimum.best_model import best_output_error
+from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -38,3 +40,16 @@ def record_of(model, rng, *, samples=300, noise=0.0, regular=True, hold="zoh", o
     x = simulate(model, HeldSignal(t, u, hold), t)
     y = x + noise * x.std() * rng.standard_normal(samples) + offset
     return Record.from_arrays(t, u, y, hold=hold)
+
+
+def problem_of(records, zeros, *, free_response=False, offset=False, periods=None, integrators=0):
+    """Laid out records, and what is eliminated with them."""
+    periods = periods or (0.0,) * len(records)
+    return Problem(tuple(records), zeros, free_response, offset, periods, integrators=integrators)
+
+
+def best(records, poles, zeros, *, delays=(0.0, 0.0), starts=(), **options):
+    """The least output error of laid out records."""
+    names = "free_response", "offset", "periods", "integrators"
+    problem = problem_of(records, zeros, **{name: options.pop(name) for name in names if name in options})
+    return best_output_error(problem, poles, delays, starts, **options)

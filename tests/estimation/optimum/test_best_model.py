@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimation.optimum import pilot
-from ctid_cli.estimation.optimum.best_model import SearchOptions, best_output_error
+from ctid_cli.estimation.optimum import best_model
 from ctid_cli.estimation.optimum.search import Ending
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
@@ -14,7 +13,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import squared_error
-from tests.estimation.optimum.systems import random_model, record_of
+from tests.estimation.optimum.systems import best, random_model, record_of
 
 
 @pytest.mark.parametrize(
@@ -24,8 +23,8 @@ def test_a_system_without_noise_is_found(n, m, delay, regular):
     rng = np.random.default_rng(10 * n + m)
     model = random_model(rng, n, m, delay)
     record = record_of(model, rng, samples=400, regular=regular, offset=1.5)
-    options = SearchOptions(delays=(0.0, 3.0) if delay else (0.0, 0.0), offset=True, random_starts=0)
-    found = best_output_error([filter_data(record)], n, m, options)
+    options = {"delays": (0.0, 3.0) if delay else (0.0, 0.0), "offset": True, "random_starts": 0}
+    found = best([filter_data(record)], n, m, **options)
     assert found.ending.optimal
     assert 1 <= found.agree <= found.tried
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=1e-6)
@@ -37,12 +36,8 @@ def test_a_system_without_noise_is_found(n, m, delay, regular):
 def test_no_structure_is_worse_than_one_that_it_contains(seed):
     rng = np.random.default_rng(seed)
     record = record_of(random_model(rng, 3, 1), rng, samples=120, noise=1.0)
-    options = SearchOptions(free_response=bool(seed % 2), random_starts=0)
-    least = {
-        (n, m): best_output_error([filter_data(record)], n, m, options).squared_error
-        for n in range(1, 5)
-        for m in range(n)
-    }
+    options = {"free_response": bool(seed % 2), "random_starts": 0}
+    least = {(n, m): best([filter_data(record)], n, m, **options).squared_error for n in range(1, 5) for m in range(n)}
     for (n, m), error in least.items():
         for smaller in ((n - 1, m - 1), (n, m - 1), (n - 1, m)):
             if smaller in least:
@@ -54,9 +49,9 @@ def test_a_mode_that_hardly_decays_is_found_between_the_others_of_the_noise(seed
     modes = AdditiveModel([Submodel([1.0], [1.0, 1.2, 1.0]), Submodel([0.004], [5.05**-2, 2e-4 / 5.05, 1.0])])
     model = unfactored(modes)
     data = filter_data(record_of(model, np.random.default_rng(seed), samples=240, noise=0.1))
-    true_poles = SearchOptions(starts=[(model.denominator, 0.0)], nested=False)
-    expected = best_output_error([data], 4, 2, true_poles).squared_error
-    assert best_output_error([data], 4, 2, SearchOptions(random_starts=2)).squared_error <= expected * (1 + 1e-9)
+    true_poles = {"starts": [(model.denominator, 0.0)], "nested": False}
+    expected = best([data], 4, 2, **true_poles).squared_error
+    assert best([data], 4, 2, random_starts=2).squared_error <= expected * (1 + 1e-9)
 
 
 def test_a_superfluous_pole_runs_to_infinity():
@@ -64,7 +59,7 @@ def test_a_superfluous_pole_runs_to_infinity():
     rng = np.random.default_rng(4)
     record = record_of(TransferFunction([0.8], [1.0, 0.8]), rng, noise=0.02)
     early = Record.from_arrays(record.t[:-1], record.input.values[:-1], record.y[1:])
-    one, two = (best_output_error([filter_data(early)], n, 0, SearchOptions(random_starts=5)) for n in (1, 2))
+    one, two = (best([filter_data(early)], n, 0, random_starts=5) for n in (1, 2))
     assert two.poles_at_infinity == 1
     assert two.squared_error == pytest.approx(one.squared_error, rel=1e-9)
     assert two.denominator.size == 2
@@ -74,8 +69,8 @@ def test_the_model_has_the_squared_error_that_is_said():
     rng = np.random.default_rng(5)
     record = record_of(random_model(rng, 3, 2, 0.6), rng, noise=0.3, offset=2.0)
     data = filter_data(record, 2.0)
-    options = SearchOptions(delays=(0.0, 2.0), free_response=True, offset=True, random_starts=0)
-    found = best_output_error([data], 2, 1, options)
+    options = {"delays": (0.0, 2.0), "free_response": True, "offset": True, "random_starts": 0}
+    found = best([data], 2, 1, **options)
     # C/A of an impulse is C p/A of a step, with what jumps at once taken apart.
     used = data.t[data.use]
     free = simulate(
@@ -90,7 +85,7 @@ def test_the_model_has_the_squared_error_that_is_said():
 def test_a_biproper_model_has_a_direct_way_through():
     rng = np.random.default_rng(6)
     model = TransferFunction([0.5, 1.0, 2.0], [1.0, 0.9, 1.3])
-    found = best_output_error([filter_data(record_of(model, rng))], 2, 2, SearchOptions(random_starts=0))
+    found = best([filter_data(record_of(model, rng))], 2, 2, random_starts=0)
     np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-6)
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=1e-6)
 
@@ -105,8 +100,8 @@ def test_a_periodic_record_is_exact_for_a_lightly_damped_model():
     long = 0.5 * np.arange(periods * t.size)
     x = simulate(model, HeldSignal(long, np.tile(u, periods)), long)[-t.size :]
     record = Record.from_arrays(t, u, x + 0.01 * rng.standard_normal(t.size))
-    options = SearchOptions(delays=(0.0, 2.0), periods=(period,), random_starts=5)
-    found = best_output_error([filter_data(record)], 2, 0, options)
+    options = {"delays": (0.0, 2.0), "periods": (period,), "random_starts": 5}
+    found = best([filter_data(record)], 2, 0, **options)
     assert found.ending is Ending.CONVERGED
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=0.01, atol=1e-4)
     assert found.delay == pytest.approx(0.7, abs=0.02)
@@ -123,7 +118,7 @@ def test_a_resonator_of_little_damping_is_within_the_set_of_a_periodic_record():
     x = simulate(model, HeldSignal(long, np.tile(u, periods)), long)[-t.size :]
     noise = 0.01 * x.std() * rng.standard_normal(t.size)
     record = Record.from_arrays(t, u, x + noise)
-    found = best_output_error([filter_data(record)], 2, 0, SearchOptions(periods=(200.0,), random_starts=0))
+    found = best([filter_data(record)], 2, 0, periods=(200.0,), random_starts=0)
     assert found.ending is Ending.CONVERGED
     assert found.squared_error <= noise @ noise
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=0.1)
@@ -135,7 +130,7 @@ def test_an_integrating_drive_at_rest_is_next_to_the_set():
     u = np.repeat(rng.choice([-1.0, 1.0], 20), 20)
     x = simulate(TransferFunction([1.0], [8.0, 1.0, 0.0]), HeldSignal(t, u), t)
     noise = 0.01 * x.std() * rng.standard_normal(t.size)
-    found = best_output_error([filter_data(Record.from_arrays(t, u, x + noise))], 2, 0, SearchOptions(random_starts=0))
+    found = best([filter_data(Record.from_arrays(t, u, x + noise))], 2, 0, random_starts=0)
     # Three parameters fit noise too; the slowest pole is not zero.
     assert found.squared_error <= 1.001 * (noise @ noise)
     np.testing.assert_allclose(found.denominator[1], 0.125, rtol=0.02)
@@ -147,8 +142,8 @@ def test_given_starts_alone_are_refined_where_nothing_else_is_wanted():
     rng = np.random.default_rng(8)
     model = random_model(rng, 3, 1)
     data = filter_data(record_of(model, rng, noise=0.1))
-    everything = best_output_error([data], 3, 1, SearchOptions(random_starts=0))
-    alone = best_output_error([data], 3, 1, SearchOptions(starts=[(model.denominator, 0.0)], nested=False))
+    everything = best([data], 3, 1, random_starts=0)
+    alone = best([data], 3, 1, starts=[(model.denominator, 0.0)], nested=False)
     assert alone.squared_error == pytest.approx(everything.squared_error, rel=1e-9)
     assert (alone.tried, alone.agree) == (1, 1)
     assert alone.evaluations < everything.evaluations / 5
@@ -161,9 +156,9 @@ def test_a_lightly_damped_pair_is_found_without_a_smaller_model_that_shows_it(se
     w, zeta = np.exp(rng.uniform(np.log((0.05, 0.005)), np.log((5.0, 0.5))))
     denominator = [1.0, 2 * zeta * w, w * w]
     record = record_of(TransferFunction([w * w], denominator), rng, samples=200, noise=(0.1, 1.0, 5.0)[seed % 3])
-    found = best_output_error([filter_data(record)], 2, 0, SearchOptions(free_response=True, random_starts=0))
-    options = SearchOptions(free_response=True, starts=[(denominator, 0.0)], nested=False)
-    assert found.squared_error <= best_output_error([filter_data(record)], 2, 0, options).squared_error * (1 + 1e-9)
+    found = best([filter_data(record)], 2, 0, free_response=True, random_starts=0)
+    options = {"free_response": True, "starts": [(denominator, 0.0)], "nested": False}
+    assert found.squared_error <= best([filter_data(record)], 2, 0, **options).squared_error * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("seed", [11, 35, 60])
@@ -176,8 +171,8 @@ def test_a_delay_is_found_across_a_kink(seed):
     model = TransferFunction([pole], [1.0, pole], rng.uniform(2, 8))
     record = Record(t, simulate(model, held, t), held)
     start = [1.0, 0.3], model.delay + 1.0
-    options = SearchOptions(delays=(0.0, 12.0), nested=False, random_starts=2, starts=[start])
-    found = best_output_error([filter_data(record)], 1, 0, options)
+    options = {"delays": (0.0, 12.0), "nested": False, "random_starts": 2, "starts": [start]}
+    found = best([filter_data(record)], 1, 0, **options)
     assert found.delay == pytest.approx(model.delay, abs=1e-6)
 
 
@@ -185,11 +180,11 @@ def test_a_delay_is_found_across_a_kink(seed):
 def test_a_long_record_is_searched_by_a_part_of_it(monkeypatch, delay, free_response):
     rng = np.random.default_rng(9)
     data = filter_data(record_of(random_model(rng, 3, 1, delay), rng, samples=1500, noise=0.3, regular=delay == 0.0))
-    options = SearchOptions(delays=(0.0, 2 * delay), free_response=free_response, random_starts=2)
-    whole = best_output_error([data], 3, 1, options)
-    monkeypatch.setattr(pilot, "LONG", 1000)
-    monkeypatch.setattr(pilot, "PART", 400)
-    part = best_output_error([data], 3, 1, options)
+    options = {"delays": (0.0, 2 * delay), "free_response": free_response, "random_starts": 2}
+    whole = best([data], 3, 1, **options)
+    monkeypatch.setattr(best_model, "LONG", 1000)
+    monkeypatch.setattr(best_model, "PART", 400)
+    part = best([data], 3, 1, **options)
     assert part.squared_error == pytest.approx(whole.squared_error, rel=1e-9)
     assert part.evaluations < 0.2 * whole.evaluations
 
@@ -201,9 +196,9 @@ def test_a_part_that_tells_too_little_is_not_trusted(monkeypatch):
     u = np.where(t < 300, np.repeat(rng.choice([-1.0, 1.0], 1000), 3), 1.0)
     model = TransferFunction([0.5, 0.004], [1.0, 0.502, 0.001])
     record = Record(t, simulate(model, HeldSignal(t, u), t) + 1e-3 * rng.standard_normal(t.size), HeldSignal(t, u))
-    options = SearchOptions(random_starts=2)
-    whole = best_output_error([filter_data(record)], 2, 1, options)
-    monkeypatch.setattr(pilot, "LONG", 1000)
-    monkeypatch.setattr(pilot, "PART", 200)
-    part = best_output_error([filter_data(record)], 2, 1, options)
+    options = {"random_starts": 2}
+    whole = best([filter_data(record)], 2, 1, **options)
+    monkeypatch.setattr(best_model, "LONG", 1000)
+    monkeypatch.setattr(best_model, "PART", 200)
+    part = best([filter_data(record)], 2, 1, **options)
     assert part.squared_error <= whole.squared_error * (1 + 1e-6)

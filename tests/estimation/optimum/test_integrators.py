@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from ctid_cli.estimation.optimum.best_model import SearchOptions, best_output_error, problem_of
 from ctid_cli.estimation.optimum.projection import project, slopes
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import squared_error
-from tests.estimation.optimum.systems import record_of
+from tests.estimation.optimum.systems import best, problem_of, record_of
 
 SPEED, DAMPING = np.array([2.2, 0.4]), np.array([0.3, -1.0])
 DENOMINATOR = np.convolve([1.0, 1.32, 4.84], [1.0, 0.4])
@@ -23,7 +22,7 @@ MODEL = [TransferFunction([1.0, 3.0], np.append([1.0, 1.3, 2.4], np.zeros(k)), 0
 @pytest.mark.parametrize("zeros", [0, 3])
 def test_projection_is_that_of_dense_matrices(integrators, regular, zeros, treatment):
     record = record_of(MODEL[integrators], np.random.default_rng(1), noise=0.1, offset=0.3, regular=regular)
-    problem = problem_of([filter_data(record)], zeros, SearchOptions(integrators=integrators, **treatment))
+    problem = problem_of([filter_data(record)], zeros, integrators=integrators, **treatment)
     found = project(problem, SPEED, DAMPING, Delay(0.37, -1)).squared_error
     whole = np.append(DENOMINATOR, np.zeros(integrators))
     assert found == pytest.approx(squared_error(record, whole, zeros, 0.37, **treatment), rel=1e-8)
@@ -33,8 +32,7 @@ def test_projection_is_that_of_dense_matrices(integrators, regular, zeros, treat
 @pytest.mark.parametrize("integrators", [1, 2])
 def test_gradient_is_that_of_differences(integrators, free_response):
     record = record_of(MODEL[integrators], np.random.default_rng(2), noise=0.1)
-    options = SearchOptions(integrators=integrators, free_response=free_response)
-    problem = problem_of([filter_data(record)], 2, options)
+    problem = problem_of([filter_data(record)], 2, integrators=integrators, free_response=free_response)
 
     def value(step):
         speed, damping = SPEED * np.exp([step[0], step[2]]), DAMPING * np.exp([step[1], 0.0])
@@ -56,15 +54,9 @@ def test_an_integrating_model_is_found(integrators, free_response):
         # What came before is a state, the offset part of it.
         y[:40] = np.nan
     data = filter_data(Record(record.t, y, record.input))
-    options = SearchOptions((0.0, 2.0), free_response, free_response, integrators=integrators, random_starts=2)
-    found = best_output_error([data], 2, 1, options)
+    own = {"free_response": free_response, "offset": free_response, "integrators": integrators}
+    found = best([data], 2, 1, delays=(0.0, 2.0), random_starts=2, **own)
     assert found.squared_error < 1e-16 * float(data.y_used @ data.y_used)
     assert found.delay == pytest.approx(0.7, abs=1e-6)
     np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-5)
     np.testing.assert_allclose(found.model.denominator, model.denominator, rtol=1e-5)
-
-
-def test_a_periodic_record_of_an_integrator_is_refused():
-    data = filter_data(record_of(MODEL[1], np.random.default_rng(4)))
-    with pytest.raises(ValueError, match="need not repeat"):
-        best_output_error([data], 2, 1, SearchOptions(periods=(150.0,), integrators=1))

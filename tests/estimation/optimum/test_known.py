@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum.best_model import SearchOptions, best_output_error
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.known import KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
@@ -13,7 +12,7 @@ from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.transfer_function import TransferFunction
 from tests.estimation.optimum.dense import columns_of, left_over
-from tests.estimation.optimum.systems import MODEL, random_model, record_of
+from tests.estimation.optimum.systems import MODEL, best, random_model, record_of
 
 SPEED, DAMPING = np.array([2.2, 0.3]), np.array([0.4, -1.0])
 DENOMINATOR = np.convolve([1.0, 2 * 0.4 * 2.2, 2.2**2], [1.0, 0.3])
@@ -76,7 +75,7 @@ def test_known_coefficients_that_hold_poles_at_a_bound():
     record = record_of(TransferFunction([1.0], [1.0, 1.0, 0.0625]), rng, samples=300, noise=0.05)
     data = filter_data(record)
     known = KnownCoefficients.of(2, 0, {0: 0.05})
-    found = best_output_error([data], 2, 0, SearchOptions(known=known, free_response=True))
+    found = best([data], 2, 0, known=known, free_response=True)
     assert found.ending in (Ending.AT_BOUND, Ending.CONVERGED)
     assert found.denominator[1] == 0.05
     trials = [[1.0, 0.05, a2] for a2 in np.geomspace(1e-4, 30.0, 200)]
@@ -93,7 +92,7 @@ def test_known_coefficients_that_hold_poles_at_a_bound():
 def test_a_known_denominator_needs_no_box():
     record = record_of(TransferFunction([2.0], [1.0, 1e-4]), np.random.default_rng(5), noise=0.01)
     known = KnownCoefficients.of(1, 0, {0: 1e-4})
-    found = best_output_error([filter_data(record)], 1, 0, SearchOptions(known=known, free_response=True))
+    found = best([filter_data(record)], 1, 0, known=known, free_response=True)
     assert found.denominator.tolist() == [1.0, 1e-4]
     assert found.numerator == pytest.approx([2.0], rel=0.05)
     assert found.ending is Ending.CONVERGED
@@ -103,7 +102,7 @@ def test_values_that_no_admissible_model_has_are_refused():
     record = record_of(TransferFunction([2.0], [1.0, 1.0, 1.0]), np.random.default_rng(6), noise=0.1)
     known = KnownCoefficients.of(2, 0, {0: 1e5})
     with pytest.raises(DataError, match="no model with the fixed a1 = 100000"):
-        best_output_error([filter_data(record)], 2, 0, SearchOptions(known=known))
+        best([filter_data(record)], 2, 0, known=known)
 
 
 def test_the_end_of_a_search_is_stationary_along_the_constraint():
@@ -112,7 +111,7 @@ def test_the_end_of_a_search_is_stationary_along_the_constraint():
     data = filter_data(record_of(model, rng, noise=0.2))
     values = {1: 1.2 * model.denominator[2], 4: 0.8 * model.numerator[0]}
     known = KnownCoefficients.of(4, 1, values)
-    found = best_output_error([data], 4, 1, SearchOptions(delays=(0.0, 3.0), known=known))
+    found = best([data], 4, 1, delays=(0.0, 3.0), known=known)
     assert found.ending is Ending.CONVERGED
     assert (found.denominator[2], found.numerator[0]) == (values[1], values[4])
     box = found.box

@@ -45,7 +45,7 @@ def test_a_general_optimiser_in_the_same_box_finds_the_same_minimum(seed, regula
         gtol=1e-12,
     )
     assert found.ending.optimal
-    assert found.local.squared_error == pytest.approx(2 * other.cost, rel=1e-8)
+    assert found.squared_error == pytest.approx(2 * other.cost, rel=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -57,8 +57,8 @@ def test_a_system_without_noise_is_found_from_nearby(seed):
     descent = descent_of(record, n - 1, (0.0, 2.0), free_response=True, offset=True)
     found = settled(descent, model.poles * 1.02, 0.75)
     assert found.ending.optimal
-    np.testing.assert_allclose(np.sort_complex(found.local.point.poles), np.sort_complex(model.poles), rtol=1e-6)
-    assert found.local.point.delay.seconds == pytest.approx(0.8, abs=1e-7)
+    np.testing.assert_allclose(np.sort_complex(found.point.poles), np.sort_complex(model.poles), rtol=1e-6)
+    assert found.point.delay.seconds == pytest.approx(0.8, abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -69,12 +69,12 @@ def test_a_minimum_is_lower_than_everything_around_it(seed):
     found = settled(descent, random_poles(rng, 3), 0.6)
     assert found.ending.optimal
     assert found.promise <= CONVERGED
-    point = found.local.point
+    point = found.point
     for _ in range(40):
         speed, damping = point.shifted(1e-3 * rng.standard_normal(4))
         tau = point.delay.seconds + 1e-3 * rng.standard_normal()
         there = point_of(type(point)(speed, damping, point.edge, point.delay).poles, tau, descent.box)
-        assert descent.value(there).squared_error >= found.local.squared_error * (1 - 1e-12)
+        assert descent.value(there).squared_error >= found.squared_error * (1 - 1e-12)
 
 
 @pytest.mark.parametrize("seed", [2, 6, 7])
@@ -86,8 +86,8 @@ def test_a_minimum_in_a_kink_is_pinned_to_its_sample(seed):
     found = settled(descent, [-0.6], 1.7)
     assert found.ending is Ending.CONVERGED
     assert found.pinned
-    assert found.local.point.delay.seconds == 2.0
-    before, after = (descent.local(replace(found.local.point, delay=Delay(2.0, cell))).gradient[-1] for cell in (3, 4))
+    assert found.point.delay.seconds == 2.0
+    before, after = (descent.local(replace(found.point, delay=Delay(2.0, cell))).gradient[-1] for cell in (3, 4))
     assert before < 0 < after
 
 
@@ -97,7 +97,7 @@ def test_a_pole_beyond_the_set_stops_at_its_border():
     slow = Record.from_arrays(t, np.ones(300), 1e-4 * t**2 + 1e-3 * rng.standard_normal(300))
     found = settled(descent_of(slow, 0), [-0.1])
     assert found.ending is Ending.AT_BOUND
-    np.testing.assert_allclose(found.local.point.poles, [-LIMITS["slowest"].rest / t[-1]])
+    np.testing.assert_allclose(found.point.poles, [-LIMITS["slowest"].rest / t[-1]])
 
 
 def test_what_a_record_says_nothing_about_is_a_ridge():

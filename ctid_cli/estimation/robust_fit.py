@@ -1,0 +1,94 @@
+r"""The least loss of measured records with outliers.
+
+With x the simulated outputs, a loss is minimised by fitting ``x + psi(r)`` instead of ``y = x + r``: the squared errors
+touch twice the loss from above, so that every fit lowers the loss, and where nothing moves any more
+``sum s psi(r) = 0`` [1]_. All starts, bounds and kinds of minima of least squares serve the loss too.
+
+References
+----------
+.. [1] P. J. Huber and E. M. Ronchetti, *Robust Statistics*, 2nd ed. (Wiley 2009), section 7.8.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.search import ROUNDING
+from ctid_cli.inference.robust_loss import Loss, RobustKind, scale_of
+
+#: Most fits in one descent, and most of them after which the scale is taken anew.
+MOST_FITS, MOST_SCALES = 60, 20
+#: The scale has settled where it changes by less than this fraction, the descent where the loss falls by less.
+SETTLED, DONE = 1e-4, 1e-11
+#: Most searches, and the fraction by which the next one must lower the loss.
+MOST_SEARCHES, WORTHWHILE = 5, 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RobustFit:
+    """A local minimum of the loss."""
+
+    found: Optimum
+    losses: tuple[Loss, ...]
+    #: Simulated outputs and output errors at the used samples of each record.
+    simulated: list[Array]
+    errors: list[Array]
+
+    def cost(self, losses: Sequence[Loss]) -> float:
+        """Twice the sum of losses of given scales."""
+        return sum(loss.cost(r) for loss, r in zip(losses, self.errors, strict=True))
+
+    def modified(self) -> list[Array]:
+        """Outputs whose least squares are taken next."""
+        each = zip(self.simulated, self.losses, self.errors, strict=True)
+        return [x + loss.weight(r) * r for x, loss, r in each]
+
+
+def robust_fit(
+    measured: MeasuredRecords, kind: RobustKind, starts: Sequence[tuple[Array, float]], nested: bool
+) -> RobustFit:
+    """Search for the least Huber loss, and from there for Tukey's.
+
+    The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.
+    """
+    best = _descend(measured, measured.best(starts, nested), "huber")
+    for _ in range(MOST_SEARCHES):
+        at = [(best.found.denominator, best.found.delay), *starts]
+        trial = _descend(measured, measured.with_outputs(best.modified()).best(at, nested), "huber")
+        smaller = [min(pair, key=lambda loss: loss.scale) for pair in zip(best.losses, trial.losses, strict=True)]
+        if trial.cost(smaller) > best.cost(smaller) * (1.0 - WORTHWHILE):
+            break
+        best = trial
+    if kind == "tukey":
+        best = _descend(measured, best.found, kind, tuple(replace(loss, kind=kind) for loss in best.losses))
+    return best
+
+
+def _descend(
+    measured: MeasuredRecords, found: Optimum, kind: RobustKind, losses: tuple[Loss, ...] | None = None
+) -> RobustFit:
+    """Local minimum of the loss, at given scales or at those of the errors, which are fixed when they have settled."""
+    here = _at(measured, found, kind, losses)
+    settled = losses is not None
+    for k in range(MOST_FITS):
+        there = measured.with_outputs(here.modified()).local(here.found)
+        there = replace(there, tried=found.tried, agree=found.agree, poles_at_infinity=found.poles_at_infinity)
+        following = _at(measured, there, kind, here.losses if settled else None)
+        if settled and following.cost(here.losses) >= here.cost(here.losses) * (1.0 - DONE):
+            break
+        changes = [new.scale / old.scale - 1.0 for new, old in zip(following.losses, here.losses, strict=True)]
+        settled = settled or k >= MOST_SCALES or float(np.abs(changes).max()) < SETTLED
+        here = following
+    return following
+
+
+def _at(measured: MeasuredRecords, found: Optimum, kind: RobustKind, losses: tuple[Loss, ...] | None) -> RobustFit:
+    simulated, outputs = measured.simulated(found), measured.outputs
+    errors = [y - x for y, x in zip(outputs, simulated, strict=True)]
+    least = [ROUNDING * float(np.sqrt(np.mean(y**2))) for y in outputs]
+    losses = losses or tuple(Loss(kind, scale_of(*pair)) for pair in zip(errors, least, strict=True))
+    return RobustFit(found, losses, simulated, errors)
