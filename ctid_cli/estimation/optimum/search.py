@@ -23,6 +23,8 @@ ROUNDING = 1e-10
 MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
 #: Places that differ by less than this fraction in poles, dampings and squared error are on the way to one minimum.
 CLOSE = 0.01
+#: The same for the delay on an irregular clock, as a fraction of a quarter period.
+CLOSE_BETWEEN_KINKS = 1e-3
 #: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
 #: parts them (after the first few steps), or once the squared error is still so many times higher.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
@@ -32,6 +34,9 @@ DIFFERENCE, FLAT = 1e-4, 1e-9
 SURE = 10.0
 #: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
 RIDGE = float(np.log(2.0))
+#: A kink is looked for where a step of Newton's method gives less than this fraction of the fall that it promises, from
+#: this many decades below the length of that step on.
+CROSSED, NEIGHBOURS = 0.01, 8
 #: Least first step along negative curvature, and longest one over which second derivatives are kept.
 SADDLE, SHORT = 0.1, 0.01
 
@@ -140,6 +145,16 @@ class Descent:
         if self.box.delay_free:
             inner[n, n] = self.box.quarter
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
+
+    def at_its_delay(self, point: Point) -> Point:
+        """Return a point after one Gauss-Newton step of everything but its delay."""
+        here = self.local(point)
+        ways = self._freedom(here, _lengths(here), kinked=True)
+        scaled, slope = ways.reduced(here.gradient, here.curvature)
+        step = ways.whole(-np.linalg.lstsq(scaled, slope, rcond=FLAT)[0])
+        step /= max(1.0, float(np.abs(step).max()))
+        moved = self._moved(here.point, step)
+        return point if moved is None else moved
 
     def _freedom(self, here: Local, lengths: Array, kinked: bool = False) -> Freedom:
         """Return where a search can go, coordinates measured in given lengths; not along the delay in a kink."""
@@ -279,17 +294,24 @@ class Descent:
             # At a saddle the gradient says nothing about how far to go.
             step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
             lower = self._lower_along(here, step, saddle)
+            fall = 0.0
             if lower is not None:
                 # After a short step the second derivatives are still good enough to tell that it was the last.
                 same = np.array_equal(lower[1].damping < 0, here.point.damping < 0)
                 short = float(np.abs(lower[0]).max()) < SHORT
+                fall = 1.0 - lower[2].squared_error / here.squared_error
                 here = self.local(*lower[1:])
                 second = second if fresh and same and short else None
             elif not fresh:
                 second = None
-            elif free[-1] and self._in_a_kink(here, float(abs(step[-1]))):
-                kinked = True
-            else:
+                continue
+            # A step that gives next to nothing of what it promises has crossed a kink.
+            if free[-1] and (lower is None or fall < CROSSED * promise < np.inf):
+                kink = self._in_kink(here, float(abs(step[-1])))
+                if kink is not None:
+                    here, kinked, second = kink, True, None
+                    continue
+            if lower is None:
                 return self._judged(here, free, promise, modes)
         return self._judged(here, free, promise, modes)
 
@@ -322,14 +344,36 @@ class Descent:
         part = way / (step[-1] * self.box.quarter)
         return [step, part * step] if 0.0 < part < 1.0 else [step]
 
-    def _in_a_kink(self, here: Local, reach: float) -> bool:
-        """Whether the squared error rises on both sides of the delay, on a clock where any of them may be a kink."""
+    def _in_kink(self, here: Local, reach: float) -> Local | None:
+        """The nearest kink along the delay, on a clock where any delay may be one; None where there is none.
+
+        The slope along the delay changes sign in it. The next kink may be nearer than a step reaches, so neighbours are
+        compared from the closest on; halving then leaves nothing to be gained between the two sides.
+        """
         if not self.box.delay_free or here.point.delay.cell >= 0 or not reach > 0:
-            return False
-        step = np.zeros(here.gradient.size)
-        step[-1] = reach
-        ends = [self.local(moved_by(here.point, sign * step, self.box)).gradient[-1] for sign in (-1.0, 1.0)]
-        return bool(ends[0] <= 0 <= ends[1])
+            return None
+        along = np.append(np.zeros(here.gradient.size - 1), 1.0)
+
+        def at(shift: float) -> Local:
+            return self.local(moved_by(here.point, shift * along, self.box))
+
+        for length in reach * 10.0 ** np.arange(-NEIGHBOURS, 1.0):
+            low, high = -length, length
+            before, after = at(low), at(high)
+            if before.gradient[-1] <= 0 <= after.gradient[-1]:
+                break
+        else:
+            return None
+        while (high - low) * (after.gradient[-1] - before.gradient[-1]) > CONVERGED * here.squared_error:
+            middle = 0.5 * (low + high)
+            if not low < middle < high:
+                break
+            between = at(middle)
+            if between.gradient[-1] <= 0:
+                low, before = middle, between
+            else:
+                high, after = middle, between
+        return min((here, before, after), key=lambda one: one.squared_error)
 
     def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
@@ -408,7 +452,9 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
     later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
-    return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < CLOSE)
+    # On an irregular clock minima lie closer along the delay.
+    nearest = CLOSE if box.cell > 0 else CLOSE_BETWEEN_KINKS
+    return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < nearest)
 
 
 def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:

@@ -15,8 +15,9 @@ from ctid_cli.estimation.optimum.search import Descent, Local
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
 RESOLVED, LOOKED_AT = 1_000_000, 16
-#: Delays tried beside the best one, in sampling intervals: minima between kinks lie a twentieth of an interval apart.
-CLOSE_DELAYS = np.array([1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2])
+#: Delays tried on both sides of the best one, in sampling intervals: there is a kink for every sample, and minima lie as
+#: little as a two-hundredth of an interval apart.
+CLOSE_DELAYS = 0.5 ** np.arange(1, 9)
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
 #: Squared errors that differ by less than this fraction are those of one minimum.
@@ -254,7 +255,8 @@ class StructureSearch:
         interval = LIMITS["fastest"].rest / self.box.fastest
         delays = best.delay.seconds + interval * np.concatenate((-CLOSE_DELAYS, CLOSE_DELAYS))
         inside = np.unique(np.clip(delays, *self.box.delays))
-        return [replace(best, delay=best.delay._replace(seconds=tau)) for tau in inside.tolist()]
+        points = [replace(best, delay=best.delay._replace(seconds=tau)) for tau in inside.tolist()]
+        return [self.descent(zeros).at_its_delay(point) for point in points]
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
