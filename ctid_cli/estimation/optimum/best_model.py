@@ -77,29 +77,12 @@ def best_output_error(
 ) -> Optimum:
     """Return the least sum of squared output errors of a structure and of all that it contains.
 
-    Parameters
-    ----------
-    problem : Problem
-        The records, the degree of the numerator, and what is eliminated with it. Free responses begin at the first used
-        sample of each record.
-    poles : int
-        Number of poles that are searched; as many zeros need a known delay.
-    delays : tuple of float
-        Least and greatest delay [s]; two equal numbers are a known delay.
-    starts : sequence of tuple
-        Denominators and delays [s] that other estimators have found.
-    nested : bool
-        Whether the smaller models that the structure contains are fitted too: their minima are starts. Without them
-        only the given starts are refined.
-    fewer_poles : bool
-        Whether the least of all is returned, so that the cost never rises with the structure, though with fewer poles.
-    random_starts : int
-        Further starts at random, this number and as many again for each pole, also of the smaller models. Where these
-        are left out: only if the given starts do not agree.
-    seed : int
-        Seed of these.
-    known : KnownCoefficients
-        Coefficients that are known.
+    Two equal delays [s] are a known one, which as many zeros as poles need. Searches start from denominators and delays
+    that other estimators have found. ``nested``: the smaller models that the structure contains are fitted too, and
+    their minima are starts; otherwise only the given starts are refined. ``fewer_poles``: the least of all is returned,
+    so that the cost never rises with the structure, though with fewer poles. ``random_starts``: this number of further
+    starts at random and as many again for each pole, also of the smaller models; without these only where the given
+    starts do not agree.
     """
     zeros, box = problem.zeros, box_of(problem, delays)
     if known.all_poles:

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeqrf
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
@@ -87,6 +86,8 @@ def rows_of(
 
 def _reduced(triangle: Array | None, rows: Array) -> Array:
     """Return the triangle of rows, transposed and overwritten, below another triangle: R <- qr[R; rows]."""
+    from scipy.linalg.lapack import dgeqrf  # slow to import
+
     q, whole = len(rows), rows if triangle is None else np.hstack((triangle.T, rows))
     # The transpose has the order of LAPACK: nothing is copied, unlike in ``numpy.linalg.qr``.
     factors = dgeqrf(whole.T, lwork=32 * q, overwrite_a=True)[0][:q]
