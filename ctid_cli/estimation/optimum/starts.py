@@ -15,8 +15,8 @@ from ctid_cli.estimation.optimum.search import Descent, Local
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
 RESOLVED, LOOKED_AT = 1_000_000, 16
-#: Delays tried on both sides of the best one, in sampling intervals: there is a kink for every sample, and minima lie as
-#: little as a two-hundredth of an interval apart.
+#: Delays tried on both sides of the best one, in sampling intervals: there is a kink for every sample, and minima lie
+#: as little as a two-hundredth of an interval apart.
 CLOSE_DELAYS = 0.5 ** np.arange(1, 9)
 #: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
 KEPT = 3
