@@ -14,7 +14,7 @@ from ctid_cli.models.distances import h2_distance, hinf_distance, response_dista
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.reporting.parameter_errors import ParameterEstimates
-from ctid_cli.storage.stored import Rows
+from ctid_cli.storage.estimates import Rows
 
 Distance = Callable[[TransferFunction, TransferFunction], float]
 

@@ -25,8 +25,8 @@ from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, out_option
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.reporting.tables import notes_of
+from ctid_cli.storage.estimates import Rows
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.stored import Rows
 from ctid_cli.text import did_you_mean
 
 #: Fewer common data sets than these say nothing.

@@ -12,10 +12,9 @@ import numpy as np
 
 from ctid_cli.arrays import IndexArray
 from ctid_cli.errors import UsageError
+from ctid_cli.storage.estimates import Rows, Stored, read_stored
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.manifest import Manifest
-from ctid_cli.storage.store import read_stored
-from ctid_cli.storage.stored import Rows, Stored
 from ctid_cli.text import did_you_mean
 
 
@@ -60,7 +59,7 @@ class Results:
     @property
     def failed(self) -> int:
         """How many estimates ended in an error."""
-        return int(self.stored.failures().sum())
+        return int(self.stored.failures.sum())
 
     @property
     def sampling(self) -> str | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from ctid_cli.running.limits import Limits
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.journal_reader import JournalReader
+from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key
 from ctid_cli.storage.planned import KeySet
 
@@ -33,7 +33,7 @@ class Stock(Container[Key]):
 
 def take_stock(log: JournalReader, retry: Collection[str], limits: Limits) -> Stock:
     """What a journal holds, where failures of some statuses are unwanted, and those that a limit no longer explains."""
-    stock, before = Stock(), {session["session"]: Limits.of(session) for session in log.sessions()}
+    stock, before = Stock(), {session.number: Limits.of(session.info) for session in log.sessions()}
 
     for key, status, session in log.stock():
         stock.keys.add(key)

@@ -21,11 +21,12 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
-from ctid_cli.storage.exact import decoded, encoded
 from ctid_cli.storage.result_file import (
     ResultKind,
     Source,
     content_of,
+    decoded,
+    encoded,
     path_and_sum,
     refuse,
     require,

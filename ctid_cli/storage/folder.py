@@ -1,7 +1,7 @@
 """The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
 
-``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log), ``runs.h5`` (the sealed
-results), ``timings.csv`` and ``provenance/`` (times, hosts, versions).
+``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log) and ``runs.h5`` (the
+estimates that the latest plan asks for).
 """
 
 import fcntl
@@ -10,23 +10,21 @@ import os
 import platform
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, read_journal
+from ctid_cli.storage.identity import Origin, origin_differences
+from ctid_cli.storage.journal import FILE_NAME, JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
 from ctid_cli.written_files import TAKEN, is_leftover
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
 SEALED = "runs.h5"
-TIMINGS = "timings.csv"
-PROVENANCE = "provenance"
 #: Present while a run goes on; says who runs.
 RUNNING = "running.json"
 
@@ -126,9 +124,8 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 
 def clear(folder: Path) -> None:
     """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
-    written = (SPEC, CANONICAL, SEALED, TIMINGS)
-    for path in (*folder.glob(".*"), *(folder / PROVENANCE).glob(".*")):
-        if is_leftover(path.name) and (path.parent != folder or path.name[1:].startswith(written)):
+    for path in folder.glob(".*"):
+        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, SEALED)):
             with suppress(OSError):
                 path.unlink()
 
@@ -171,7 +168,7 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int)
 
 
 def check_free(
-    folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool, known: str | None = None
+    folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool, known: str | None = None
 ) -> None:
     """Refuse a folder, whose lock this process holds, if this run must not add to its results.
 
@@ -182,7 +179,9 @@ def check_free(
         if log is None:
             if (folder / SEALED).exists():
                 why = f"{SEALED} without the {FILE_NAME} it was made from, so nothing can be added to it"
-                raise RefusedError(f"{folder} holds {why}; {_ELSEWHERE}")
+                raise RefusedError(
+                    f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
+                )
             return
         if known is not None and log.state() == known:
             return
@@ -190,28 +189,16 @@ def check_free(
         if log.experiment() != experiment:
             other = f"the experiment {log.experiment()!r}, not {experiment!r}"
             raise RefusedError(f"{folder} holds {other}; {_ELSEWHERE}")
-        # Estimators that the plan does not name may be of another version, but not their data, nor the platform.
-        cells, some = {cell["hash"] for cell in manifest["data_cells"]}, next(iter(origins.values()))
-        for data, estimator, made in sorted(log.made()):
-            present = origins.get(estimator, some)
-            differs = made != present if estimator in origins else made.shared != present.shared
-            if data in cells and differs and not allow_mixed:
-                raise RefusedError(_other_origin(folder, made, present))
+        cells = {cell["hash"] for cell in manifest["data_cells"]}
+        for data, made in sorted(log.made()):
+            if data in cells and made != origin and not allow_mixed:
+                raise RefusedError(_other_origin(folder, made, origin))
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
     differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in origin_differences(other, origin))
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
-
-
-def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None, str | None]]:
-    """What of two origins differs: its name, and what it is of each."""
-    left, right = dict(one.packages), dict(other.packages)
-    pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
-    pairs += [(name, left.get(name), right.get(name)) for name in left | right]
-    pairs += [("numeric platform", repr(one.platform), repr(other.platform))]
-    return [pair for pair in pairs if pair[1] != pair[2]]
 
 
 @contextmanager
@@ -264,16 +251,9 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
 
 
 def what_is_safe(folder: Path) -> str:
-    """A sentence about the results that can still be read although the journal cannot."""
-    from ctid_cli.storage.sealed import open_sealed
-
-    advice = "'ctid verify' says what else can be read, 'ctid repair' saves it into a new folder."
-    try:
-        found = open_sealed(folder / SEALED)
-    except (StorageError, RefusedError):
-        return f"There is no intact {SEALED} either. {advice}"
-    count = found.table.count
-    return f"{SEALED} is intact and holds {count} estimates of the last finished or interrupted run. {advice}"
+    """A sentence about what to do where a journal is damaged."""
+    start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
+    return f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
 
 
 def move_aside(folder: Path) -> Path | None:
@@ -304,6 +284,5 @@ def experiment_folders(results: Path) -> list[Path]:
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))
         if FILE_NAME in files or SEALED in files:
-            folders[:] = [name for name in folders if name != PROVENANCE]
             found.append(Path(path))
     return sorted(found)

@@ -13,11 +13,12 @@ from typing import Any
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
-from ctid_cli.storage.exact import decoded, encoded
 from ctid_cli.storage.result_file import (
     ResultKind,
     Source,
     content_of,
+    decoded,
+    encoded,
     path_and_sum,
     refuse,
     require,

@@ -12,7 +12,7 @@ import pytest
 
 from ctid_cli.errors import StorageError
 from ctid_cli.storage import folder
-from ctid_cli.storage.whereabouts import Whereabouts
+from ctid_cli.storage.journal import open_journal
 
 
 def test_a_network_file_system_is_named_with_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,12 +48,12 @@ def test_a_close_that_is_interrupted_has_closed(tmp_path: Path, monkeypatch: pyt
         closed.append(descriptor)
         raise InterruptedError(errno.EINTR, "Interrupted system call")
 
-    whereabouts = Whereabouts(tmp_path / "file")
+    log = open_journal(tmp_path / "journal.sqlite")
     with monkeypatch.context() as patch:
         patch.setattr(os, "close", interrupted)
         with folder.lock(tmp_path):
             pass
-        whereabouts.close()
+        log.close()
     assert len(closed) == 2
     with folder.lock(tmp_path):
         pass

@@ -23,10 +23,10 @@ from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_blocks import success_sentence
 from ctid_cli.reporting.tables import experiment_report, notes_of
+from ctid_cli.storage.estimates import Rows
 from ctid_cli.storage.folder import SPEC
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.provenance import public_sessions
-from ctid_cli.storage.stored import Rows
+from ctid_cli.storage.status import public_sessions
 
 #: What is measured of every simulated system, beside what the specification asks for.
 MEASURES = ("bias", "rmse", "coverage")
