@@ -26,6 +26,7 @@ from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.hindrances import advice
 from ctid_cli.running.job import Job
+from ctid_cli.running.key_set import KeySet
 from ctid_cli.running.limits import WATCHES_PROCESSES, Limits
 from ctid_cli.running.origins import current_origin
 from ctid_cli.running.own_check import check_components
@@ -40,7 +41,6 @@ from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
 from ctid_cli.storage.journal import FILE_NAME, Journal, open_journal
 from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
 from ctid_cli.storage.merge import keep_readable as keep_readable_of
-from ctid_cli.storage.planned import KeySet
 
 if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan

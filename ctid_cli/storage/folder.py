@@ -30,33 +30,12 @@ RUNNING = "running.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
-
-
+_ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
 _ELSEWHERE = "choose another results folder (--out), or --fresh to move the old results aside"
-
-
-#: Types of file systems that several machines share.
-_OF_NETWORKS = {
-    "nfs",
-    "nfs4",
-    "cifs",
-    "smb3",
-    "lustre",
-    "gpfs",
-    "beegfs",
-    "ceph",
-    "fuse.sshfs",
-    "9p",
-    "afs",
-    "glusterfs",
-}
 
 
 class InUseError(RefusedError):
     """Another process holds the folder's lock."""
-
-
-_ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
 
 
 @contextmanager
@@ -77,7 +56,10 @@ def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> I
             except BlockingIOError:
                 _wait(folder, deadline)
             except OSError as error:
-                raise StorageError(_unlockable(folder, error)) from error
+                advice = (
+                    "on a file system of a network give --out a folder on a disk of this machine, and copy the results"
+                )
+                raise StorageError(f"{folder} cannot be locked ({error.strerror}); {advice}") from error
         if not shared:
             _refuse_links(folder)
         yield
@@ -92,27 +74,6 @@ def _refuse_links(folder: Path) -> None:
     for path in folder.iterdir():
         if path.is_symlink() and (path.name in TAKEN or is_leftover(path.name)):
             raise RefusedError(f"{path} is a link, and results are written into their folder alone; remove it")
-
-
-def _unlockable(folder: Path, error: OSError) -> str:
-    """Why a folder cannot be locked; file systems of a network have no locks on folders."""
-    reason = f"{folder} cannot be locked ({error.strerror})"
-    kind = file_system(folder)
-    if kind not in _OF_NETWORKS:
-        return reason
-    advice = "give --out a folder on a disk of this machine, and copy the results when they are complete"
-    return f"{reason}: it lies on a file system of type {kind}, where two runs could write at once; {advice}"
-
-
-def file_system(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
-    """Type of the file system that a folder lies on, such as ``ext4`` or ``nfs4``; empty where that is not known."""
-    found: dict[Path, str] = {}
-    with suppress(OSError, ValueError):
-        for line in mounts.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-            _, point, kind, *_ = line.split(" ")
-            found[Path(point.replace("\\040", " "))] = kind
-    whole = folder.resolve()
-    return next((found[place] for place in (whole, *whole.parents) if place in found), "")
 
 
 def _is_open(folder: Path, descriptor: int) -> bool:

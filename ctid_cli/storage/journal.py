@@ -15,6 +15,8 @@ import math
 import os
 import shutil
 import sqlite3
+import uuid
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import groupby
@@ -48,11 +50,11 @@ _COLUMNS = f"{_KEY}, status, seconds, cpu_seconds, session, checksum, result"
 _SCHEMA = (
     "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT, checksum TEXT) WITHOUT ROWID",
     """CREATE TABLE sessions (
-        number INTEGER PRIMARY KEY, origin TEXT, started TEXT, stopped TEXT, reason TEXT, info TEXT, checksum TEXT)""",
+        id TEXT PRIMARY KEY, origin TEXT, started TEXT, stopped TEXT, reason TEXT, info TEXT, checksum TEXT)""",
     # In the order of a plan, in which they are read; what is long stands last.
     f"""CREATE TABLE estimates (
         data_hash TEXT, estimator_hash TEXT, replicate INTEGER, start TEXT,
-        status TEXT, seconds REAL, cpu_seconds REAL, session INTEGER, checksum TEXT, result TEXT,
+        status TEXT, seconds REAL, cpu_seconds REAL, session TEXT, checksum TEXT, result TEXT,
         PRIMARY KEY ({_KEY})) WITHOUT ROWID""",
     f"PRAGMA application_id={APPLICATION}",
     f"PRAGMA user_version={FORMAT}",
@@ -72,22 +74,17 @@ class Row(NamedTuple):
     status: str
     seconds: float | None
     cpu_seconds: float | None
-    session: int
+    session: str
     checksum: str
     result: str
 
     @classmethod
-    def of(cls, outcome: Outcome, session: int) -> "Row":
+    def of(cls, outcome: Outcome, session: str) -> "Row":
         """An estimate that was computed just now."""
         key, result, *times = outcome
         of_key = (key.data_hash, key.estimator_hash, key.replicate, key.start)
         seconds, cpu_seconds = (None if t is None or not math.isfinite(t) else float(t) for t in times)
         row = cls(*of_key, str(result["status"]), seconds, cpu_seconds, session, "", canonical_json(result))
-        return row.in_session(session)
-
-    def in_session(self, session: int) -> "Row":
-        """The same as an estimate of a run with another number."""
-        row = self._replace(session=session)
         return row._replace(checksum=_digest(*row[:-2], row.result))
 
     @property
@@ -110,7 +107,8 @@ class Row(NamedTuple):
 class Session(NamedTuple):
     """A run that has written to a journal."""
 
-    number: int
+    #: As no other run has it, so that runs keep theirs where journals are merged.
+    id: str
     origin: Origin
     started: str
     #: None while it goes on, and of one that was killed.
@@ -143,42 +141,41 @@ class JournalReader:
 
     def state(self) -> str | None:
         """What changes with every run that writes; None before the first one."""
-        rows = self._rows("SELECT number, stopped FROM sessions ORDER BY number DESC LIMIT 1")
+        rows = self._rows("SELECT id, stopped FROM sessions ORDER BY rowid DESC LIMIT 1")
         return str(rows[0]) if rows else None
 
     def sessions(self) -> list[Session]:
         """Every run that has written here, the oldest first."""
-        return self._sessions("ORDER BY number")
+        return self._sessions("ORDER BY rowid")
 
-    def session(self, number: int) -> Session:
+    def session(self, id: str) -> Session:
         """One of these runs."""
-        (found,) = self._sessions("WHERE number = ?", number)
+        (found,) = self._sessions("WHERE id = ?", id)
         return found
 
     def _sessions(self, where: str, *values: Any) -> list[Session]:
-        rows = self._checked("sessions", "number, origin, started, stopped, reason, info", where, *values)
+        rows = self._checked("sessions", "id, origin, started, stopped, reason, info", where, *values)
         with self._guard():
             return [
-                Session(number, Origin.of(**json.loads(origin)), started, stopped, reason, json.loads(info))
-                for number, origin, started, stopped, reason, info in rows
+                Session(id, Origin.of(**json.loads(origin)), started, stopped, reason, json.loads(info))
+                for id, origin, started, stopped, reason, info in rows
             ]
 
     def origins(self) -> tuple[Origin, ...]:
         """Where the stored estimates come from."""
-        return self.origins_of(number for (number,) in self._rows("SELECT DISTINCT session FROM estimates"))
+        return self.origins_of(id for (id,) in self._rows("SELECT DISTINCT session FROM estimates"))
 
-    def origins_of(self, sessions: Iterable[int]) -> tuple[Origin, ...]:
+    def origins_of(self, sessions: Iterable[str]) -> tuple[Origin, ...]:
         """Where the estimates of some runs come from."""
-        known = {session.number: session.origin for session in self.sessions()}
+        known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
-            return tuple(sorted({known[number] for number in sessions}))
+            return tuple(sorted({known[id] for id in sessions}))
 
     def made(self) -> set[tuple[str, Origin]]:
         """Data cells of the stored estimates, and where these come from."""
-        known = {session.number: session.origin for session in self.sessions()}
+        known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
-            rows = self._rows("SELECT DISTINCT data_hash, session FROM estimates")
-            return {(data, known[number]) for data, number in rows}
+            return {(data, known[id]) for data, id in self._rows("SELECT DISTINCT data_hash, session FROM estimates")}
 
     def count(self) -> int:
         """How many estimates are stored."""
@@ -189,13 +186,10 @@ class JournalReader:
         mean: float | None = self._rows("SELECT avg(seconds) FROM estimates")[0][0]
         return mean
 
-    def counts(self) -> dict[int, tuple[int, dict[str, int]]]:
-        """Number of estimates of each run, and of each status among them."""
-        found: dict[int, tuple[int, dict[str, int]]] = {}
-        for session, status, count in self._rows("SELECT session, status, count(*) FROM estimates GROUP BY 1, 2"):
-            total, statuses = found.get(session, (0, {}))
-            found[session] = total + count, statuses | {status: count}
-        return found
+    def counts(self) -> Counter[tuple[str, str]]:
+        """Number of estimates of each run with each status."""
+        rows = self._rows("SELECT session, status, count(*) FROM estimates GROUP BY 1, 2")
+        return Counter({(session, status): count for session, status, count in rows})
 
     def rows(self) -> Iterator[Row]:
         """Every stored estimate."""
@@ -207,10 +201,6 @@ class JournalReader:
         written, there = self._meta(_COUNT) or "0", self.count()
         if written != str(there):
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
-
-    def stock(self) -> Iterator[tuple[Key, str, int]]:
-        """Every stored estimate with its status and the run that it comes from."""
-        return ((row.key, row.status, row.session) for row in self.rows())
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
         """The stored estimates that a plan asks for, in its order."""
@@ -291,21 +281,17 @@ class Journal(JournalReader):
         if not path.exists() or path.read_bytes() != data:
             write_file(path, data)
 
-    def begin(self, manifest: Manifest, origin: Origin, started: str, info: dict[str, Any]) -> int:
+    def begin(self, manifest: Manifest, origin: Origin, started: str, info: dict[str, Any]) -> str:
         """Note that a run begins, and where its estimates will come from."""
         with self.transaction():
             self.note_plan(manifest)
-            return self.add_session(Session(0, origin, started, None, None, info))
+            return self.note_session(Session(new_id(), origin, started, None, None, info))
 
-    def add_session(self, session: Session) -> int:
-        """Note a run under the next number, which is returned; inside a transaction."""
-        ((number,),) = self._rows("SELECT coalesce(max(number), 0) + 1 FROM sessions")
-        self._insert_session(session._replace(number=number))
-        return int(number)
-
-    def _insert_session(self, session: Session) -> None:
-        number, origin, *times, info = session
-        self._insert("sessions", number, canonical_json(origin._asdict()), *times, canonical_json(info))
+    def note_session(self, session: Session) -> str:
+        """Note a run, whose id is returned; inside a transaction."""
+        id, origin, *times, info = session
+        self._insert("sessions", id, canonical_json(origin._asdict()), *times, canonical_json(info))
+        return id
 
     def replan(self, manifest: Manifest) -> None:
         """Note that the plan of the present run has changed."""
@@ -320,7 +306,7 @@ class Journal(JournalReader):
             self._insert("meta", _MANIFEST, text)
             self._connection.execute("DELETE FROM meta WHERE name = ?", (_EXPORTED,))
 
-    def add(self, outcomes: Iterable[Outcome], session: int) -> None:
+    def add(self, outcomes: Iterable[Outcome], session: str) -> None:
         """Store estimates, in place of earlier ones if there are any; when this returns, they are safe."""
         with self.transaction():
             self.add_rows(Row.of(outcome, session) for outcome in outcomes)
@@ -339,10 +325,10 @@ class Journal(JournalReader):
         with self.transaction():
             self._insert("meta", _EXPORTED, sha256)
 
-    def end(self, session: int, stopped: str, reason: str) -> None:
+    def end(self, session: str, stopped: str, reason: str) -> None:
         """Note that a run ends."""
         with self.transaction():
-            self._insert_session(self.session(session)._replace(stopped=stopped, reason=reason))
+            self.note_session(self.session(session)._replace(stopped=stopped, reason=reason))
 
     def require_in_place(self) -> None:
         """Refuse to go on in a file that its path does not lead to any more."""
@@ -505,6 +491,11 @@ def _identity(path: Path) -> tuple[int, int] | None:
         found = os.stat(path)
         return found.st_dev, found.st_ino
     return None
+
+
+def new_id() -> str:
+    """An id as no other run has it."""
+    return uuid.uuid4().hex[:16]
 
 
 def _digest(*values: Any) -> str:

@@ -8,7 +8,7 @@ alone, so that it has the bytes of a single run's.
 import re
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
@@ -18,7 +18,16 @@ from ctid_cli.errors import CtidError, RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.export import EXPORT, ROWS, open_export, seal
 from ctid_cli.storage.identity import Origin, now, origin_differences
-from ctid_cli.storage.journal import FILE_NAME, Journal, JournalReader, Row, Session, open_journal, read_journal
+from ctid_cli.storage.journal import (
+    FILE_NAME,
+    Journal,
+    JournalReader,
+    Row,
+    Session,
+    new_id,
+    open_journal,
+    read_journal,
+)
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -102,7 +111,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
                 for folder in others:
                     with _reading(folder) as other:
                         other.check()
-                        taken.take(folder, other)
+                        log.add_rows(taken.new_rows(folder, other))
                 taken.require_no_conflict()
                 missing = tuple(_missing(plan, shards, taken.missing()))
                 if missing and not partial:
@@ -173,8 +182,8 @@ class _Taken:
 
     def __init__(self, target: Path, log: Journal, plan: Manifest, *, allow_mixed: bool) -> None:
         self._log, self._plan, self._planned, self._allow_mixed = log, plan, Planned(plan), allow_mixed
-        #: Where the runs of the journal come from, by their number.
-        self._places = {session.number: (target, session) for session in log.sessions()}
+        #: Where the runs of the journal come from, by their ids.
+        self._places = {session.id: (target, session) for session in log.sessions()}
         self._conflicts: list[tuple[Key, Path, Path]] = []
         self._changed: set[Key] = set()
         cells = {cell["hash"] for cell in plan["data_cells"]}
@@ -185,40 +194,32 @@ class _Taken:
         """Estimates that were not there before, or exceeded a limit there."""
         return len(self._changed)
 
-    def take(self, folder: Path, other: JournalReader) -> None:
-        """Take over what a folder holds of the plan."""
-        sessions, numbers = {session.number: session for session in other.sessions()}, dict[int, int]()
-        new: list[Row] = []
+    def new_rows(self, folder: Path, other: JournalReader) -> Iterator[Row]:
+        """The rows of a folder that are to be stored; their runs are noted."""
+        sessions = {session.id: session for session in other.sessions()}
         for row in other.rows():
             if row.key not in self._planned:
                 continue
-            session = sessions[row.session]
+            session, present = sessions[row.session], self._log.row(row.key)
             self._require_origin(folder, session.origin)
-            present = self._log.row(row.key)
-            if present is not None and not self._is_better(row, session, present, folder):
-                continue
-            if row.session not in numbers:
-                number = numbers[row.session] = self._log.add_session(session)
-                self._places[number] = (folder, session)
-            new.append(row.in_session(numbers[row.session]))
-            self._changed.add(row.key)
-            if len(new) == ROWS:
-                self._log.add_rows(new)
-                new.clear()
-        self._log.add_rows(new)
+            if present is None or self._is_better(row, session, present, folder):
+                if row.session not in self._places:
+                    self._places[self._log.note_session(session)] = (folder, session)
+                self._changed.add(row.key)
+                yield row
 
     def _require_origin(self, folder: Path, origin: Origin) -> None:
         """Refuse what other code or another processor has computed than the rest."""
-        if self._allow_mixed or origin in self._origins:
+        if self._allow_mixed or origin in self._origins or not self._origins:
+            self._origins.setdefault(origin, folder)
             return
-        for other, place_of_other in self._origins.items():
-            pairs = origin_differences(other, origin)
-            differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
-            raise RefusedError(
-                f"{folder} and {place_of_other} were computed by other code or arithmetic ({differences}); run one of "
-                "them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
-            )
-        self._origins[origin] = folder
+        other, where = next(iter(self._origins.items()))
+        pairs = origin_differences(other, origin)
+        differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
+        raise RefusedError(
+            f"{folder} and {where} were computed by other code or arithmetic ({differences}); run one of "
+            "them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
+        )
 
     def _is_better(self, row: Row, session: Session, present: Row, folder: Path) -> bool:
         """Whether a row replaces the present one: where one of both exceeded a limit, or else a conflict is noted."""
@@ -324,59 +325,44 @@ def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, 
     ``runs.h5`` if this is whole. Results of other code or arithmetic are left out unless they may be mixed.
     """
     keys = dict.fromkeys(slot.key for slot in slots(plan))
+    kept, noted = set[Key](), set[str]()
 
-    def fits(found: Origin) -> bool:
-        return allow_mixed or found == origin
+    def chosen(found: Iterator[tuple[Row, Session]]) -> Iterator[Row]:
+        for row, session in found:
+            if row.key in keys and row.key not in kept and (allow_mixed or session.origin == origin):
+                if session.id not in noted:
+                    noted.add(log.note_session(session))
+                kept.add(row.key)
+                yield row
 
     with log.transaction():
         log.note_plan(plan)
-        kept = _keep_rows(aside, log, keys, fits)
-        lost = keys.keys() - kept
-        from_export = _keep_exported(aside, log, lost, fits) if lost else 0
-    return Kept(len(keys), len(kept), from_export)
+        log.add_rows(chosen(_readable(aside, keys)))
+        from_journal = len(kept)
+        if from_journal < len(keys):
+            log.add_rows(chosen(_exported(aside)))
+    return Kept(len(keys), from_journal, len(kept) - from_journal)
 
 
-def _keep_rows(aside: Path, log: Journal, keys: Iterable[Key], fits: Callable[[Origin], bool]) -> set[Key]:
-    kept: set[Key] = set()
-    numbers: dict[int, int] = {}
-    new: list[Row] = []
+def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
+    """The rows of a journal that can be read, each with its run."""
     with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
-        if old is None:
-            return kept
-        for key in keys:
-            found = _readable(old, key)
-            if found is not None and fits(found[1].origin):
-                row, session = found
-                if row.session not in numbers:
-                    numbers[row.session] = log.add_session(session)
-                new.append(row.in_session(numbers[row.session]))
-                kept.add(key)
-    log.add_rows(new)
-    return kept
+        for key in keys if old is not None else ():
+            # Whatever a damaged page hides, the other rows are worth reading.
+            with suppress(CtidError, ValueError):
+                assert old is not None
+                if (row := old.row(key)) is not None:
+                    yield row, old.session(row.session)
 
 
-def _readable(old: JournalReader, key: Key) -> tuple[Row, Session] | None:
-    """A row and its run; None where it is not there, or a damaged page hides it."""
-    with suppress(CtidError, ValueError):
-        row = old.row(key)
-        return None if row is None else (row, old.session(row.session))
-    return None
-
-
-def _keep_exported(aside: Path, log: Journal, lost: set[Key], fits: Callable[[Origin], bool]) -> int:
-    try:
+def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
+    """The estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
+    with suppress(CtidError):
         export = open_export(aside / EXPORT)
         export.verify()
-    except CtidError:
-        return 0
-    # Of several origins the file does not say which an estimate has.
-    if len(export.origins) != 1 or not fits(export.origins[0]):
-        return 0
-    session = log.add_session(Session(0, export.origins[0], now(), None, None, {"kept_from": str(aside / EXPORT)}))
-    found: set[Key] = set()
-    for first in range(0, export.count, ROWS):
-        pairs = zip(export.keys(first, first + ROWS), export.results(first, first + ROWS), strict=True)
-        some = {key: result for key, result in pairs if key in lost}
-        log.add_rows(Row.of(Outcome(key, result, None), session) for key, result in some.items())
-        found |= some.keys()
-    return len(found)
+        if len(export.origins) == 1:
+            session = Session(new_id(), export.origins[0], now(), None, None, {"kept_from": str(aside / EXPORT)})
+            for first in range(0, export.count, ROWS):
+                part = (first, min(first + ROWS, export.count))
+                for key, result in zip(export.keys(*part), export.results(*part), strict=True):
+                    yield Row.of(Outcome(key, result, None), session.id), session

@@ -79,14 +79,18 @@ def public_sessions(folder: Path) -> list[dict[str, Any]]:
     with place.reading_journal(folder) as log:
         if log is None:
             return []
-        counts = log.counts()
-        return [_public(session, *counts.get(session.number, (0, {}))) for session in log.sessions()]
-
-
-def _public(session: Any, computed: int, statuses: Mapping[str, int]) -> dict[str, Any]:
-    about = {"started": session.started, "stopped": session.stopped, "computed": computed}
-    about["failed"] = sum(statuses.get(name, 0) for name in columns.FAILURES)
-    return about | {"code_version": session.origin.code_version} | {key: session.info.get(key) for key in PUBLIC}
+        counts, sessions = log.counts(), log.sessions()
+    return [
+        {
+            "started": session.started,
+            "stopped": session.stopped,
+            "computed": sum(count for (id, _), count in counts.items() if id == session.id),
+            "failed": sum(counts[session.id, status] for status in columns.FAILURES),
+            "code_version": session.origin.code_version,
+            **{key: session.info.get(key) for key in PUBLIC},
+        }
+        for session in sessions
+    ]
 
 
 @dataclass(frozen=True)

@@ -42,26 +42,26 @@ def files(folder: Path) -> dict[str, str]:
 def test_what_was_added_is_read_back_exactly(tmp_path: Path) -> None:
     path = tmp_path / "journal.sqlite"
     log = filled(path)
-    states = [log.state(), log.begin(MANIFEST, ORIGIN, "2026-11-21T06:00:00Z", {}), log.state()]
-    log.end(1, "2026-11-21T05:00:00Z", "finished")
-    log.add([outcome(1, 5.0)._replace(seconds=float("inf"), cpu_seconds=0.5)], 2)
+    (first,), states = log.sessions(), [log.state()]
+    second = log.begin(MANIFEST, ORIGIN, "2026-11-21T06:00:00Z", {})
+    states.append(log.state())
+    log.end(first.id, "2026-11-21T05:00:00Z", "finished")
+    log.add([outcome(1, 5.0)._replace(seconds=float("inf"), cpu_seconds=0.5)], second)
     log.close()
-    assert states[0] != states[2]
+    assert states[0] != states[1]
     with read_journal(path) as read:
         assert read is not None
         assert (read.experiment(), read.manifest(), read.origins()) == ("toys", MANIFEST, (ORIGIN,))
         assert delays(read) == [8.0, 5.0, 26 / 3]
         assert [(row.seconds, row.cpu_seconds, row.session) for row in read.rows()] == [
-            (0.25, None, 1),
-            (None, 0.5, 2),
-            (0.25, None, 1),
+            (0.25, None, first.id),
+            (None, 0.5, second),
+            (0.25, None, first.id),
         ]
-        first = ("2026-11-21T04:00:00Z", "2026-11-21T05:00:00Z", "finished", {"host": "here"})
-        assert read.sessions() == [
-            Session(1, ORIGIN, *first),
-            Session(2, ORIGIN, "2026-11-21T06:00:00Z", None, None, {}),
+        assert sorted(read.sessions(), key=lambda session: session.started) == [
+            first._replace(stopped="2026-11-21T05:00:00Z", reason="finished"),
+            Session(second, ORIGIN, "2026-11-21T06:00:00Z", None, None, {}),
         ]
-        assert read.state() == states[2]
         assert read.row(outcome(1).key) is not None
         assert read.row(outcome(9).key) is None
 
@@ -102,10 +102,10 @@ def test_others_read_while_a_run_writes_each_as_it_was_when_they_began(
         assert len(delays(early)) == 3
         # The index in memory is shared with the writer, which is in the same process here.
         assert {**files(tmp_path), "journal.sqlite-shm": ""} == {**before, "journal.sqlite-shm": ""}
-        log.add([outcome(3), outcome(4)], 1)
+        log.add([outcome(3), outcome(4)], log.sessions()[0].id)
         with read_journal(log.path, live=True) as late:
             assert (len(delays(early)), len(delays(late))) == (3, 5)
-    log.add([outcome(k) for k in range(5, 500)], 1)  # more than SQLite keeps in its log
+    log.add([outcome(k) for k in range(5, 500)], log.sessions()[0].id)  # more than SQLite keeps in its log
     assert len(delays(log)) == 500
     log.close()
     assert [path.name for path in tmp_path.iterdir()] == ["journal.sqlite"]
@@ -116,7 +116,7 @@ def test_nothing_is_acknowledged_in_a_folder_that_is_gone(tmp_path: Path, change
     place, elsewhere = tmp_path / "toys", tmp_path / "old"
     place.mkdir()
     log = filled(place / "journal.sqlite")
-    log.add([outcome(3)], 1)
+    log.add([outcome(3)], log.sessions()[0].id)
     match change:
         case "rename":
             place.rename(elsewhere)
@@ -131,7 +131,7 @@ def test_nothing_is_acknowledged_in_a_folder_that_is_gone(tmp_path: Path, change
             shutil.copyfile(place / "kept", place / name)
     words = {"rename": f"renamed .* it is {elsewhere} now", "delete": "toys was deleted", "replace": f"{elsewhere} now"}
     with pytest.raises(StorageError, match=words.get(change, "was deleted or replaced")):
-        log.add([outcome(4)], 1)
+        log.add([outcome(4)], log.sessions()[0].id)
     log.close()
 
 
@@ -169,7 +169,7 @@ def test_what_cannot_be_stored_as_a_whole_is_not_stored(tmp_path: Path) -> None:
         "CREATE TRIGGER full BEFORE INSERT ON estimates WHEN new.replicate = 2 BEGIN SELECT raise(FAIL, 'full'); END"
     )
     with pytest.raises(StorageError, match="could not be written"):
-        log.add([outcome(1), outcome(2)], 1)
+        log.add([outcome(1), outcome(2)], log.sessions()[0].id)
     assert delays(log) == [8.0]
     log.close()
 
@@ -179,7 +179,7 @@ def test_new_estimates_and_a_new_plan_make_an_export_stale(tmp_path: Path) -> No
     log.note_export("abc")
     log.begin(MANIFEST, ORIGIN, "later", {})
     assert log.exported() == "abc"
-    log.add([outcome(7)], 2)
+    log.add([outcome(7)], log.sessions()[0].id)
     assert log.exported() is None
     log.note_export("def")
     log.replan({**MANIFEST, "runs": 7})
