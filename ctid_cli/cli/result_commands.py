@@ -49,7 +49,7 @@ def status(
         for text in with_list(status_object(one, cells), "estimates", rows):
             typer.echo(text, nl=False)
     else:
-        some = () if results is None else results.rows.only(*OF_STATUS)
+        some = () if results is None else results.stored.rows(*OF_STATUS)
         typer.echo(status_text(one, some, out, cells))
 
 

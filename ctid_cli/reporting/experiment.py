@@ -34,7 +34,7 @@ class ExperimentResults(Results):
     ----------
     folder : pathlib.Path
         Where they are stored.
-    stored : Stored
+    stored : Estimates
         The estimates, as they were read.
 
     See Also

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.storage import columns
-from ctid_cli.storage.estimates import Stored, export_rows
+from ctid_cli.storage.estimates import Estimates, export_rows
 from ctid_cli.storage.export import ROWS
 from ctid_cli.storage.manifest import swept_names
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def csv_lines(stored: Stored) -> Iterator[str]:
+def csv_lines(stored: Estimates) -> Iterator[str]:
     """The estimates as CSV, the head first."""
     types = _types(stored)
     head = _head(stored, types)
     yield str(head.to_csv(index=False, lineterminator="\n"))
-    for start in range(0, stored.count, ROWS):
+    for start in range(0, len(stored), ROWS):
         flat = export_rows(stored.part(start, start + ROWS).frame(types=types))
         yield str(flat.reindex(columns=head.columns).to_csv(index=False, lineterminator="\n", header=False))
 
 
-def _head(stored: Stored, types: Mapping[str, Any]) -> pd.DataFrame:
+def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
     """A table without rows, with the columns of an estimate that has all that any of them has."""
     import pandas as pd
 
@@ -45,7 +45,7 @@ def _head(stored: Stored, types: Mapping[str, Any]) -> pd.DataFrame:
     return export_rows(whole).iloc[:0]
 
 
-def _types(stored: Stored) -> dict[str, Any]:
+def _types(stored: Estimates) -> dict[str, Any]:
     """Types that columns of swept fields have over all estimates."""
     import pandas as pd
 

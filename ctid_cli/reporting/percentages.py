@@ -25,7 +25,7 @@ from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.reporting.study import Place, Study, StudyTable
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
 from ctid_cli.storage.columns import COUNTS, reserved_names
-from ctid_cli.storage.estimates import CLOCKS, Rows
+from ctid_cli.storage.estimates import CLOCKS, Estimates
 from ctid_cli.storage.manifest import is_of_signal
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def experiment_rows(
     ]
 
 
-def _counted(rows: Rows) -> Row:
+def _counted(rows: Estimates) -> Row:
     """Counts and percentages of a group of estimates, and the medians of their times."""
     n, converged = len(rows), rows.converged
     row: Row = dict.fromkeys(COUNTS) | {"n": n, "failed": int(rows.failures.sum())}

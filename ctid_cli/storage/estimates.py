@@ -58,7 +58,6 @@ if TYPE_CHECKING:
 
 #: Columns of the times, which are in the journal only.
 CLOCKS = ("seconds", "cpu_seconds")
-_FAILED = [name.encode() for name in columns.FAILURES]
 #: What parameters of an estimate are found in, and what says which of these places are filled.
 _OF_PARAMETERS = {
     "numerator": "length",
@@ -77,21 +76,22 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
     return read_stored(folder).frame(names)
 
 
-def read_stored(folder: Path) -> Stored:
+def read_stored(folder: Path) -> Estimates:
     """The estimates of the latest plan of an experiment."""
     with place.reading_journal(folder) as log:
         if log is None:
             # There is a journal without a plan where the run was killed before it had planned anything.
             if not (folder / EXPORT).exists():
                 raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
-            return Stored(open_export(folder / EXPORT))
+            return Estimates(open_export(folder / EXPORT))
         exported = log.exported()
         if exported is not None and sha256_of(folder / EXPORT) == exported:
-            return Stored(open_export(folder / EXPORT), _times_of(folder, exported))
+            return Estimates(open_export(folder / EXPORT), _times_of(folder, exported))
         log.check()
-        stored = Stored(export_in_memory(log))
-        times = {(block.cell["hash"], block.hash): log.times(block.cell["hash"], block.hash) for block in stored.blocks}
-        return Stored(stored.export, lambda *part: times[part])
+        export = export_in_memory(log)
+        parts = {(block.cell["hash"], block.hash) for block in Estimates(export).blocks}
+        times = {part: log.times(*part) for part in parts}
+        return Estimates(export, lambda *part: times[part])
 
 
 def _times_of(folder: Path, exported: str) -> Times:
@@ -118,18 +118,34 @@ class Block:
     hash: str
 
 
-class Stored:
-    """The stored estimates of one plan, or some that follow each other."""
+class Estimates:
+    """The stored estimates of one plan, or some of them, in the order of ``runs.h5``."""
 
-    def __init__(self, export: Export, times: Times | None = None, part: tuple[int, int] | None = None) -> None:
+    def __init__(self, export: Export, times: Times | None = None, places: range | IndexArray | None = None) -> None:
         self.export = export
         self._times = times
-        self._first, self._last = (0, export.count) if part is None else part
+        self._places = places
+        #: All estimates where these are some, chosen one by one.
+        self._all: Estimates = self
         self._read: dict[str, AnyArray] = {}
 
-    def part(self, start: int, stop: int) -> Stored:
-        """Some of them."""
-        return Stored(self.export, self._times, (self._first + start, min(self._first + stop, self._last)))
+    @property
+    def places(self) -> range | IndexArray:
+        """Numbers of their rows in the export."""
+        return range(self.export.count) if self._places is None else self._places
+
+    def part(self, start: int, stop: int) -> Estimates:
+        """Some that follow each other, whose columns are read without those of others."""
+        return self._some(self.places[start:stop])
+
+    def chosen(self, which: BoolArray | IndexArray) -> Estimates:
+        """Some of them, whose columns are taken out of those of all."""
+        some = self._some(np.asarray(self.places)[which])
+        some._all = self._all
+        return some
+
+    def _some(self, places: range | IndexArray) -> Estimates:
+        return Estimates(self.export, self._times, places)
 
     @property
     def manifest(self) -> Manifest:
@@ -146,10 +162,8 @@ class Stored:
         """Whether several versions of the code, or platforms, computed what is compared here."""
         return len(self.origins) > 1
 
-    @property
-    def count(self) -> int:
-        """Number of estimates."""
-        return self._last - self._first
+    def __len__(self) -> int:
+        return len(self.places)
 
     # --- columns ----------------------------------------------------------------------------------------------------
 
@@ -159,35 +173,57 @@ class Stored:
 
     def column(self, name: str) -> AnyArray:
         """A column as an array."""
+        if self._all is not self:
+            return np.asarray(self._all.column(name)[self.places])
         if name not in self._read:
             if name in CLOCKS:
                 self._read |= zip(CLOCKS, self._clocks(), strict=True)
             else:
-                self._read[name] = self.export.read(name, self._first, self._last)
+                self._read[name] = self._span(lambda first, last: self.export.read(name, first, last))
         return self._read[name]
+
+    def _span(self, read: Callable[[int, int], Any]) -> Any:
+        """What is read of the rows from the first to the last of them, without those between."""
+        places = self.places
+        if not len(places):
+            return read(0, 0)
+        first, last = int(places[0]), int(places[-1]) + 1
+        found = read(first, last)
+        if last - first == len(places):
+            return found
+        inside = np.asarray(places) - first
+        return found[inside] if isinstance(found, np.ndarray) else [found[k] for k in inside.tolist()]
 
     def values(self, name: str) -> list[Any]:
         """A column as it is in rows: None where there is no value."""
-        (column,) = (column for column in columns.COLUMNS if column.name == name)
+        known = {column.name: column for column in columns.COLUMNS}
+        if name not in known:
+            return self._by_block(lambda block: {**block.cell["swept"], **block.estimator["swept"]}.get(name))
         if name in CLOCKS:
             return [None if value != value else value for value in self.column(name).tolist()]
         if name == "experiment":
-            return [self.manifest["experiment"]] * self.count
+            return [self.manifest["experiment"]] * len(self)
         if name == "initial_delay":
             return [self.manifest["starts"].get(start) for start in self.values("start")]
-        if column.source == "truth":
-            return self._compared(name)
-        values = self.export.values(column, self._first, self._last)
+        if name == "true_delay":
+            return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
+        if name == "converged":
+            found = self._judged
+            return [value for part in found for value in ([None] * part if isinstance(part, int) else part.tolist())]
+        values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
         if name == "standard_errors" and self.has("denominator"):
             # An estimate with a model has a table of errors, if an empty one.
             models = (self.column("denominator_length") != MISSING).tolist()
             values = [value or ({} if there else None) for value, there in zip(values, models, strict=True)]
         return values
 
+    def _by_block(self, value: Callable[[Block], Any]) -> list[Any]:
+        return [one for block in self.blocks for one in [value(block)] * (block.last - block.first)]
+
     def _clocks(self) -> tuple[Array, Array]:
         """Times of the estimates [s]; NaN where they are not known."""
-        found = np.full((2, self.count), np.nan)
-        if self._times is not None and self.count:
+        found = np.full((2, len(self)), np.nan)
+        if self._times is not None and len(self):
             replicates, starts = self.column("replicate").tolist(), self.values("start")
             for block in self.blocks:
                 times = self._times(block.cell["hash"], block.hash)
@@ -196,27 +232,16 @@ class Stored:
                 found[:, inside] = np.array(pairs, dtype=float).T
         return found[0], found[1]
 
-    def _compared(self, name: str) -> list[Any]:
-        """What follows from a comparison with the truth: ``converged`` or ``true_delay``."""
-        values: list[Any] = []
-        for block in self.blocks:
-            if name == "true_delay":
-                values += [self._truths[block.cell["hash"]].get("delay")] * (block.last - block.first)
-                continue
-            converged = self.converged(block, np.arange(block.first, block.last))
-            values += [None] * (block.last - block.first) if converged is None else converged.tolist()
-        return values
-
     @cached_property
     def blocks(self) -> list[Block]:
         """The rows of every estimator on every data cell, which follow each other."""
         known = {(part["hash"], part["name"]): part for part in self.manifest["estimators"]}
         cells = {cell["hash"]: cell for cell in self.manifest["data_cells"]}
         parts = [self.column(name) for name in ("estimator_hash", "estimator", "cell")]
-        differs: BoolArray = np.zeros(max(self.count - 1, 0), dtype=bool)
+        differs: BoolArray = np.zeros(max(len(self) - 1, 0), dtype=bool)
         for part in parts:
             differs |= part[1:] != part[:-1]
-        places = [*([0] if self.count else []), *(np.flatnonzero(differs) + 1).tolist(), self.count]
+        places = [*([0] if len(self) else []), *(np.flatnonzero(differs) + 1).tolist(), len(self)]
         found = []
         for first, last in pairwise(places):
             estimator, name, cell = (part[first].decode() for part in parts)
@@ -226,14 +251,18 @@ class Stored:
             found.append(Block(first, last, cells[cell], known[estimator, name], estimator))
         return found
 
-    @cached_property
-    def ends_of_blocks(self) -> IndexArray:
-        """The row after the last one of every block."""
-        return np.array([block.last for block in self.blocks], dtype=np.intp)
+    @property
+    def failures(self) -> BoolArray:
+        """Which of them failed."""
+        return np.isin(self.column("status"), [name.encode() for name in columns.FAILURES])
+
+    # --- comparison with the truth ----------------------------------------------------------------------------------
 
     @cached_property
     def _truths(self) -> dict[str, dict[str, float]]:
         """True values by name of every data cell."""
+        if self._all is not self:
+            return self._all._truths
         try:
             return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
         # Somebody else may have written the plan.
@@ -241,50 +270,59 @@ class Stored:
             raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
 
     @property
-    def failures(self) -> BoolArray:
-        """Which estimates are failures."""
-        return np.isin(self.column("status"), _FAILED)
+    def converged(self) -> BoolArray | None:
+        """Which of them satisfy the rule of success; None where there is none for all of them."""
+        known = [part for part in self._judged if not isinstance(part, int)]
+        return np.concatenate(known) if known and len(known) == len(self._judged) else None
 
-    def converged(self, block: Block, where: IndexArray) -> BoolArray | None:
-        """Which estimates of a block satisfy the rule; None where there is none."""
-        success, truth = self.manifest["success"], self._truths[block.cell["hash"]]
+    @cached_property
+    def _judged(self) -> list[BoolArray | int]:
+        """By block which of the estimates satisfy the rule; where there is none, their number."""
+        success = self.manifest["success"]
         if not success:
-            return None
-        measures = None
-        if success.get("band") is not None:
-            measures = self.part(int(where[0]), int(where[-1]) + 1).values("measures") if where.size else []
-            measures = [measures[k - where[0]] for k in where.tolist()]
-        values = dict(zip(truth, self.found(where, tuple(truth))[0].T, strict=True))
-        fit, failures = self.column("fit_percent")[where], np.isin(self.column("status")[where], _FAILED)
-        return judged(success, truth, failures, values, fit, measures)
+            return [block.last - block.first for block in self.blocks]
+        failures, fits = self.failures, self.column("fit_percent")
+        measures = self.values("measures") if success.get("band") is not None else None
+        found: list[BoolArray | int] = []
+        for block in self.blocks:
+            own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
+            values = dict(zip(truth, self._found(own, tuple(truth))[0].T, strict=True))
+            hits = judged(success, truth, failures[own], values, fits[own], measures and measures[own])
+            found.append(block.last - block.first if hits is None else hits)
+        return found
 
-    def found(self, where: IndexArray, names: Sequence[str]) -> tuple[Array, Array, Array]:
-        """Values, standard errors and quantiles under the names of the true ones, NaN where none is, shape (n, p).
+    def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Values, standard errors and quantiles under the names of the true ones, NaN where none is, shape (n, p)."""
+        return self._found(slice(None), names)
+
+    def _found(self, own: slice, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """The same of some of them.
 
         Rows that have the same form take their numbers from the same places: what `found_values` says of places.
         """
         there = [name for name in _OF_PARAMETERS if self.has(name)]
         names_of_forms = [f"{name}_{_OF_PARAMETERS[name]}" for name in there if _OF_PARAMETERS[name]]
-        held = {name: self.column(name)[where] for name in (*there, *names_of_forms)}
-        forms = [held[name].reshape(len(where), -1) for name in names_of_forms]
-        form: AnyArray = np.hstack(forms) if forms else np.zeros((len(where), 1), dtype=int)
-        values, errors, quantiles = np.full((3, len(where), len(names)), np.nan)
-        left = np.ones(len(where), dtype=bool)
+        held = {name: self.column(name)[own] for name in (*there, *names_of_forms)}
+        count = len(range(len(self))[own])
+        forms = [held[name].reshape(count, -1) for name in names_of_forms]
+        form: AnyArray = np.hstack(forms) if forms else np.zeros((count, 1), dtype=int)
+        values, errors, quantiles = np.full((3, count, len(names)), np.nan)
+        left = np.ones(count, dtype=bool)
         while left.any():
             some = int(left.argmax())
             alike = left & (form == form[some]).all(axis=1)
-            row = self._places(some, held)
+            row = self._places_in(some, held)
             for target, places in zip((values, errors, quantiles), found_values(row, names), strict=True):
                 for k, name in enumerate(names):
                     at = places[name]
                     if isinstance(at, tuple):
-                        target[alike, k] = held[at[0]].reshape(len(where), -1)[alike, at[1]]
+                        target[alike, k] = held[at[0]].reshape(count, -1)[alike, at[1]]
                     elif at is not None:
                         target[alike, k] = at
             left &= ~alike
         return values, errors, quantiles
 
-    def _places(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
+    def _places_in(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
         """One of some rows with the places of its numbers in their place."""
         row: dict[str, Any] = {"delay": ("delay", 0) if "delay" in held else None}
         for name, form in _OF_PARAMETERS.items():
@@ -298,28 +336,24 @@ class Stored:
 
     # --- rows -------------------------------------------------------------------------------------------------------
 
-    def every(self) -> Rows:
-        """All of them, as rows."""
-        return Rows(self, np.arange(self.count))
-
     @property
-    def row_names(self) -> list[str]:
+    def names(self) -> list[str]:
         """Names of what a row has."""
-        names = [column.name for column in row_columns(self.manifest)]
+        own = [column.name for column in row_columns(self.manifest)]
         compared = [column.name for column in columns.COLUMNS if column.source == "truth"]
-        return [*names, *swept_names(self.manifest), *compared]
+        return [*own, *swept_names(self.manifest), *compared]
 
-    def fields(self, names: Sequence[str] | None = None) -> dict[str, list[Any]]:
-        """All of what rows have, or some of it, by name."""
-        swept = swept_names(self.manifest)
-        return {n: self._swept(n) if n in swept else self.values(n) for n in names or self.row_names}
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return self.rows()
 
-    def _swept(self, name: str) -> list[Any]:
-        """Values of a swept field."""
-        values: list[Any] = []
-        for block in self.blocks:
-            values += [{**block.cell["swept"], **block.estimator["swept"]}.get(name)] * (block.last - block.first)
-        return values
+    def rows(self, *names: str) -> Iterator[dict[str, Any]]:
+        """All of them one after the other, or some columns of them; some thousand are read at a time."""
+        for start in range(0, self.export.count, ROWS):
+            inside = slice(*np.searchsorted(np.asarray(self.places), (start, start + ROWS)))
+            some = self.part(inside.start, inside.stop)
+            if len(some):
+                fields = {name: some.values(name) for name in names or self.names}
+                yield from (dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True))
 
     def slot(self, number: int) -> Slot:
         """What an estimate is of."""
@@ -330,8 +364,7 @@ class Stored:
     @cached_property
     def results(self) -> dict[Key, dict[str, Any]]:
         """All results by key."""
-        part = (self._first, self._last)
-        return dict(zip(self.export.keys(*part), self.export.results(*part), strict=True))
+        return dict(zip(self.export.keys(), self.export.results(0, self.export.count), strict=True))
 
     def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
         """All of them as a table, with the units of its columns; the types of swept fields may be given."""
@@ -340,77 +373,12 @@ class Stored:
         # Where there is no system, the columns of one would be empty.
         left_out = "systems" if is_of_signal(self.manifest) else ""
         known = {c.name: c for c in columns.COLUMNS}
-        shown = [n for n in names or self.row_names if n not in known or known[n].of != left_out]
-        series = {
-            name: pd.Series(values, dtype=known[name].dtype if name in known else (types or {}).get(name))
-            for name, values in self.fields(shown).items()
-        }
-        frame = pd.DataFrame(series)
+        shown = [n for n in names or self.names if n not in known or known[n].of != left_out]
+        dtypes = {name: known[name].dtype if name in known else (types or {}).get(name) for name in shown}
+        frame = pd.DataFrame({name: pd.Series(self.values(name), dtype=dtype) for name, dtype in dtypes.items()})
         frame.attrs["mixed"] = self.mixed
         frame.attrs["units"] = {name: known[name].unit for name in shown if name in known and known[name].unit}
         return frame
-
-
-class Rows:
-    """Some estimates, in the order of ``runs.h5``: as columns, or one after the other."""
-
-    def __init__(self, stored: Stored, places: IndexArray, names: Sequence[str] | None = None) -> None:
-        self.stored, self.places = stored, places
-        self._names = names
-
-    def only(self, *names: str) -> Rows:
-        """The same, with rows of some columns only."""
-        return Rows(self.stored, self.places, names)
-
-    def chosen(self, which: BoolArray | IndexArray | slice) -> Rows:
-        """Some of them."""
-        return Rows(self.stored, self.places[which], self._names)
-
-    def __len__(self) -> int:
-        return len(self.places)
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        for start in range(0, self.stored.count, ROWS):
-            inside = self.places[slice(*np.searchsorted(self.places, (start, start + ROWS)))]
-            if inside.size:
-                first = int(inside[0])
-                fields = self.stored.part(first, int(inside[-1]) + 1).fields(self._names)
-                for number in (inside - first).tolist():
-                    yield {name: values[number] for name, values in fields.items()}
-
-    def has(self, name: str) -> bool:
-        """Whether they have such a column at all."""
-        return self.stored.has(name)
-
-    def column(self, name: str) -> AnyArray:
-        """A column as an array."""
-        return np.asarray(self.stored.column(name)[self.places])
-
-    def values(self, name: str) -> list[Any]:
-        """A column as it is in rows."""
-        return [row[name] for row in self.only(name)]
-
-    @property
-    def failures(self) -> BoolArray:
-        """Which of them failed."""
-        return np.isin(self.column("status"), _FAILED)
-
-    @cached_property
-    def converged(self) -> BoolArray | None:
-        """Which of them satisfy the rule of success; None where there is none for all of them."""
-        if not len(self):
-            return None
-        found = []
-        first, last = np.searchsorted(self.stored.ends_of_blocks, self.places[[0, -1]], side="right")
-        for block in self.stored.blocks[first : last + 1]:
-            inside = self.places[slice(*np.searchsorted(self.places, (block.first, block.last)))]
-            found.append(self.stored.converged(block, inside))
-        known = [part for part in found if part is not None]
-        return np.concatenate(known) if known and len(known) == len(found) else None
-
-    def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
-        """Estimated values, standard errors and quantiles of intervals under the names of the true ones."""
-        return self.stored.found(self.places, names)
 
 
 # --- success and flat tables ----------------------------------------------------------------------------------------

@@ -221,12 +221,6 @@ def planned_count(manifest: Manifest) -> int:
     return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
 
 
-def shares_estimates(manifest: Manifest) -> bool:
-    """Whether two names of the same estimator, or data cell, share their estimates."""
-    parts = [[part["hash"] for part in manifest[of]] for of in ("data_cells", "estimators")]
-    return any(len(set(hashes)) < len(hashes) for hashes in parts)
-
-
 def shard_of(manifest: Manifest) -> Shard | None:
     """Which shard of the experiment it is; None for the whole."""
     return Shard(*manifest["shard"]) if "shard" in manifest else None

@@ -16,7 +16,7 @@ import numpy as np
 from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.estimates import Stored, read_stored
+from ctid_cli.storage.estimates import Estimates, read_stored
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.storage.identity import as_text
 from ctid_cli.storage.manifest import Manifest, Planned, Slot, planned_parts, shard_of
@@ -33,12 +33,12 @@ class FoundEstimate:
 
     folder: Path
     #: It alone.
-    stored: Stored
+    stored: Estimates
 
     @cached_property
     def row(self) -> dict[str, Any]:
         """Its row."""
-        return next(iter(self.stored.every()))
+        return next(self.stored.rows())
 
     @cached_property
     def slot(self) -> Slot:

@@ -9,7 +9,7 @@ import h5py
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.columns import failed, no_result
-from ctid_cli.storage.estimates import Stored
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.export import Export, write_export
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Outcome, slots
@@ -52,12 +52,13 @@ def outcomes_of(manifest):
     return [outcome(key) for key in dict.fromkeys(slot.key for slot in slots(manifest))]
 
 
-class MadeResults(Stored):
+class MadeResults(Estimates):
     """Results by key, all of which took the same time but those that have their own [s]; some hold a CPU time."""
 
     def __init__(self, manifest, results, origins=ORIGINS, seconds=0.02):
         self.plan, self.given_origins, self.results = manifest, origins, results
-        self.usual, self.seconds, self._read, self._first = seconds, {}, {}, 0
+        self.usual, self.seconds = seconds, {}
+        self._all, self._places, self._read = self, None, {}
 
     @property
     def manifest(self):
@@ -71,10 +72,6 @@ class MadeResults(Stored):
     def export(self):
         image = export_image(self.plan, self.given_origins, self.results)
         return Export(h5py.File(io.BytesIO(image), "r"), Path("runs.h5"))
-
-    @property
-    def _last(self):
-        return self.export.count
 
     def _times(self, data_hash, estimator_hash):
         return {

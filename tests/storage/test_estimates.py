@@ -128,19 +128,19 @@ def test_folders_without_results_and_with_odd_names(place: Path, tmp_path: Path)
 
 def test_rows_are_read_some_at_a_time(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = read_stored(place)
-    rows, columns = list(stored.every()), {name: stored.every().column(name) for name in ("status", "delay")}
+    rows, columns = list(stored), {name: stored.column(name) for name in ("status", "delay")}
     monkeypatch.setattr("ctid_cli.storage.estimates.ROWS", 7)
-    some = read_stored(place).every().chosen(np.arange(30) % 3 == 1)
+    some = read_stored(place).chosen(np.arange(30) % 3 == 1)
     assert list(some) == rows[1::3]
     assert (
-        [row["status"] for row in some.only("status")]
+        [row["status"] for row in some.rows("status")]
         == some.values("status")
         == columns["status"][1::3].astype(str).tolist()
     )
     assert np.array_equal(some.column("delay"), columns["delay"][1::3], equal_nan=True)
     assert some.converged is not None
     assert some.converged.tolist() == [row["converged"] for row in rows[1::3]]
-    assert len(some.chosen(slice(0))) == 0
+    assert (len(some.part(0, 0)), list(some.part(0, 0))) == (0, [])
 
 
 def row(status: str = "CONVERGED", delay: float | None = 8.0, fit: float | None = 95.0) -> dict[str, Any]:
