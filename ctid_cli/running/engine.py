@@ -38,7 +38,7 @@ from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.export import seal
 from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import FILE_NAME, Journal, open_journal
+from ctid_cli.storage.journal import EXPORT, FILE_NAME, Journal, open_journal
 from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
 from ctid_cli.storage.merge import keep_readable as keep_readable_of
 
@@ -308,7 +308,7 @@ class _Run:
         place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
+        self.on_event(events.Sealed(self.folder / EXPORT, *seal(self.folder, self.log)))
         failed = self.planned.count_in(self.stock.failed)
         missing = self.ready.estimates - self.computed
         reason = reason or (MACHINE if self.given_up else None)

@@ -18,7 +18,6 @@ converged and counts in every percentage. Without ``success``, or without true v
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -28,11 +27,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.errors import CtidError, StorageError, UsageError
+from ctid_cli.errors import DamageError, StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.export import (
-    EXPORT,
     MISSING,
     ROWS,
     AnyArray,
@@ -42,6 +40,7 @@ from ctid_cli.storage.export import (
     sha256_of,
 )
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal import EXPORT
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -67,8 +66,10 @@ _OF_PARAMETERS = {
     "standard_errors": "present",
     "quantiles": "present",
 }
-#: Times of the estimates of an estimator on a data cell, from the hashes of both, by replicate and start.
-Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]]]
+_OF_ERRORS = ("standard_errors", "quantiles")
+#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both; None where
+#: they are not known.
+Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]] | None]
 
 
 def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
@@ -97,11 +98,9 @@ def read_stored(folder: Path) -> Estimates:
 def _times_of(folder: Path, exported: str) -> Times:
     """Times out of a journal, as long as that is the one of ``runs.h5``."""
 
-    def read(data_hash: str, estimator_hash: str) -> Mapping[tuple[int, str], tuple[float | None, float | None]]:
-        with suppress(CtidError), place.reading_journal(folder) as log:
-            if log is not None and log.exported() == exported:
-                return log.times(data_hash, estimator_hash)
-        return {}
+    def read(data_hash: str, estimator_hash: str) -> Any:
+        with place.reading_journal(folder) as log:
+            return None if log is None or log.exported() != exported else log.times(data_hash, estimator_hash)
 
     return read
 
@@ -228,8 +227,13 @@ class Estimates:
             for block in self.blocks:
                 times = self._times(block.cell["hash"], block.hash)
                 inside = range(block.first, block.last)
-                pairs = [times.get((replicates[k], starts[k]), (None, None)) for k in inside]
-                found[:, inside] = np.array(pairs, dtype=float).T
+                if times is not None:
+                    try:
+                        pairs = [times[replicates[k], starts[k]] for k in inside]
+                    except KeyError as error:
+                        lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
+                        raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
+                    found[:, inside] = np.array(pairs, dtype=float).T
         return found[0], found[1]
 
     @cached_property
@@ -286,7 +290,7 @@ class Estimates:
         found: list[BoolArray | int] = []
         for block in self.blocks:
             own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
-            values = dict(zip(truth, self._found(own, tuple(truth))[0].T, strict=True))
+            values = dict(zip(truth, self._found(own, tuple(truth), errors=False)[0].T, strict=True))
             hits = judged(success, truth, failures[own], values, fits[own], measures and measures[own])
             found.append(block.last - block.first if hits is None else hits)
         return found
@@ -295,24 +299,24 @@ class Estimates:
         """Values, standard errors and quantiles under the names of the true ones, NaN where none is, shape (n, p)."""
         return self._found(slice(None), names)
 
-    def _found(self, own: slice, names: Sequence[str]) -> tuple[Array, Array, Array]:
-        """The same of some of them.
+    def _found(self, own: slice, names: Sequence[str], *, errors: bool = True) -> tuple[Array, Array, Array]:
+        """The same of some of them, or the values only.
 
         Rows that have the same form take their numbers from the same places: what `found_values` says of places.
         """
-        there = [name for name in _OF_PARAMETERS if self.has(name)]
+        there = [name for name in _OF_PARAMETERS if self.has(name) and (errors or name not in _OF_ERRORS)]
         names_of_forms = [f"{name}_{_OF_PARAMETERS[name]}" for name in there if _OF_PARAMETERS[name]]
         held = {name: self.column(name)[own] for name in (*there, *names_of_forms)}
         count = len(range(len(self))[own])
         forms = [held[name].reshape(count, -1) for name in names_of_forms]
         form: AnyArray = np.hstack(forms) if forms else np.zeros((count, 1), dtype=int)
-        values, errors, quantiles = np.full((3, count, len(names)), np.nan)
+        targets = np.full((3, count, len(names)), np.nan)
         left = np.ones(count, dtype=bool)
         while left.any():
             some = int(left.argmax())
             alike = left & (form == form[some]).all(axis=1)
             row = self._places_in(some, held)
-            for target, places in zip((values, errors, quantiles), found_values(row, names), strict=True):
+            for target, places in zip(targets, found_values(row, names), strict=True):
                 for k, name in enumerate(names):
                     at = places[name]
                     if isinstance(at, tuple):
@@ -320,7 +324,7 @@ class Estimates:
                     elif at is not None:
                         target[alike, k] = at
             left &= ~alike
-        return values, errors, quantiles
+        return targets[0], targets[1], targets[2]
 
     def _places_in(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
         """One of some rows with the places of its numbers in their place."""

@@ -28,7 +28,7 @@ from ctid_cli.signals.hdf5 import require_plain_tree
 from ctid_cli.storage import columns
 from ctid_cli.storage.columns import Column
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal import Journal, JournalReader, require_format
+from ctid_cli.storage.journal import EXPORT, Journal, JournalReader, require_format
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -44,7 +44,6 @@ from ctid_cli.written_files import replace_file
 
 AnyArray = NDArray[Any]
 
-EXPORT = "runs.h5"
 KIND, FORMAT = "ctid runs", 2
 #: Rows that are written at once, and make a chunk of the file.
 ROWS = 8192

@@ -18,13 +18,12 @@ from typing import Any
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage.identity import Origin, origin_differences
-from ctid_cli.storage.journal import FILE_NAME, JournalReader, read_journal
+from ctid_cli.storage.journal import EXPORT, FILE_NAME, JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
 from ctid_cli.written_files import TAKEN, is_leftover
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
-SEALED = "runs.h5"
 #: Present while a run goes on; says who runs.
 RUNNING = "running.json"
 
@@ -86,7 +85,7 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 def clear(folder: Path) -> None:
     """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
     for path in folder.glob(".*"):
-        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, SEALED)):
+        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, EXPORT)):
             with suppress(OSError):
                 path.unlink()
 
@@ -138,8 +137,8 @@ def check_free(
     experiment = manifest["experiment"]
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
-            if (folder / SEALED).exists():
-                why = f"{SEALED} without the {FILE_NAME} it was made from, so nothing can be added to it"
+            if (folder / EXPORT).exists():
+                why = f"{EXPORT} without the {FILE_NAME} it was made from, so nothing can be added to it"
                 raise RefusedError(
                     f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
                 )
@@ -244,6 +243,6 @@ def experiment_folders(results: Path) -> list[Path]:
     found = []
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))
-        if FILE_NAME in files or SEALED in files:
+        if FILE_NAME in files or EXPORT in files:
             found.append(Path(path))
     return sorted(found)

@@ -30,7 +30,8 @@ from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_part
 from ctid_cli.temporary import TemporaryFolder
 from ctid_cli.written_files import write_file
 
-FILE_NAME = "journal.sqlite"
+#: The journal, and what is exported of it.
+FILE_NAME, EXPORT = "journal.sqlite", "runs.h5"
 #: Another one for every change after which another ctid could misread the file.
 FORMAT = 5
 #: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
@@ -220,11 +221,8 @@ class JournalReader:
 
     def times(self, data_hash: str, estimator_hash: str) -> dict[tuple[int, str], tuple[float | None, float | None]]:
         """Times of the estimates of an estimator on a data cell [s], by replicate and start."""
-        query = (
-            "SELECT replicate, start, seconds, cpu_seconds FROM estimates WHERE data_hash = ? AND estimator_hash = ?"
-        )
-        rows = self._rows(query, data_hash, estimator_hash)
-        return {(replicate, start): (seconds, cpu_seconds) for replicate, start, seconds, cpu_seconds in rows}
+        rows = self._selected("WHERE data_hash = ? AND estimator_hash = ?", data_hash, estimator_hash)
+        return {(row.replicate, row.start): (row.seconds, row.cpu_seconds) for row in rows}
 
     def check(self, *, fully: bool = False) -> None:
         """Refuse a file that SQLite finds damaged; fully, compare indices with tables too."""
@@ -380,6 +378,7 @@ class Journal(JournalReader):
 
 def open_journal(path: Path) -> Journal:
     """Open a journal for writing, and make it if there is none."""
+    _require_whole(path)
     with ExitStack() as stack:
         try:
             connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
@@ -415,6 +414,7 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
     if not path.exists():
         yield None
         return
+    _require_whole(path)
     with ExitStack() as stack:
         try:
             address = stack.enter_context(_readable(path, live=live))
@@ -431,7 +431,16 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
             log = JournalReader(connection, path, live=live)
         except (OSError, *ERRORS) as error:
             refuse(path, error)
+        _require_whole(path, planned=bool(planned))
         yield log if planned else None
+
+
+def _require_whole(path: Path, *, planned: bool = True) -> None:
+    """Refuse a file that was emptied: beside what was made from it, or its log, which SQLite would remove."""
+    log, export = path.with_name(f"{path.name}-wal"), path.with_name(EXPORT)
+    emptied = path.exists() and path.stat().st_size == 0 and log.exists() and log.stat().st_size > _LOG_HEADER
+    if emptied or (not planned and export.exists()):
+        raise DamageError(f"{path} is damaged: it is empty, and was not")
 
 
 @contextmanager

@@ -16,9 +16,10 @@ from pathlib import Path
 
 from ctid_cli.errors import CtidError, RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.export import EXPORT, ROWS, open_export, seal
+from ctid_cli.storage.export import ROWS, open_export, seal
 from ctid_cli.storage.identity import Origin, now, origin_differences
 from ctid_cli.storage.journal import (
+    EXPORT,
     FILE_NAME,
     Journal,
     JournalReader,

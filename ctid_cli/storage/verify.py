@@ -8,8 +8,8 @@ from typing import Literal
 
 from ctid_cli.errors import CtidError, DamageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.export import EXPORT, open_export, sha256_of
-from ctid_cli.storage.journal import FILE_NAME, JournalReader
+from ctid_cli.storage.export import open_export, sha256_of
+from ctid_cli.storage.journal import EXPORT, FILE_NAME, JournalReader
 from ctid_cli.storage.manifest import Planned, slots
 from ctid_cli.written_files import is_leftover
 
