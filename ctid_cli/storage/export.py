@@ -96,10 +96,16 @@ def export_in_memory(log: JournalReader) -> "Export":
     return Export(h5py.File(image, "r"), log.path)
 
 
-def _of_journal(log: JournalReader, manifest: Manifest) -> tuple[Sequence[Origin], Results]:
-    """Where the estimates of a plan come from, and these."""
-    sessions = {row.session for _, row in log.planned_rows(manifest)}
-    return log.origins_of(sessions), lambda: ((slot, from_json(row.result)) for slot, row in log.planned_rows(manifest))
+def _of_journal(log: JournalReader, manifest: Manifest) -> tuple[Callable[[], Sequence[Origin]], Results]:
+    """Where the estimates of a plan come from, to ask when all of them were read, and these."""
+    sessions: set[str] = set()
+
+    def results() -> Iterator[tuple[Slot, Mapping[str, Any]]]:
+        for slot, row in log.planned_rows(manifest):
+            sessions.add(row.session)
+            yield slot, from_json(row.result)
+
+    return lambda: log.origins_of(sessions), results
 
 
 class _Recorder:
@@ -144,14 +150,14 @@ class _Recorder:
             raise self._error
 
 
-def write_export(target: Any, manifest: Manifest, origins: Sequence[Origin], results: Results) -> int:
+def write_export(target: Any, manifest: Manifest, origins: Callable[[], Sequence[Origin]], results: Results) -> int:
     """Write the file of some estimates; returns their number."""
     extent = _Extent(manifest)
     for slot, result in results():
         extent.include(slot, result)
     try:
         with h5py.File(target, "w", libver=_VERSION) as file:
-            _write_plan(file, manifest, origins)
+            _write_plan(file, manifest, origins())
             group = file.create_group("estimates")
             datasets = dict(extent.datasets(group))
             waiting = iter(results())

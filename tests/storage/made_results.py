@@ -85,5 +85,5 @@ def export_image(manifest, origins, results):
     """The bytes of ``runs.h5`` for some results."""
     image = io.BytesIO()
     planned = [(slot, results[slot.key]) for slot in slots(manifest) if slot.key in results]
-    write_export(image, manifest, origins, lambda: planned)
+    write_export(image, manifest, lambda: origins, lambda: planned)
     return image.getvalue()
