@@ -73,12 +73,12 @@ Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float 
 
 
 def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
-    """Estimates of the latest plan of an experiment, or some columns of them, as a table."""
+    """Return estimates of the latest plan of an experiment, or some columns of them, as a table."""
     return read_stored(folder).frame(names)
 
 
 def read_stored(folder: Path) -> Estimates:
-    """The estimates of the latest plan of an experiment."""
+    """Return the estimates of the latest plan of an experiment."""
     with place.reading_journal(folder) as log:
         if log is None:
             # There is a journal without a plan where the run was killed before it had planned anything.
@@ -96,7 +96,7 @@ def read_stored(folder: Path) -> Estimates:
 
 
 def _times_of(folder: Path, exported: str) -> Times:
-    """Times out of a journal, as long as that is the one of ``runs.h5``."""
+    """Return times out of a journal, as long as that is the one of ``runs.h5``."""
 
     def read(data_hash: str, estimator_hash: str) -> Any:
         with place.reading_journal(folder) as log:
@@ -130,15 +130,15 @@ class Estimates:
 
     @property
     def places(self) -> range | IndexArray:
-        """Numbers of their rows in the export."""
+        """Return numbers of their rows in the export."""
         return range(self.export.count) if self._places is None else self._places
 
     def part(self, start: int, stop: int) -> Estimates:
-        """Some that follow each other, whose columns are read without those of others."""
+        """Return some that follow each other, whose columns are read without those of others."""
         return self._some(self.places[start:stop])
 
     def chosen(self, which: BoolArray | IndexArray) -> Estimates:
-        """Some of them, whose columns are taken out of those of all."""
+        """Return some of them, whose columns are taken out of those of all."""
         some = self._some(np.asarray(self.places)[which])
         some._all = self._all
         return some
@@ -148,17 +148,17 @@ class Estimates:
 
     @property
     def manifest(self) -> Manifest:
-        """The plan."""
+        """Return the plan."""
         return self.export.manifest
 
     @property
     def origins(self) -> tuple[Origin, ...]:
-        """Where they come from."""
+        """Return where they come from."""
         return self.export.origins
 
     @property
     def mixed(self) -> bool:
-        """Whether several versions of the code, or platforms, computed what is compared here."""
+        """Return whether several versions of the code, or platforms, computed what is compared here."""
         return len(self.origins) > 1
 
     def __len__(self) -> int:
@@ -167,11 +167,11 @@ class Estimates:
     # --- columns ----------------------------------------------------------------------------------------------------
 
     def has(self, name: str) -> bool:
-        """Whether there is such a column."""
+        """Return whether there is such a column."""
         return name in CLOCKS or self.export.has(name)
 
     def column(self, name: str) -> AnyArray:
-        """A column as an array."""
+        """Return a column as an array."""
         if self._all is not self:
             return np.asarray(self._all.column(name)[self.places])
         if name not in self._read:
@@ -182,7 +182,7 @@ class Estimates:
         return self._read[name]
 
     def _span(self, read: Callable[[int, int], Any]) -> Any:
-        """What is read of the rows from the first to the last of them, without those between."""
+        """Return what is read of the rows from the first to the last of them, without those between."""
         places = self.places
         if not len(places):
             return read(0, 0)
@@ -194,7 +194,7 @@ class Estimates:
         return found[inside] if isinstance(found, np.ndarray) else [found[k] for k in inside.tolist()]
 
     def values(self, name: str) -> list[Any]:
-        """A column as it is in rows: None where there is no value."""
+        """Return a column as it is in rows: None where there is no value."""
         known = {column.name: column for column in columns.COLUMNS}
         if name not in known:
             return self._by_block(lambda block: {**block.cell["swept"], **block.estimator["swept"]}.get(name))
@@ -220,7 +220,7 @@ class Estimates:
         return [one for block in self.blocks for one in [value(block)] * (block.last - block.first)]
 
     def _clocks(self) -> tuple[Array, Array]:
-        """Times of the estimates [s]; NaN where they are not known."""
+        """Return times of the estimates [s]; NaN where they are not known."""
         found = np.full((2, len(self)), np.nan)
         if self._times is not None and len(self):
             replicates, starts = self.column("replicate").tolist(), self.values("start")
@@ -238,7 +238,7 @@ class Estimates:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """The rows of every estimator on every data cell, which follow each other."""
+        """Return the rows of every estimator on every data cell, which follow each other."""
         known = {(part["hash"], part["name"]): part for part in self.manifest["estimators"]}
         cells = {cell["hash"]: cell for cell in self.manifest["data_cells"]}
         parts = [self.column(name) for name in ("estimator_hash", "estimator", "cell")]
@@ -257,14 +257,14 @@ class Estimates:
 
     @property
     def failures(self) -> BoolArray:
-        """Which of them failed."""
+        """Return which of them failed."""
         return np.isin(self.column("status"), [name.encode() for name in columns.FAILURES])
 
     # --- comparison with the truth ----------------------------------------------------------------------------------
 
     @cached_property
     def _truths(self) -> dict[str, dict[str, float]]:
-        """True values by name of every data cell."""
+        """Return True values by name of every data cell."""
         if self._all is not self:
             return self._all._truths
         try:
@@ -275,13 +275,13 @@ class Estimates:
 
     @property
     def converged(self) -> BoolArray | None:
-        """Which of them satisfy the rule of success; None where there is none for all of them."""
+        """Return which of them satisfy the rule of success; None where there is none for all of them."""
         known = [part for part in self._judged if not isinstance(part, int)]
         return np.concatenate(known) if known and len(known) == len(self._judged) else None
 
     @cached_property
     def _judged(self) -> list[BoolArray | int]:
-        """By block which of the estimates satisfy the rule; where there is none, their number."""
+        """Return by block which of the estimates satisfy the rule; where there is none, their number."""
         success = self.manifest["success"]
         if not success:
             return [block.last - block.first for block in self.blocks]
@@ -296,11 +296,11 @@ class Estimates:
         return found
 
     def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
-        """Values, standard errors and quantiles under the names of the true ones, NaN where none is, shape (n, p)."""
+        """Return values, standard errors and quantiles under the true names, NaN where none is, shape (n, p)."""
         return self._found(slice(None), names)
 
     def _found(self, own: slice, names: Sequence[str], *, errors: bool = True) -> tuple[Array, Array, Array]:
-        """The same of some of them, or the values only.
+        """Return `found` of some of them, or its values only.
 
         Rows that have the same form take their numbers from the same places: what `found_values` says of places.
         """
@@ -327,7 +327,7 @@ class Estimates:
         return targets[0], targets[1], targets[2]
 
     def _places_in(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
-        """One of some rows with the places of its numbers in their place."""
+        """Return one of some rows with the places of its numbers in their place."""
         row: dict[str, Any] = {"delay": ("delay", 0) if "delay" in held else None}
         for name, form in _OF_PARAMETERS.items():
             if form and name in held:
@@ -342,7 +342,7 @@ class Estimates:
 
     @property
     def names(self) -> list[str]:
-        """Names of what a row has."""
+        """Return names of what a row has."""
         own = [column.name for column in row_columns(self.manifest)]
         compared = [column.name for column in columns.COLUMNS if column.source == "truth"]
         return [*own, *swept_names(self.manifest), *compared]
@@ -351,7 +351,7 @@ class Estimates:
         return self.rows()
 
     def rows(self, *names: str) -> Iterator[dict[str, Any]]:
-        """All of them one after the other, or some columns of them; some thousand are read at a time."""
+        """Yield all of them one after the other, or some columns of them; some thousand are read at a time."""
         for start in range(0, self.export.count, ROWS):
             inside = slice(*np.searchsorted(np.asarray(self.places), (start, start + ROWS)))
             some = self.part(inside.start, inside.stop)
@@ -360,18 +360,18 @@ class Estimates:
                 yield from (dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True))
 
     def slot(self, number: int) -> Slot:
-        """What an estimate is of."""
+        """Return what an estimate is of."""
         (block,) = (block for block in self.blocks if block.first <= number < block.last)
         start, replicate = self.column("start")[number].decode(), int(self.column("replicate")[number])
         return Slot(Key(block.cell["hash"], replicate, block.hash, start), block.cell, block.estimator)
 
     @cached_property
     def results(self) -> dict[Key, dict[str, Any]]:
-        """All results by key."""
+        """Return all results by key."""
         return dict(zip(self.export.keys(), self.export.results(0, self.export.count), strict=True))
 
     def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
-        """All of them as a table, with the units of its columns; the types of swept fields may be given."""
+        """Return all of them as a table, with the units of its columns; the types of swept fields may be given."""
         import pandas as pd
 
         # Where there is no system, the columns of one would be empty.
@@ -389,7 +389,7 @@ class Estimates:
 
 
 def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, truth: Mapping[str, float]) -> bool | None:
-    """Whether an estimate satisfies the success rule, from the true values by name."""
+    """Return whether an estimate satisfies the success rule, from the true values by name."""
     found = {name: _array(value) for name, value in found_values(row, truth)[0].items()}
     failures = np.array([row["status"] in columns.FAILURES])
     hits = judged(success, truth, failures, found, _array(row.get("fit_percent")), [row.get("measures")])
@@ -408,7 +408,7 @@ def judged(
     fit_percent: Array,
     measures: Sequence[Mapping[str, float | None] | None] | None,
 ) -> BoolArray | None:
-    """Which estimates satisfy the success rule: from what they found by name, NaN where there is nothing."""
+    """Return which estimates satisfy the success rule: from what they found by name, NaN where there is nothing."""
     rule = success or {}
     conditions: list[BoolArray] = []
     if rule.get("delay_relative_error") is not None and "delay" in truth:
@@ -430,7 +430,7 @@ def _near(values: Array, true: float, tolerance: float) -> BoolArray:
 
 
 def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
-    """Estimates as a flat table for other programs, with one number per cell."""
+    """Return estimates as a flat table for other programs, with one number per cell."""
     import pandas as pd
 
     parts = {column.name: column for column in columns.COLUMNS if column.type in ("coefficients", "by name")}
@@ -449,7 +449,7 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def _parts(column: columns.Column, cells: Iterable[Any]) -> Iterator[tuple[Any, list[float | None]]]:
-    """The parts of a column with several numbers in a cell, each with its values."""
+    """Yield the parts of a column with several numbers in a cell, each with its values."""
     # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
     rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in cells]
     found: list[Any] = column.names(rows) if column.type == "by name" else []

@@ -90,14 +90,14 @@ def _write_file(path: Path, manifest: Manifest, log: JournalReader) -> int:
 
 
 def export_in_memory(log: JournalReader) -> "Export":
-    """What would be exported of a journal's plan now."""
+    """Return what would be exported of a journal's plan now."""
     manifest, image = log.manifest(), io.BytesIO()
     write_export(image, manifest, *_of_journal(log, manifest))
     return Export(h5py.File(image, "r"), log.path)
 
 
 def _of_journal(log: JournalReader, manifest: Manifest) -> tuple[Callable[[], Sequence[Origin]], Results]:
-    """Where the estimates of a plan come from, to ask when all of them were read, and these."""
+    """Yield where the estimates of a plan come from, to ask when all of them were read, and these."""
     sessions: set[str] = set()
 
     def results() -> Iterator[tuple[Slot, Mapping[str, Any]]]:
@@ -190,7 +190,7 @@ class _Extent:
         self._lists = [name for name, column in self._columns.items() if column.type == "coefficients"]
 
     def values(self, slot: Slot, result: Mapping[str, Any]) -> dict[str, Any]:
-        """Values of the columns of a row."""
+        """Return values of the columns of a row."""
         values = {**result, **plan_values(slot, self._manifest), "estimator_hash": slot.key.estimator_hash}
         for name, value in slot.swept.items():
             of = f"swept/{name}"
@@ -238,7 +238,7 @@ class _Extent:
             yield name, dataset
 
     def array(self, name: str, rows: Sequence[Mapping[str, Any]]) -> AnyArray:
-        """The values of some rows in one of the arrays."""
+        """Return the values of some rows in one of the arrays."""
         base = name.removesuffix("_present").removesuffix("_length")
         if name in self._columns:
             base = name
@@ -278,7 +278,7 @@ def _write_texts(group: h5py.Group, name: str, texts: Sequence[str]) -> None:
 
 
 def _encoded(texts: Sequence[str], longest: int) -> AnyArray:
-    """Texts as an array that says that they are UTF-8."""
+    """Return texts as an array that says that they are UTF-8."""
     array = np.empty(len(texts), h5py.string_dtype("utf-8", longest))
     array[:] = [text.encode() for text in texts]
     return array
@@ -329,21 +329,21 @@ class Export:
             _require_columns(self._group, self.count)
 
     def has(self, name: str) -> bool:
-        """Whether there is such an array."""
+        """Return whether there is such an array."""
         return name in self._group
 
     def parts(self, name: str) -> list[str]:
-        """Names of the columns of an array that has several."""
+        """Return names of the columns of an array that has several."""
         with saying_where(self.path):
             return _texts(self._group[names_of(name)][()])
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
-        """Some rows of an array."""
+        """Return some rows of an array."""
         with saying_where(self.path):
             return np.asarray(self._group[name][start:stop])
 
     def values(self, column: Column, start: int = 0, stop: int | None = None) -> list[Any]:
-        """Values of a column, None where there is none."""
+        """Return values of a column, None where there is none."""
         name, stop = column.name, self.count if stop is None else min(stop, self.count)
         if not self.has(name):
             return [None] * (stop - start)
@@ -365,13 +365,13 @@ class Export:
         return list(plain)
 
     def keys(self, start: int = 0, stop: int | None = None) -> list[Key]:
-        """Identities of some estimates."""
+        """Return identities of some estimates."""
         names = ("cell", "estimator_hash", "start")
         cells, estimators, starts = (_texts(self.read(name, start, stop)) for name in names)
         return list(map(Key, cells, self.read("replicate", start, stop).tolist(), estimators, starts))
 
     def results(self, start: int, stop: int) -> list[dict[str, Any]]:
-        """Results of some estimates, as they were computed."""
+        """Return results of some estimates, as they were computed."""
         wanted = [column for column in columns.COLUMNS if column.source == "result"]
         values = [self.values(column, start, stop) for column in wanted]
         found = [dict(zip((c.name for c in wanted), row, strict=True)) for row in zip(*values, strict=True)]
@@ -400,19 +400,19 @@ def open_export(path: Path) -> Export:
 
 
 def sha256_of(path: Path) -> str | None:
-    """SHA-256 of a file; None where it cannot be read."""
+    """Return SHA-256 of a file; None where it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
     return None
 
 
 def with_errors(row: dict[str, Any]) -> dict[str, Any]:
-    """A row whose model, if it has one, has a table of errors, if an empty one."""
+    """Return a row whose model, if it has one, has a table of errors, if an empty one."""
     return row if row["denominator"] is None else row | {"standard_errors": row["standard_errors"] or {}}
 
 
 def names_of(name: str) -> str:
-    """Name of the array with the names of the parts of a column."""
+    """Return name of the array with the names of the parts of a column."""
     return f"{name.removesuffix('s')}_names"
 
 

@@ -108,7 +108,7 @@ def _wait(folder: Path, deadline: float) -> None:
 
 
 def who_runs(folder: Path) -> dict[str, Any] | None:
-    """What the run that writes to a folder says about itself."""
+    """Return what the run that writes to a folder says about itself."""
     try:
         running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
         return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
@@ -211,7 +211,7 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
 
 
 def what_is_safe(folder: Path) -> str:
-    """A sentence about what to do where a journal is damaged."""
+    """Return a sentence about what to do where a journal is damaged."""
     start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
     return f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
 
@@ -239,7 +239,7 @@ def move_aside(folder: Path) -> Path | None:
 
 
 def experiment_folders(results: Path) -> list[Path]:
-    """Folders of experiments, in a results folder or anywhere below."""
+    """Return folders of experiments, in a results folder or anywhere below."""
     found = []
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))

@@ -56,18 +56,18 @@ class Origin(NamedTuple):
 
     @classmethod
     def of(cls, code_version: str, platform: str, packages: Iterable[Any]) -> Self:
-        """An origin from plain data."""
+        """Return an origin from plain data."""
         return cls(code_version, platform, tuple((name, version) for name, version in packages))
 
 
 def origin_of(*options: Any) -> Origin:
-    """Where estimates of data sources and estimators come from that are computed by this process and its workers."""
+    """Return where estimates come from that this process and its workers compute with some options."""
     packages = (("python", platform.python_version()), *package_versions(NUMERICAL_LIBRARIES).items())
     return Origin(code_version(set().union(*map(modules_of, options))), numeric_platform(), packages)
 
 
 def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None, str | None]]:
-    """What of two origins differs: its name, and what it is of each."""
+    """Return what of two origins differs: its name, and what it is of each."""
     left, right = dict(one.packages), dict(other.packages)
     pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
     pairs += [(name, left.get(name), right.get(name)) for name in left | right]
@@ -76,13 +76,13 @@ def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None
 
 
 def code_version(modules: Iterable[str] = (), root: Path = ROOT) -> str:
-    """Hash of the layers that compute, of the numerical libraries, and of the custom ones of some modules."""
+    """Return hash of the layers that compute, of the numerical libraries, and of the custom ones of some modules."""
     custom = sorted(set(_custom_modules(modules).values()))
     return content_hash([package_versions(NUMERICAL_LIBRARIES), _layers_hash(root), custom])[:12]
 
 
 def modules_of(value: Any) -> set[str]:
-    """The modules of the classes that options and their fields have."""
+    """Return the modules of the classes that options and their fields have."""
     fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
     parts = [modules_of(getattr(value, part.name)) for part in fields]
     parts += [modules_of(item) for item in value] if isinstance(value, list | tuple) else []
@@ -90,7 +90,7 @@ def modules_of(value: Any) -> set[str]:
 
 
 def _custom_modules(names: Iterable[str]) -> dict[str, str]:
-    """Hashes of the custom modules among some, and of those that these import, directly or not."""
+    """Return hashes of the custom modules among some, and of those that these import, directly or not."""
     found: dict[str, str] = {}
     waiting = list(names)
     while waiting:
@@ -127,7 +127,7 @@ def _layers_hash(root: Path) -> str:
 
 
 def _without_docstrings(source: bytes) -> str:
-    """Hash of a syntax tree without docstrings; comments are not in it."""
+    """Return hash of a syntax tree without docstrings; comments are not in it."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -139,7 +139,7 @@ def _without_docstrings(source: bytes) -> str:
 
 
 def package_versions(names: tuple[str, ...] = NUMERICAL_LIBRARIES + OTHER_LIBRARIES) -> dict[str, str]:
-    """Versions of installed packages."""
+    """Return versions of installed packages."""
     return {name: _version(name) for name in names}
 
 
@@ -153,7 +153,7 @@ def _version(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def numeric_platform() -> str:
-    """What decides the last bits of floating-point results on this machine."""
+    """Return what decides the last bits of floating-point results on this machine."""
     import numpy as np
 
     # stubs leave the modes of show_config untyped
@@ -166,7 +166,7 @@ def numeric_platform() -> str:
 
 
 def _numba_target() -> str:
-    """The processor that Numba compiles for, and a hash of what it may use of it."""
+    """Return the processor that Numba compiles for, and a hash of what it may use of it."""
     from llvmlite import binding  # type: ignore[import-untyped,unused-ignore]
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
@@ -194,12 +194,12 @@ def _openblas_kernels() -> Iterator[str]:
 
 
 def now() -> str:
-    """The present time in UTC, for example ``2026-11-21T04:00:00Z``."""
+    """Return the present time in UTC, for example ``2026-11-21T04:00:00Z``."""
     return as_text(datetime.now(UTC))
 
 
 def as_text(moment: datetime) -> str:
-    """A time in UTC, as it is stored."""
+    """Return a time in UTC, as it is stored."""
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
@@ -220,12 +220,12 @@ def session_info(spec_text: str, spec_folder: Path) -> dict[str, Any]:
 
 
 def canonical_text(spec: Mapping[str, Any]) -> str:
-    """A canonical specification as its file holds it."""
+    """Return a canonical specification as its file holds it."""
     return json.dumps(spec, sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def git_commit(root: Path) -> str | None:
-    """Commit of a checkout; None where there is none, or no git."""
+    """Return commit of a checkout; None where there is none, or no git."""
     # An installed package may lie in a folder of some other repository.
     if (root / ".git").exists():
         with suppress(OSError, subprocess.CalledProcessError):

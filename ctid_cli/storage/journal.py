@@ -81,7 +81,7 @@ class Row(NamedTuple):
 
     @classmethod
     def of(cls, outcome: Outcome, session: str) -> "Row":
-        """An estimate that was computed just now."""
+        """Return an estimate that was computed just now."""
         key, result, *times = outcome
         of_key = (key.data_hash, key.estimator_hash, key.replicate, key.start)
         seconds, cpu_seconds = (None if t is None or not math.isfinite(t) else float(t) for t in times)
@@ -90,17 +90,17 @@ class Row(NamedTuple):
 
     @property
     def key(self) -> Key:
-        """Its identity."""
+        """Return its identity."""
         return Key(self.data_hash, self.replicate, self.estimator_hash, self.start)
 
     @property
     def is_intact(self) -> bool:
-        """Whether it is what was written."""
+        """Return whether it is what was written."""
         return self.checksum == _digest(*self[:-2], self.result)
 
     @property
     def content(self) -> dict[str, Any]:
-        """Its result."""
+        """Return its result."""
         found: dict[str, Any] = json.loads(self.result)
         return found
 
@@ -128,29 +128,29 @@ class JournalReader:
         self.live = live
 
     def experiment(self) -> str:
-        """Name of the experiment."""
+        """Return name of the experiment."""
         return str(self.manifest()["experiment"])
 
     def manifest(self) -> Manifest:
-        """The plan of the latest run."""
+        """Return the plan of the latest run."""
         with self._guard():
             return require_manifest(read_json(self._meta(_MANIFEST) or ""))
 
     def exported(self) -> str | None:
-        """SHA-256 of ``runs.h5``; None if estimates or another plan came after it."""
+        """Return SHA-256 of ``runs.h5``; None if estimates or another plan came after it."""
         return self._meta(_EXPORTED)
 
     def state(self) -> str | None:
-        """What changes with every run that writes; None before the first one."""
+        """Return what changes with every run that writes; None before the first one."""
         rows = self._rows("SELECT id, stopped FROM sessions ORDER BY rowid DESC LIMIT 1")
         return str(rows[0]) if rows else None
 
     def sessions(self) -> list[Session]:
-        """Every run that has written here, the oldest first."""
+        """Return every run that has written here, the oldest first."""
         return self._sessions("ORDER BY rowid")
 
     def session(self, id: str) -> Session:
-        """One of these runs."""
+        """Return one of these runs."""
         (found,) = self._sessions("WHERE id = ?", id)
         return found
 
@@ -163,37 +163,37 @@ class JournalReader:
             ]
 
     def origins(self) -> tuple[Origin, ...]:
-        """Where the stored estimates come from."""
+        """Return where the stored estimates come from."""
         return self.origins_of(id for (id,) in self._rows("SELECT DISTINCT session FROM estimates"))
 
     def origins_of(self, sessions: Iterable[str]) -> tuple[Origin, ...]:
-        """Where the estimates of some runs come from."""
+        """Return where the estimates of some runs come from."""
         known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
             return tuple(sorted({known[id] for id in sessions}))
 
     def made(self) -> set[tuple[str, Origin]]:
-        """Data cells of the stored estimates, and where these come from."""
+        """Return the data cells of the stored estimates, and where these come from."""
         known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
             return {(data, known[id]) for data, id in self._rows("SELECT DISTINCT data_hash, session FROM estimates")}
 
     def count(self) -> int:
-        """How many estimates are stored."""
+        """Return how many estimates are stored."""
         return int(self._rows("SELECT count(*) FROM estimates")[0][0])
 
     def mean_seconds(self) -> float | None:
-        """Mean time of an estimate [s]; None where none is known."""
+        """Return mean time of an estimate [s]; None where none is known."""
         mean: float | None = self._rows("SELECT avg(seconds) FROM estimates")[0][0]
         return mean
 
     def counts(self) -> Counter[tuple[str, str]]:
-        """Number of estimates of each run with each status."""
+        """Return number of estimates of each run with each status."""
         rows = self._rows("SELECT session, status, count(*) FROM estimates GROUP BY 1, 2")
         return Counter({(session, status): count for session, status, count in rows})
 
     def rows(self) -> Iterator[Row]:
-        """Every stored estimate."""
+        """Yield every stored estimate."""
         self.require_count()
         yield from self._selected("")
 
@@ -204,7 +204,7 @@ class JournalReader:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
-        """The stored estimates that a plan asks for, in its order."""
+        """Yield the stored estimates that a plan asks for, in its order."""
         for estimator, cell, replicates in planned_parts(manifest):
             order = {start: number for number, start in enumerate(estimator["starts"])}
             wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
@@ -215,12 +215,12 @@ class JournalReader:
                         yield Slot(row.key, cell, estimator), row
 
     def row(self, key: Key) -> Row | None:
-        """A stored estimate."""
+        """Return a stored estimate."""
         of_key = (key.data_hash, key.estimator_hash, key.replicate, key.start)
         return next(self._selected(f"WHERE {_IS_KEY}", *of_key), None)
 
     def times(self, data_hash: str, estimator_hash: str) -> dict[tuple[int, str], tuple[float | None, float | None]]:
-        """Times of the estimates of an estimator on a data cell [s], by replicate and start."""
+        """Return times of the estimates of an estimator on a data cell [s], by replicate and start."""
         rows = self._selected("WHERE data_hash = ? AND estimator_hash = ?", data_hash, estimator_hash)
         return {(row.replicate, row.start): (row.seconds, row.cpu_seconds) for row in rows}
 
@@ -232,7 +232,7 @@ class JournalReader:
         self.require_count()
 
     def _selected(self, where: str, *values: Any) -> Iterator[Row]:
-        """Some estimates, compared with their checksums."""
+        """Yield some estimates, compared with their checksums."""
         with self._guard():
             for values_of_row in self._connection.execute(f"SELECT {_COLUMNS} FROM estimates {where}", values):
                 row = Row(*values_of_row)
@@ -245,7 +245,7 @@ class JournalReader:
             return self._connection.execute(query, values).fetchall()
 
     def _checked(self, table: str, names: str, where: str = "", *values: Any) -> list[Any]:
-        """Rows of a table, compared with their checksums; ``names`` are all of its columns but that."""
+        """Return rows of a table, compared with their checksums; ``names`` are all its columns but that."""
         rows = self._rows(f"SELECT {names}, checksum FROM {table} {where}", *values)
         for *row, checksum in rows:
             if _digest(table, *row) != checksum:
@@ -368,7 +368,7 @@ class Journal(JournalReader):
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Commit what is done inside, or undo all of it if an exception ends it."""
+        """Return commit what is done inside, or undo all of it if an exception ends it."""
         # The connection commits, or rolls back what an exception has left undone.
         with self._guard(writing=True), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
@@ -445,7 +445,7 @@ def _require_whole(path: Path, *, planned: bool = True) -> None:
 
 @contextmanager
 def _readable(path: Path, *, live: bool) -> Iterator[str]:
-    """An address at which SQLite reads a journal and changes nothing.
+    """Return an address at which SQLite reads a journal and changes nothing.
 
     After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
     index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
@@ -503,10 +503,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def new_id() -> str:
-    """An id as no other run has it."""
+    """Return an id as no other run has it."""
     return uuid.uuid4().hex[:16]
 
 
 def _digest(*values: Any) -> str:
-    """Checksum of a row."""
+    """Return checksum of a row."""
     return hashlib.sha256(repr(values).encode("utf-8", "surrogatepass")).hexdigest()[:32]

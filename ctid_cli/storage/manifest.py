@@ -33,7 +33,7 @@ class Key(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Short name of the estimate."""
+        """Return short name of the estimate."""
         return hashlib.sha256(f"{self[0]}/{self[1]}/{self[2]}/{self[3]}".encode()).hexdigest()[:12]
 
 
@@ -59,7 +59,7 @@ class Slot(NamedTuple):
 
     @property
     def swept(self) -> dict[str, Any]:
-        """Values of the swept fields."""
+        """Return values of the swept fields."""
         return {**self.cell["swept"], **self.estimator["swept"]}
 
 
@@ -75,23 +75,23 @@ class Shard:
 
     @classmethod
     def read(cls, text: str) -> Self:
-        """The shard that a text such as ``2/3`` names."""
+        """Return the shard that a text such as ``2/3`` names."""
         found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if found is None or not 1 <= int(found[1]) <= int(found[2]):
             raise UsageError(f"--shard {text}: write k/n, for example 2/3 for the second of three, with k from 1 to n")
         return cls(int(found[1]), int(found[2]))
 
     def folder(self, experiment: str) -> str:
-        """Name of the folder of its results."""
+        """Return name of the folder of its results."""
         return f"{experiment}.shard-{self.number}-of-{self.of}"
 
     def has(self, cell: int, replicate: int, cells: int) -> bool:
-        """Whether a data set is among those of this shard."""
+        """Return whether a data set is among those of this shard."""
         return owner(cell, replicate, cells, self.of) == self.number
 
 
 def owner(cell: int, replicate: int, cells: int, of: int) -> int:
-    """Number of the shard that a data set is dealt to."""
+    """Return number of the shard that a data set is dealt to."""
     index = replicate * cells + cell
     # Dealt in turn, a number of cells that has a factor in common with that of the shards would give some shards the
     # same cells over and over; so each turn through both begins one shard later.
@@ -99,7 +99,7 @@ def owner(cell: int, replicate: int, cells: int, of: int) -> int:
 
 
 def read_json(text: str) -> Any:
-    """JSON without the numbers that it has no words for."""
+    """Return JSON without the numbers that it has no words for."""
 
     def refuse(constant: str) -> NoReturn:
         raise ValueError(f"{constant} is no JSON number")
@@ -137,7 +137,7 @@ def planned_most(plan: Manifest) -> int:
 
 @cache
 def _plan_model() -> Any:
-    """What checks the form of a plan."""
+    """Return what checks the form of a plan."""
     from typing import Annotated
 
     from pydantic import BaseModel, Field, FiniteFloat
@@ -183,7 +183,7 @@ def _plan_model() -> Any:
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
-    """Every estimate that a plan asks for, or that its shard is to compute."""
+    """Yield every estimate that a plan asks for, or that its shard is to compute."""
     for estimator, cell, replicates in planned_parts(manifest):
         for replicate in replicates:
             for start in estimator["starts"]:
@@ -191,7 +191,7 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
 
 
 def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], Sequence[int]]]:
-    """Every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
+    """Yield every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
     cells, shard = manifest["data_cells"], shard_of(manifest)
     asked: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
     if shard is not None:
@@ -217,30 +217,30 @@ class Planned:
 
 
 def planned_count(manifest: Manifest) -> int:
-    """How many estimates that are, those that two names share counted twice."""
+    """Return how many estimates that are, those that two names share counted twice."""
     return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
 
 
 def shard_of(manifest: Manifest) -> Shard | None:
-    """Which shard of the experiment it is; None for the whole."""
+    """Return which shard of the experiment it is; None for the whole."""
     return Shard(*manifest["shard"]) if "shard" in manifest else None
 
 
 def whole(manifest: Manifest) -> Manifest:
-    """The plan that a shard was dealt from."""
+    """Return the plan that a shard was dealt from."""
     return {name: value for name, value in manifest.items() if name != "shard"}
 
 
 def assemble(
     slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
 ) -> dict[str, Any]:
-    """An estimate row."""
+    """Return an estimate row."""
     values = {**result, **plan_values(slot, manifest), "seconds": seconds, "cpu_seconds": cpu_seconds}
     return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
 
 
 def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
-    """What the plan says of an estimate, apart from swept fields."""
+    """Return what the plan says of an estimate, apart from swept fields."""
     return {
         "id": slot.key.id,
         "experiment": manifest["experiment"],
@@ -254,7 +254,7 @@ def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
 
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:
-    """The columns of a row as it is computed, before it is compared with the truth."""
+    """Return the columns of a row as it is computed, before it is compared with the truth."""
     return _row_columns(of_signal=is_of_signal(manifest))
 
 
@@ -265,18 +265,18 @@ def _row_columns(*, of_signal: bool) -> list[columns.Column]:
 
 
 def is_of_signal(manifest: Manifest) -> bool:
-    """Whether the estimates are frequencies of a signal."""
+    """Return whether the estimates are frequencies of a signal."""
     return "signal" in manifest["data_cells"][0]["content"]
 
 
 def swept_names(manifest: Manifest) -> list[str]:
-    """Names of the swept fields."""
+    """Return names of the swept fields."""
     parts = [*manifest["data_cells"], *manifest["estimators"]]
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
 def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
-    """True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
+    """Return True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
 
     ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
     parameters of the submodels of a sum, and its delay; the truth that a system of one's own gives.
@@ -298,7 +298,7 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
 
 @cache
 def _coefficients(names: tuple[str, ...]) -> tuple[int, int]:
-    """How many of these names are coefficients of a denominator, and of a numerator."""
+    """Return how many of these names are coefficients of a denominator, and of a numerator."""
     poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names) for letter in "ab")
     return poles, zeros
 
@@ -313,7 +313,7 @@ class Found(NamedTuple):
 
 
 def found_values(row: Mapping[str, Any], names: Iterable[str]) -> Found:
-    """Estimated values, standard errors and quantiles of intervals under the names of the true ones.
+    """Return estimated values, standard errors and quantiles of intervals under the names of the true ones.
 
     Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
     ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.

@@ -67,7 +67,7 @@ class Merged:
 
 
 def find_sources(paths: Iterable[Path]) -> list[Path]:
-    """The folders that are meant: of experiments as they are given, of all shards below others."""
+    """Return the folders that are meant: of experiments as they are given, of all shards below others."""
     found: dict[Path, Path] = {}
     for path in paths:
         if (path / FILE_NAME).exists():
@@ -141,7 +141,7 @@ def _plan_of(folder: Path) -> Manifest:
 
 
 def _common_plan(plans: Sequence[tuple[Path, Manifest]]) -> Manifest:
-    """The plan that all folders are of."""
+    """Return the plan that all folders are of."""
     first, plan = plans[0][0], whole(plans[0][1])
     for folder, found in plans[1:]:
         other = whole(found)
@@ -158,7 +158,7 @@ def _common_plan(plans: Sequence[tuple[Path, Manifest]]) -> Manifest:
 
 @contextmanager
 def _new_folder(target: Path) -> Iterator[None]:
-    """A folder that is removed again if it was made here and what follows fails."""
+    """Return a folder that is removed again if it was made here and what follows fails."""
     made = not target.exists()
     try:
         with _writing(target):
@@ -192,11 +192,11 @@ class _Taken:
 
     @property
     def new(self) -> int:
-        """Estimates that were not there before, or exceeded a limit there."""
+        """Return estimates that were not there before, or exceeded a limit there."""
         return len(self._changed)
 
     def new_rows(self, folder: Path, other: JournalReader) -> Iterator[Row]:
-        """The rows of a folder that are to be stored; their runs are noted."""
+        """Yield the rows of a folder that are to be stored; their runs are noted."""
         sessions = {session.id: session for session in other.sessions()}
         for row in other.rows():
             if row.key not in self._planned:
@@ -223,7 +223,7 @@ class _Taken:
         )
 
     def _is_better(self, row: Row, session: Session, present: Row, folder: Path) -> bool:
-        """Whether a row replaces the present one: where one of both exceeded a limit, or else a conflict is noted."""
+        """Return whether a row replaces the present one, as where this exceeded a limit; a conflict is noted."""
         if row.result == present.result:
             return False
         where, of_present = self._places[present.session]
@@ -233,7 +233,7 @@ class _Taken:
         return False
 
     def require_no_conflict(self) -> None:
-        """Name the estimates that are one thing here and another there."""
+        """Return name the estimates that are one thing here and another there."""
         if self._conflicts:
             key, one, other = self._conflicts[0]
             count = len(self._conflicts)
@@ -245,20 +245,20 @@ class _Taken:
             )
 
     def missing(self) -> list[Key]:
-        """Estimates of the plan that are in none of the folders."""
+        """Return estimates of the plan that are in none of the folders."""
         there = {row.key for row in self._log.rows()}
         return list({slot.key: None for slot in slots(self._plan) if slot.key not in there})
 
 
 def _rank(row: Row, session: Session) -> tuple[bool, list[float], str]:
-    """Which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
+    """Return which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
     limits = session.info.get("limits") or {}
     allowed = [inf if (limit := limits.get(name)) is None else float(limit) for name in LIMITS]
     return row.status not in LIMITED, allowed, row.result
 
 
 def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]) -> Iterator[str]:
-    """What is not there, by shard where all folders are of the same dealing."""
+    """Yield what is not there, by shard where all folders are of the same dealing."""
     known = [shard for shard in shards if shard is not None]
     if not keys:
         return
@@ -281,7 +281,7 @@ def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]
 
 
 def shards_text(numbers: Iterable[int], of: int) -> str:
-    """Some shards in words, with numbers as job arrays take them: ``shards 1-3,7 of 9``."""
+    """Return some shards in words, with numbers as job arrays take them: ``shards 1-3,7 of 9``."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and runs[-1][-1] == number - 1:
@@ -346,7 +346,7 @@ def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, 
 
 
 def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
-    """The rows of a journal that can be read, each with its run."""
+    """Yield the rows of a journal that can be read, each with its run."""
     with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
         for key in keys if old is not None else ():
             # Whatever a damaged page hides, the other rows are worth reading.
@@ -357,7 +357,7 @@ def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]
 
 
 def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
-    """The estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
+    """Yield the estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
     with suppress(CtidError):
         export = open_export(aside / EXPORT)
         export.verify()

@@ -46,14 +46,14 @@ class ResultKind(NamedTuple):
 
 
 def result_text(kind: ResultKind, content: Mapping[str, Any], command: str | None) -> str:
-    """The file's text, with what every reader compares."""
+    """Return the file's text, with what every reader compares."""
     whole = {"kind": kind.kind, "format": kind.format, "ctid": ctid_cli.__version__, "command": command, **content}
     text = json.dumps(whole, allow_nan=False)
     return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
 
 
 def path_and_sum(path: str | os.PathLike[str], folder: Path) -> dict[str, Any]:
-    """Where a record lies, seen from a folder, and its SHA-256."""
+    """Return where a record lies, seen from a folder, and its SHA-256."""
     place, home = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
     below = place.is_relative_to(home)
     shown = place.relative_to(home).as_posix() if below else str(place)
@@ -74,7 +74,7 @@ class Source:
 
     @property
     def place(self) -> str:
-        """Where the record is looked for."""
+        """Return where the record is looked for."""
         return self.moved or str(Path(os.path.abspath(self.owner)).parent / str(self.content["path"]))
 
     def require_same(self) -> None:
@@ -88,7 +88,7 @@ class Source:
 
 
 def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
-    """What a file says, if it is one of this kind as it was written."""
+    """Return what a file says, if it is one of this kind as it was written."""
     content = _json_of(file, kind)
     if not isinstance(content, dict) or content.get("kind") != kind.kind:
         refuse(file, kind, _what_else(content, kind))
@@ -103,7 +103,7 @@ def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
 
 
 def kind_in(file: str, kind: ResultKind) -> str | None:
-    """Which kind of result a file says that it is, None if none; one that cannot be read is refused as of a kind."""
+    """Return which kind of result a file says that it is; refuse one that cannot be read as of a kind."""
     content = _json_of(file, kind)
     return content["kind"] if isinstance(content, dict) and isinstance(content.get("kind"), str) else None
 
@@ -121,7 +121,7 @@ def _json_of(file: str, kind: ResultKind) -> Any:
 
 
 def texts(values: Iterable[Any]) -> bool:
-    """Whether all values are texts."""
+    """Return whether all values are texts."""
     return all(isinstance(value, str) for value in values)
 
 
@@ -137,7 +137,7 @@ def refuse(file: str, kind: ResultKind, what: str) -> NoReturn:
 
 
 def _what_else(content: Any, kind: ResultKind) -> str:
-    """What a file is that is of another kind."""
+    """Return what a file is that is of another kind."""
     if not isinstance(content, dict):
         return f"is no {kind.noun}"
     if isinstance(content.get("kind"), str):
@@ -154,7 +154,7 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 def encoded(value: Any) -> Any:
-    """A result as JSON can hold it, without what it computes later."""
+    """Return a result as JSON can hold it, without what it computes later."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kept = {name: encoded(getattr(value, name)) for name in _hints(type(value))}
         return {"type": type(value).__name__, **kept}
@@ -177,7 +177,7 @@ def _number(value: Any) -> Any:
 
 
 def decoded(content: Any, hint: Any, place: str = "result") -> Any:
-    """The value of an annotation that was encoded."""
+    """Return the value of an annotation that was encoded."""
     origin, choices = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return _one_of(content, choices, place)
@@ -245,7 +245,7 @@ def _plain(content: Any, hint: Any, place: str) -> Any:
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """The fields that are written, with their annotations."""
+    """Return the fields that are written, with their annotations."""
     late = kind.deferred if issubclass(kind, DeferredFields) else ()
     hints = get_type_hints(kind)
     return {each.name: hints[each.name] for each in dataclasses.fields(kind) if each.init and each.name not in late}

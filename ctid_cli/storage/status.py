@@ -37,12 +37,12 @@ class FoundEstimate:
 
     @cached_property
     def row(self) -> dict[str, Any]:
-        """Its row."""
+        """Return its row."""
         return next(self.stored.rows())
 
     @cached_property
     def slot(self) -> Slot:
-        """What it is of."""
+        """Return what it is of."""
         return self.stored.slot(0)
 
 
@@ -68,14 +68,14 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
 
 
 def spec_folder(folder: Path) -> Path | None:
-    """Folder of the specification that an experiment was last run with."""
+    """Return folder of the specification that an experiment was last run with."""
     with place.reading_journal(folder) as log:
         infos = [] if log is None else [session.info for session in log.sessions()]
     return next((Path(info["spec_folder"]) for info in reversed(infos) if "spec_folder" in info), None)
 
 
 def public_sessions(folder: Path) -> list[dict[str, Any]]:
-    """The runs that computed an experiment, as far as they may be published."""
+    """Return the runs that computed an experiment, as far as they may be published."""
     with place.reading_journal(folder) as log:
         if log is None:
             return []
@@ -103,7 +103,7 @@ class Progress:
 
     @property
     def todo(self) -> int:
-        """Estimates that are still to be computed."""
+        """Return estimates that are still to be computed."""
         return self.planned - self.done
 
 
@@ -160,7 +160,7 @@ def experiment_status(folder: Path) -> ExperimentStatus:
 
 
 def _running(folder: Path) -> dict[str, Any]:
-    """Who runs, how far it is, how fast, and when it will have ended at that speed."""
+    """Return who runs, how far it is, how fast, and when it will have ended at that speed."""
     running = place.who_runs(folder)
     if running is None:
         return {"pid": None, "host": None}

@@ -38,7 +38,7 @@ class Verification:
 
     @property
     def is_intact(self) -> bool:
-        """Whether nothing is wrong."""
+        """Return whether nothing is wrong."""
         return not any(finding.state in WRONG for finding in self.findings)
 
 
