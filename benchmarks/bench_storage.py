@@ -28,13 +28,13 @@ import numpy as np
 import yaml
 
 from ctid_cli.running.job import Job, run_job
-from ctid_cli.running.origins import current_origins
+from ctid_cli.running.origins import current_origin
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import failed
+from ctid_cli.storage.identity import now
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.provenance import now
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "many"
@@ -93,7 +93,7 @@ def fill(folder: Path, spec: Path) -> None:
     manifest = plan.manifest()
     (folder / NAME).mkdir(parents=True)
     log = journal.open_journal(folder / NAME / journal.FILE_NAME)
-    session = log.begin(manifest, current_origins(plan), now(), {"limits": {}, "spec_folder": str(spec.parent)})
+    session = log.begin(manifest, current_origin(plan), now(), {"limits": {}, "spec_folder": str(spec.parent)})
     batch: list[Outcome] = []
     for outcome in outcomes(plan, manifest):
         batch.append(outcome)

@@ -18,8 +18,7 @@ import numpy as np
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.estimators.order_search import recommend_order
-from ctid_cli.storage.identity import numeric_platform, package_versions
-from ctid_cli.storage.provenance import git_commit, now
+from ctid_cli.storage.identity import git_commit, now, numeric_platform, package_versions
 
 #: System, sampling interval and least duration of a level [s], bounds of the delay [s], poles and zeros, or None.
 CASES = {

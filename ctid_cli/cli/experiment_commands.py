@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ctid_cli.running.events import Event, PlanReady
     from ctid_cli.running.executor import Executor
     from ctid_cli.running.limits import Limits
-    from ctid_cli.storage.shards import Shard
+    from ctid_cli.storage.manifest import Shard
 
 
 #: Why a run ended early, in words; signals have their names.
@@ -125,6 +125,10 @@ def run(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before a very large run.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
+    keep_readable: Annotated[
+        bool,
+        typer.Option("--keep-readable", help="With --fresh: keep what can be read of damaged results."),
+    ] = False,
     allow_mixed: AllowMixed = False,
     shard: Annotated[
         str | None,
@@ -147,8 +151,10 @@ def run(
     """
     from ctid_cli.running.engine import preview, run_experiment
     from ctid_cli.running.stopping import StopAt
-    from ctid_cli.storage.shards import Shard
+    from ctid_cli.storage.manifest import Shard
 
+    if keep_readable and not fresh:
+        raise UsageError("--keep-readable goes with --fresh")
     if scheduler is not None and backend != "dask":
         raise UsageError("--scheduler goes with --backend dask")
     allowed = {"allow_code": allow_code, "allow_outside": allow_outside}
@@ -176,7 +182,9 @@ def run(
         with Reporter(plan.experiment) as reporter:
             tell = partial(_tell, None if quiet else reporter, as_json)
             executor = None if backend == "loky" else _on_dask(plan, scheduler, jobs)
-            summary = run_experiment(plan, folder, jobs=jobs, on_event=tell, stop=stop, executor=executor, **how)
+            summary = run_experiment(
+                plan, folder, jobs=jobs, on_event=tell, stop=stop, executor=executor, keep_readable=keep_readable, **how
+            )
         if as_json:
             content = asdict(summary) | {"missing": summary.missing, "exit_code": summary.exit_code}
             typer.echo(json.dumps({"event": "summary", **content}, default=str))

@@ -15,7 +15,7 @@ from ctid_cli.cli.init_command import init
 from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
-from ctid_cli.cli.storage_commands import merge, repair, verify
+from ctid_cli.cli.storage_commands import merge, verify
 from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
 
@@ -53,8 +53,8 @@ def _root(
 
 app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
-_STORED = (status, show, export, verify, repair, merge, init)
-_RESULTS = (status, table, figure, report, show, export, verify, repair)
+_STORED = (status, show, export, verify, merge, init)
+_RESULTS = (status, table, figure, report, show, export, verify)
 for _command in (fit, order, frf, track, init, run, merge, *_RESULTS, validate, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 app.add_typer(model, name="model")

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -24,8 +25,8 @@ def status(
     from ctid_cli.reporting.exporting import with_list
     from ctid_cli.reporting.overview import OF_STATUS, overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
-    from ctid_cli.running.cell_precision import cell_precisions
-    from ctid_cli.storage.store import experiment_status
+    from ctid_cli.running.cell_precision import CellPrecision, cell_precisions
+    from ctid_cli.storage.status import experiment_status
 
     if experiment is None:
         found = [experiment_status(out / name) for name in experiments_in(out)]
@@ -41,12 +42,14 @@ def status(
     # A first run that is still going on has nothing to read yet.
     results = read_results(out, experiment) if one.done else None
     rows = () if results is None else results.rows
-    cells = () if results is None else cell_precisions(results.manifest, results.stored.results)
+    cells: Sequence[CellPrecision] = ()
+    if results is not None and (results.settings.get("monte_carlo") or {}).get("until"):
+        cells = cell_precisions(results.manifest, results.stored.results)
     if as_json:
         for text in with_list(status_object(one, cells), "estimates", rows):
             typer.echo(text, nl=False)
     else:
-        some = rows if results is None else results.rows.only(*OF_STATUS)
+        some = () if results is None else results.stored.rows(*OF_STATUS)
         typer.echo(status_text(one, some, out, cells))
 
 
@@ -136,7 +139,7 @@ def show(
     `ctid export EXPERIMENT` lists the identifiers, `ctid status EXPERIMENT` those of failed estimates.
     """
     from ctid_cli.reporting.detail import detail_object, detail_text, repeat
-    from ctid_cli.storage.store import find_estimate
+    from ctid_cli.storage.status import find_estimate
 
     found = find_estimate(out, id)
     again = repeat(found, allow_code=allow_code) if history else None

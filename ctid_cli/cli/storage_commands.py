@@ -1,4 +1,4 @@
-"""The commands that look after stored results: ``ctid merge``, ``verify`` and ``repair``."""
+"""The commands that look after stored results: ``ctid merge`` and ``ctid verify``."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import AllowMixed, Json, Out, answer, guarded
+from ctid_cli.cli._common import AllowMixed, Json, Out, guarded
 from ctid_cli.errors import MismatchError, UsageError
 
 
@@ -45,10 +45,11 @@ def verify(
     out: Out = Path("results"),
     as_json: Json = False,
 ) -> None:
-    """Check every stored byte of experiments.
+    """Check what is stored of experiments.
 
-    The journal with every estimate in it, the sealed file, the specification, times and provenance. Exit code 7 if
-    anything is damaged or missing. Nothing is changed; `ctid repair` saves what can be read.
+    The journal with every estimate in it, and runs.h5. Exit code 7 if anything is damaged or missing. Nothing is
+    changed: `ctid run --fresh --keep-readable` moves damaged results aside, keeps what can be read and computes the
+    rest.
     """
     from ctid_cli.reporting.integrity import verification_object, verification_text
     from ctid_cli.reporting.results import experiments_in, stored_folder
@@ -62,26 +63,3 @@ def verify(
     wrong = [item.folder for item in found if not item.is_intact]
     if wrong:
         raise MismatchError(f"not as it was written: {', '.join(map(str, wrong))}")
-
-
-@guarded
-def repair(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Experiment (quickstart).")],
-    to: Annotated[
-        Path | None, typer.Option("--to", metavar="DIR", help="Results folder to save into; OUT-repaired by default.")
-    ] = None,
-    out: Out = Path("results"),
-    as_json: Json = False,
-) -> None:
-    """Save what can be read of damaged results into a new folder.
-
-    The old folder is not touched. `ctid run` with the same specification and the new folder as --out computes what is
-    missing.
-    """
-    from ctid_cli.reporting.integrity import repair_object, repair_text
-    from ctid_cli.reporting.results import stored_folder
-    from ctid_cli.storage.repair import repair as save
-
-    target = out.with_name(f"{out.resolve().name}-repaired") if to is None else to
-    found = save(stored_folder(out, name), target)
-    answer(as_json, lambda: repair_object(found), lambda: repair_text(found, target))

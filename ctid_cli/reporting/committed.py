@@ -9,7 +9,7 @@ from typing import Any
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.percentages import Row
 from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
-from ctid_cli.running.origins import current_versions
+from ctid_cli.running.origins import current_version
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
@@ -48,7 +48,7 @@ def _present(study: str, short: str) -> set[str]:
     described = study_contents()[study]["experiments"].get(f"{study}/{short}")
     if described is None:
         return set()
-    return current_versions(build_plan(load_spec(data_folder("configs") / described["config"])))
+    return {current_version(build_plan(load_spec(data_folder("configs") / described["config"])))}
 
 
 def _versions(sessions: Iterable[Mapping[str, Any]]) -> set[str]:

@@ -13,7 +13,7 @@ from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.estimate import as_object, parameter_object, parameter_table, parameters
 from ctid_cli.reporting.layout import Table, delay_label, number, seconds
 from ctid_cli.reporting.results import out_option
-from ctid_cli.storage.store import FoundEstimate, spec_folder
+from ctid_cli.storage.status import FoundEstimate, spec_folder
 
 #: A repeated estimate agrees if no parameter moved by more than this fraction; other processors give other last bits.
 AGREEMENT = 1e-6
@@ -36,7 +36,7 @@ def detail_object(found: FoundEstimate, again: Repeated | None, out: Path) -> di
         "data": found.slot.cell["content"],
         "settings": found.slot.estimator["content"],
         "seed": found.stored.manifest["seed"],
-        "origins": [asdict(origin) for origin in found.stored.origins],
+        "origins": [origin._asdict() for origin in found.stored.origins],
         "redo": _redo_command(found, out),
     }
     return content if again is None else content | asdict(again)

@@ -20,8 +20,8 @@ from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine, events
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.estimates import read_stored
 from ctid_cli.storage.manifest import planned_count
-from ctid_cli.storage.store import estimates_table, read_stored
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ class ExperimentResults(Results):
     ----------
     folder : pathlib.Path
         Where they are stored.
-    stored : Stored
+    stored : Estimates
         The estimates, as they were read.
 
     See Also
@@ -64,7 +64,7 @@ class ExperimentResults(Results):
     @property
     def estimates(self) -> pd.DataFrame:
         """One row for each estimate, what ``ctid export`` writes; the units of columns are in ``attrs["units"]``."""
-        return estimates_table(self.stored)
+        return self.stored.frame()
 
     @property
     def surprises(self) -> list[str]:

@@ -9,42 +9,43 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.storage import columns
+from ctid_cli.storage.estimates import Estimates, export_rows
+from ctid_cli.storage.export import ROWS
 from ctid_cli.storage.manifest import swept_names
-from ctid_cli.storage.pieces import ranges
-from ctid_cli.storage.store import estimates_table
-from ctid_cli.storage.stored import Stored
-from ctid_cli.storage.summary import export_rows
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-def csv_lines(stored: Stored) -> Iterator[str]:
+def csv_lines(stored: Estimates) -> Iterator[str]:
     """The estimates as CSV, the head first."""
-    head, swept, rows = _head(stored), _types(stored), stored.every()
-    yield _written(head)
-    for start, stop in ranges(len(rows)):
-        flat = export_rows(estimates_table(stored, list(rows[start:stop]), swept))
-        yield _written(flat.reindex(columns=head.columns), header=False)
+    types = _types(stored)
+    head = _head(stored, types)
+    yield str(head.to_csv(index=False, lineterminator="\n"))
+    for start in range(0, len(stored), ROWS):
+        flat = export_rows(stored.part(start, start + ROWS).frame(types=types))
+        yield str(flat.reindex(columns=head.columns).to_csv(index=False, lineterminator="\n", header=False))
 
 
-def _written(frame: pd.DataFrame, *, header: bool = True) -> str:
-    return str(frame.to_csv(index=False, lineterminator="\n", header=header))
+def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
+    """A table without rows, with the columns of an estimate that has all that any of them has."""
+    import pandas as pd
 
-
-def _head(stored: Stored) -> pd.DataFrame:
-    """A table without rows, with all columns that any of the estimates needs."""
-    some: dict[str, Any] = {"replicate": 0}
+    some: dict[str, Any] = dict.fromkeys(map(str, stored.part(0, 0).frame(types=types)))
     for column in columns.COLUMNS:
-        if column.type == "by name" and stored.table.has(column.name):
+        if column.name not in some:
+            continue
+        if column.type == "by name" and stored.has(column.name):
             there: Any = stored.column(f"{column.name}_present").any(axis=0).tolist()
-            some[column.name] = {n: 0.0 for n, one in zip(stored.table.parts(column.name), there, strict=True) if one}
-        elif column.type == "coefficients" and stored.table.has(column.name):
+            parts = zip(stored.export.parts(column.name), there, strict=True)
+            some[column.name] = {name: 0.0 for name, one in parts if one}
+        elif column.type == "coefficients" and stored.has(column.name):
             some[column.name] = [0.0] * max(0, int(stored.column(f"{column.name}_length").max(initial=0)))
-    return export_rows(estimates_table(stored, [some], dict.fromkeys(swept_names(stored.manifest), "object"))).iloc[:0]
+    whole = pd.DataFrame({name: pd.Series([value], dtype="object") for name, value in some.items()})
+    return export_rows(whole).iloc[:0]
 
 
-def _types(stored: Stored) -> dict[str, Any]:
+def _types(stored: Estimates) -> dict[str, Any]:
     """Types that columns of swept fields have over all estimates."""
     import pandas as pd
 

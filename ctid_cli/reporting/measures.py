@@ -26,8 +26,8 @@ from ctid_cli.reporting.model_measures import distance_of, distances, pole_estim
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances
 from ctid_cli.reporting.percentages import Row, labelled_groups
 from ctid_cli.reporting.results import Results
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.stored import Rows
 from ctid_cli.text import did_you_mean, listed
 
 #: Statuses of estimates with which nothing is wrong.
@@ -55,7 +55,7 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
     cells = {cell["hash"]: cell for cell in results.manifest["data_cells"]}
     rows = []
     for group, labels in labelled_groups(results):
-        members = groups.get(group, results.rows[:0])
+        members = groups.get(group, results.stored.part(0, 0))
         if first is not None:
             members = members.chosen(members.column("replicate") < first)
         counts = {"n": len(members), "failed": int(members.failures.sum())}
@@ -144,7 +144,7 @@ def parameter_unit(name: str, names: Sequence[str]) -> str:
     return Units().of_submodel(name) if re.fullmatch(r"g\d+_[ab]\d+", name) else "-"
 
 
-def _of_estimates(measure: Measure, rows: Rows, statuses: Sequence[str]) -> Iterator[Found]:
+def _of_estimates(measure: Measure, rows: Estimates, statuses: Sequence[str]) -> Iterator[Found]:
     """A measure of what an estimate has one of."""
     if measure.source == "status":
         found = rows.column("status")

@@ -14,7 +14,7 @@ from ctid_cli.models.distances import h2_distance, hinf_distance, response_dista
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.reporting.parameter_errors import ParameterEstimates
-from ctid_cli.storage.stored import Rows
+from ctid_cli.storage.estimates import Estimates
 
 Distance = Callable[[TransferFunction, TransferFunction], float]
 
@@ -41,9 +41,9 @@ def distance_of(name: str, argument: str) -> Distance:
     return {"h2": h2_distance, "hinf": hinf_distance}[name]
 
 
-def distances(system: TransferFunction, rows: Rows, distance: Distance) -> Array:
+def distances(system: TransferFunction, rows: Estimates, distance: Distance) -> Array:
     """Distances of the estimates [%]; where there is no model, it is infinitely far."""
-    models = rows.only("numerator", "denominator", "delay")
+    models = rows.rows("numerator", "denominator", "delay")
     return np.array([100.0 * distance(system, _model(row)) if row["denominator"] else np.inf for row in models])
 
 
@@ -51,7 +51,7 @@ def _model(row: Mapping[str, Any]) -> TransferFunction:
     return TransferFunction(row["numerator"], row["denominator"], max(row["delay"] or 0.0, 0.0))
 
 
-def pole_estimates(estimates: ParameterEstimates, system: TransferFunction, rows: Rows) -> ParameterEstimates:
+def pole_estimates(estimates: ParameterEstimates, system: TransferFunction, rows: Estimates) -> ParameterEstimates:
     """Poles in the place of parameters, each with the true one that it goes with [rad/s].
 
     ``pole_1`` ..., fastest first; of two complex ones ``pole_1_real`` and ``pole_1_imag``. Of a model with another

@@ -1,7 +1,7 @@
 """What ``ctid status`` answers: how much of an experiment is done, and what went wrong."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
 from ctid_cli.running.cell_precision import CellPrecision
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.store import ExperimentStatus
+from ctid_cli.storage.status import ExperimentStatus
 
 #: Failed estimates that the text lists.
 LISTED = 10
@@ -41,7 +41,7 @@ def overview_text(found: Sequence[ExperimentStatus]) -> str:
 
 def status_text(
     status: ExperimentStatus,
-    estimates: Sequence[Mapping[str, Any]],
+    estimates: Iterable[Mapping[str, Any]],
     out: Path,
     precision: Sequence[CellPrecision] = (),
 ) -> str:
@@ -59,8 +59,8 @@ def status_text(
         blocks.append(Table(header, rows, "l" * (1 + len(swept)) + "rrr").draw())
     if precision:
         blocks.append(precision_table(precision).draw())
-    if estimates:
-        blocks.append("\n".join(_outcomes(estimates)))
+    if outcomes := _outcomes(estimates):
+        blocks.append("\n".join(outcomes))
     if status.left_aside:
         blocks.append(f"{status.left_aside} stored estimates are set aside: the latest run asked for others.")
     command = f"ctid table {status.folder.name if status.shard else status.experiment}{out_option(out)}"
@@ -71,7 +71,7 @@ def status_text(
     return "\n\n".join(blocks)
 
 
-def _outcomes(estimates: Sequence[Mapping[str, Any]]) -> list[str]:
+def _outcomes(estimates: Iterable[Mapping[str, Any]]) -> list[str]:
     """How often each status came, and the first failures."""
     outcomes: Counter[tuple[str, str]] = Counter()
     failures: list[Mapping[str, Any]] = []

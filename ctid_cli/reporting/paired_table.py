@@ -25,8 +25,8 @@ from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, out_option
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.reporting.tables import notes_of
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.stored import Rows
 from ctid_cli.text import did_you_mean
 
 #: Fewer common data sets than these say nothing.
@@ -102,13 +102,13 @@ def _named(group: Group, options: Sequence[str]) -> str:
     return ", ".join([group.estimator, *(f"{key} {number(value)}" for key, value in own if value is not None)])
 
 
-def _common(one: Rows, other: Rows) -> tuple[Rows, Rows]:
+def _common(one: Estimates, other: Estimates) -> tuple[Estimates, Estimates]:
     """The estimates of both on the data sets that both have, by replicate."""
     places = common_places(one.column("replicate"), other.column("replicate"))
     return one.chosen(places[0]), other.chosen(places[1])
 
 
-def _percentages(one: Rows, other: Rows) -> Iterator[Row]:
+def _percentages(one: Estimates, other: Estimates) -> Iterator[Row]:
     """How often each succeeds; without a rule an estimate succeeds that does not fail."""
     if len(one) < FEWEST:
         return
@@ -133,7 +133,7 @@ def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]
             yield _row("rmse", name, parameter_unit(name, one.names), errors.shape[1], difference)
 
 
-def _times(one: Rows, other: Rows) -> Iterator[Row]:
+def _times(one: Estimates, other: Estimates) -> Iterator[Row]:
     """Median processor times."""
     known = np.array([side.column("cpu_seconds") for side in (one, other)])
     known = known[:, np.isfinite(known).all(axis=0)]

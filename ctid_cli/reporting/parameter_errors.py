@@ -36,8 +36,8 @@ from ctid_cli.running.cells import Plan
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.load import spec_from_canonical
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.stored import Rows
 
 #: Errors of one parameter over the data sets of one cell.
 ParameterErrors = SimpleNamespace
@@ -241,7 +241,7 @@ def _estimates(
     results: Results,
     cell: Mapping[str, Any],
     group: Group,
-    rows: Rows,
+    rows: Estimates,
     true: Mapping[str, float],
     values: Array,
     errors: Array,

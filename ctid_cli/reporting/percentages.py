@@ -18,13 +18,15 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.reporting.results import Group, Results, lookup
 from ctid_cli.reporting.study import Place, Study, StudyTable
 from ctid_cli.simulation.frequency_measures import base_name, measure_names
-from ctid_cli.storage.columns import reserved_names
+from ctid_cli.storage.columns import COUNTS, reserved_names
+from ctid_cli.storage.estimates import CLOCKS, Estimates
 from ctid_cli.storage.manifest import is_of_signal
-from ctid_cli.storage.packing import CLOCKS
-from ctid_cli.storage.summary import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,16 +90,28 @@ def experiment_rows(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
 ) -> list[Row]:
     """Cells of one experiment."""
-    counts = {
-        group: counted(rows.failures, rows.converged, {clock: rows.column(clock) for clock in CLOCKS})
-        for group, rows in results.groups().items()
-    }
+    counts = {group: _counted(rows) for group, rows in results.groups().items()}
     measured = _measured(results)
     lacking = dict.fromkeys(itertools.chain(*measured.values()))
     return [
         labels | NOTHING | counts.get(group, {}) | measured.get(group, lacking)
         for group, labels in labelled_groups(results, table, fields)
     ]
+
+
+def _counted(rows: Estimates) -> Row:
+    """Counts and percentages of a group of estimates, and the medians of their times."""
+    n, converged = len(rows), rows.converged
+    row: Row = dict.fromkeys(COUNTS) | {"n": n, "failed": int(rows.failures.sum())}
+    for clock in CLOCKS:
+        times = rows.column(clock)
+        known = times[np.isfinite(times)]
+        row[f"median_{clock}"] = float(np.median(known)) if known.size else None
+    if converged is not None:
+        k = int(converged.sum())
+        low, high = wilson_interval(k, n)
+        row |= {"converged": k, "percent": 100 * k / n, "low": 100 * low, "high": 100 * high}
+    return row
 
 
 def study_rows(study: Study, table: StudyTable, found: Mapping[str, Results]) -> list[Row]:
@@ -141,7 +155,6 @@ def pooled_rows(study: Study, table: StudyTable, rows: Sequence[Row], options: S
     There is no interval: cells of one row share their data sets, so their estimates are not independent trials. The
     published percentage is the mean over the cells that have estimates, or over all cells where none has [%].
     """
-    import numpy as np
     import pandas as pd
 
     places = {place[:2] for place in table.published}

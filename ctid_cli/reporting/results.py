@@ -12,10 +12,9 @@ import numpy as np
 
 from ctid_cli.arrays import IndexArray
 from ctid_cli.errors import UsageError
+from ctid_cli.storage.estimates import Estimates, read_stored
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.manifest import Manifest
-from ctid_cli.storage.store import read_stored
-from ctid_cli.storage.stored import Rows, Stored
 from ctid_cli.text import did_you_mean
 
 
@@ -34,7 +33,7 @@ class Results:
     """One experiment's results."""
 
     folder: Path
-    stored: Stored
+    stored: Estimates
 
     @property
     def manifest(self) -> Manifest:
@@ -53,14 +52,14 @@ class Results:
         return spec
 
     @cached_property
-    def rows(self) -> Rows:
-        """Stored estimates of the plan, made when they are asked for."""
-        return self.stored.every()
+    def rows(self) -> Estimates:
+        """Stored estimates of the plan, whose rows are made when they are asked for."""
+        return self.stored
 
     @property
     def failed(self) -> int:
         """How many estimates ended in an error."""
-        return int(self.stored.failures().sum())
+        return int(self.stored.failures.sum())
 
     @property
     def sampling(self) -> str | None:
@@ -72,12 +71,12 @@ class Results:
         """Names of the fields swept over ``data_cells`` or ``estimators``."""
         return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
 
-    def groups(self) -> dict[Group, Rows]:
+    def groups(self) -> dict[Group, Estimates]:
         """Stored estimates by data cell, estimator and start."""
         return self._groups
 
     @cached_property
-    def _groups(self) -> dict[Group, Rows]:
+    def _groups(self) -> dict[Group, Estimates]:
         across, starts = self.swept("estimators"), self.stored.column("start")
         found: dict[Group, list[IndexArray]] = {}
         for block in self.stored.blocks:
@@ -87,7 +86,7 @@ class Results:
             for start in sorted(first, key=lambda start: first[start]):
                 group = Group(block.cell["hash"], block.estimator["name"], options, start.decode())
                 found.setdefault(group, []).append(np.flatnonzero(own == start) + block.first)
-        return {group: Rows(self.stored, np.concatenate(places)) for group, places in found.items()}
+        return {group: self.stored.chosen(np.concatenate(places)) for group, places in found.items()}
 
 
 def out_option(out: Path) -> str:

@@ -278,10 +278,11 @@ def frequency_blocks(results: Results, rows: Sequence[Row]) -> Blocks:
 def record_blocks(results: Results) -> Blocks:
     """Estimates of a measured record across, parameters with standard errors and measures of fit down."""
     bounds = {item["name"]: item["content"].get("delay_bounds") for item in results.manifest["estimators"]}
+    rows = list(results.rows)
     fits = {"fit, estimation part": "fit_percent"}
-    if any(item.get("validation_fit_percent") is not None for item in results.rows):
+    if any(item.get("validation_fit_percent") is not None for item in rows):
         fits["fit, validation part"] = "validation_fit_percent"
-    blocks = [results.rows[k : k + ESTIMATES_PER_BLOCK] for k in range(0, len(results.rows), ESTIMATES_PER_BLOCK)]
+    blocks = [rows[k : k + ESTIMATES_PER_BLOCK] for k in range(0, len(rows), ESTIMATES_PER_BLOCK)]
     tables: Blocks = [[_record_table(block, bounds, fits)] for block in blocks]
     foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
     return [[f"### {results.experiment}"], *tables, [foot]]

@@ -139,7 +139,7 @@ def experiment_report(results: Results, notes: Sequence[str] = ()) -> Report:
 def _record_rows(results: Results, rows: Sequence[Row]) -> list[Row]:
     """Rows of a measured record with its estimates."""
     keys = ["estimator", "initial_delay", *settings_of(rows)]
-    estimates = {tuple(item.get(key) for key in keys): item for item in reversed(results.rows)}
+    estimates = {tuple(item.get(key) for key in keys): item for item in reversed(list(results.rows))}
     found = []
     for row in rows:
         estimate = estimates.get(tuple({**row, "estimator": row["method"]}[key] for key in keys), {})

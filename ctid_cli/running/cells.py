@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import UsageError
-from ctid_cli.storage.manifest import Key, Manifest
-from ctid_cli.storage.shards import Shard
+from ctid_cli.storage.manifest import Key, Manifest, Shard
 
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term

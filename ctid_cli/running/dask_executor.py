@@ -23,10 +23,10 @@ from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
 from ctid_cli.running.executor import Done, Lost, Message
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.origins import current_origins
+from ctid_cli.running.origins import current_origin
 from ctid_cli.running.pool import cause_of, packed
 from ctid_cli.running.remote import compute_here, files_of, identify
-from ctid_cli.storage.folder import origin_differences
+from ctid_cli.storage.identity import origin_differences
 from ctid_cli.storage.manifest import Key
 
 if TYPE_CHECKING:
@@ -73,9 +73,8 @@ class DaskExecutor:
         self._limits, self._tell = limits, tell
         self._cluster, self._client = _connect(scheduler, workers)
         self._place = scheduler or "this machine"
-        parts = [(plan.data_cells[0].source, cell.estimator) for cell in plan.estimators]
-        origins = current_origins(plan)
-        self._origins = [origins[cell.hash] for cell in plan.estimators]
+        parts = [plan.data_cells[0].source, *(cell.estimator for cell in plan.estimators)]
+        self._origin = current_origin(plan)
         self._question = packed(parts), _contents([cell.source for cell in plan.data_cells])
         self._remotes: dict[str, _Remote] = {}
         #: Which worker has a task.
@@ -217,15 +216,11 @@ class DaskExecutor:
             reason = f"worker {address} cannot be used: {future.exception()}"
         else:
             try:
-                host, origins = future.result(timeout=ANSWER)
+                host, origin = future.result(timeout=ANSWER)
             except TimeoutError:
                 # It died with its answer; if it did not, it is asked once more.
                 return
-            pairs = [
-                pair
-                for ours, theirs in zip(self._origins, origins, strict=True)
-                for pair in origin_differences(ours, theirs)
-            ]
+            pairs = origin_differences(self._origin, origin)
             if not pairs:
                 self._remotes[address] = _Remote(address, threads)
                 return

@@ -7,7 +7,6 @@ estimate is reported as done after the journal has it safely.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import time
 import warnings
@@ -27,8 +26,9 @@ from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.hindrances import advice
 from ctid_cli.running.job import Job
+from ctid_cli.running.key_set import KeySet
 from ctid_cli.running.limits import WATCHES_PROCESSES, Limits
-from ctid_cli.running.origins import current_origins
+from ctid_cli.running.origins import current_origin
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.pool import LokyPool
 from ctid_cli.running.retry import Stock, take_stock
@@ -36,13 +36,11 @@ from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRe
 from ctid_cli.running.todo import Todo
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.identity import Origin, are_mixed
-from ctid_cli.storage.journal import Journal, open_journal
-from ctid_cli.storage.journal_reader import FILE_NAME
+from ctid_cli.storage.export import seal
+from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
+from ctid_cli.storage.journal import EXPORT, FILE_NAME, Journal, open_journal
 from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
-from ctid_cli.storage.planned import KeySet
-from ctid_cli.storage.provenance import canonical_text, now, session_info
-from ctid_cli.storage.store import seal
+from ctid_cli.storage.merge import keep_readable as keep_readable_of
 
 if TYPE_CHECKING:
     from ctid_cli.running.cells import Plan
@@ -111,6 +109,7 @@ def run_experiment(
     jobs: int | None = None,
     on_event: events.OnEvent = events.ignore,
     fresh: bool = False,
+    keep_readable: bool = False,
     allow_mixed: bool = False,
     stop: StopAt | None = None,
     warm: Callable[[], float] | None = None,
@@ -123,12 +122,12 @@ def run_experiment(
     of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
     """
     begun = time.monotonic()
-    origins = current_origins(plan)
+    origin = current_origin(plan)
     limits = Limits.of(plan.spec.canonical())
     if limits.of_processes and not WATCHES_PROCESSES:
         raise UsageError("limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere")
     with StopRequest(stop) as stopping, ExitStack() as stack:
-        found = _look(plan, folder, origins, retry, fresh=fresh, allow_mixed=allow_mixed)
+        found = _look(plan, folder, origin, retry, fresh=fresh, allow_mixed=allow_mixed)
         todo = Todo(found.plan, found.stock)
         if todo.data_sets:
             on_event(events.KernelsCompiling())
@@ -140,17 +139,20 @@ def run_experiment(
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
-        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed, known=found.state)
+        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed, known=found.state)
         place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
         stack.callback(log.close)
+        if moved is not None and keep_readable:
+            kept = keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)
+            on_event(events.Warned(f"{plan.experiment}: {kept}"))
         workers = jobs or usable_processors()
         computing = executor(limits) if executor else LokyPool(workers, limits)
         stack.callback(computing.close)
         if found.state is None or log.state() != found.state:
             found = _Found(as_needed(plan, log), take_stock(log, retry, limits))
-        run = _Run(found.plan, folder, log, found.stock, origins, on_event, computing)
+        run = _Run(found.plan, folder, log, found.stock, origin, on_event, computing)
         stack.callback(place.retract, folder)
         run.start({"jobs": workers, "limits": asdict(limits)})
         run.compute(stopping)
@@ -168,11 +170,11 @@ class _Run:
         folder: Path,
         log: Journal,
         stock: Stock,
-        origins: Mapping[str, Origin],
+        origin: Origin,
         on_event: events.OnEvent,
         executor: Executor,
     ) -> None:
-        self.plan, self.folder, self.log, self.origins = plan, folder, log, origins
+        self.plan, self.folder, self.log, self.origin = plan, folder, log, origin
         self.on_event, self.executor = on_event, executor
         #: What is stored, which grows.
         self.stock = stock
@@ -205,10 +207,8 @@ class _Run:
         with _writing(self.folder):
             for name, text in ((place.SPEC, spec.text), (place.CANONICAL, canonical)):
                 self.log.write_beside(name, text.encode())
-            (self.folder / place.PROVENANCE).mkdir(exist_ok=True)
-        versions = {cell.name: self.origins[cell.hash] for cell in self.plan.estimators}
-        self.info = session_info(spec.text, spec.folder, versions) | circumstances
-        self.session = self.log.begin(self.manifest, self.origins, self.started, self.info)
+        info = session_info(spec.text, spec.folder) | circumstances
+        self.session = self.log.begin(self.manifest, self.origin, self.started, info)
         self._announce()
         self.on_event(self.ready)
 
@@ -308,7 +308,7 @@ class _Run:
         place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        self.on_event(events.Sealed(self.folder / place.SEALED, *seal(self.folder, self.log)))
+        self.on_event(events.Sealed(self.folder / EXPORT, *seal(self.folder, self.log)))
         failed = self.planned.count_in(self.stock.failed)
         missing = self.ready.estimates - self.computed
         reason = reason or (MACHINE if self.given_up else None)
@@ -319,19 +319,13 @@ class _Run:
             "computed": self.computed,
             "failed": failed,
         }
-        about = {"session": self.session, "started": self.started, "stopped": stopped, "reason": ended, **counts}
-        text = json.dumps(about | self.info, indent=2, ensure_ascii=False) + "\n"
-        name = f"{place.PROVENANCE}/{self.session:04d}-{self.started.replace(':', '').replace('-', '')}.json"
-        with _writing(self.folder):
-            self.log.write_beside(name, text.encode())
-        # The last of all: what a run has noted before and not written, it was killed before it could.
         self.log.end(self.session, stopped, ended)
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,
             **counts,
             left_aside=self.ready.left_aside,
-            mixed=are_mixed(self.log.origins()),
+            mixed=len(self.log.origins()) > 1,
             moved_aside=moved,
             seconds=time.monotonic() - begun,
             stopped_by=reason if missing else None,
@@ -346,7 +340,7 @@ def preview(
     plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
 ) -> events.PlanReady:
     """What a run would do, without doing or writing anything."""
-    found = _look(plan, folder, current_origins(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
+    found = _look(plan, folder, current_origin(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
     needed = found.plan
     if len(found.stock.keys):
         return _ready(needed, folder, found.stock)
@@ -378,7 +372,7 @@ class _Found:
 def _look(
     plan: Plan,
     folder: Path,
-    origins: Mapping[str, Origin],
+    origin: Origin,
     retry: Collection[str],
     *,
     fresh: bool,
@@ -388,7 +382,7 @@ def _look(
     if fresh or not folder.exists():
         return _Found(plan, Stock())
     with place.lock(folder, shared=True):
-        place.check_free(folder, plan.manifest(), origins, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
             if log is None:
                 return _Found(plan, Stock())

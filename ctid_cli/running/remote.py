@@ -43,7 +43,7 @@ def files_of(source: Any) -> dict[str, str]:
     return found
 
 
-def identify(packed: bytes, contents: Mapping[str, bytes]) -> tuple[str, list[Origin]]:
+def identify(packed: bytes, contents: Mapping[str, bytes]) -> tuple[str, Origin]:
     """Name of this machine, and where estimates would come from here; keeps files for the jobs that follow."""
     global _folder
     _, parts = pickle.loads(packed)
@@ -52,7 +52,7 @@ def identify(packed: bytes, contents: Mapping[str, bytes]) -> tuple[str, list[Or
             _folder = _folder or TemporaryFolder()
             _files[sha256] = _folder.path / sha256
             _files[sha256].write_bytes(content)
-    return platform.node(), [origin_of(source, estimator) for source, estimator in parts]
+    return platform.node(), origin_of(*parts)
 
 
 def compute_here(packed: bytes, limits: Limits, alone: bool, topic: str) -> None:

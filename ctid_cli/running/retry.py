@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Container
 from dataclasses import dataclass, field
 
+from ctid_cli.running.key_set import KeySet
 from ctid_cli.running.limits import Limits
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.journal_reader import JournalReader
+from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key
-from ctid_cli.storage.planned import KeySet
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,13 @@ class Stock(Container[Key]):
 
 def take_stock(log: JournalReader, retry: Collection[str], limits: Limits) -> Stock:
     """What a journal holds, where failures of some statuses are unwanted, and those that a limit no longer explains."""
-    stock, before = Stock(), {session["session"]: Limits.of(session) for session in log.sessions()}
+    stock, before = Stock(), {session.id: Limits.of(session.info) for session in log.sessions()}
 
-    for key, status, session in log.stock():
+    for row in log.rows():
+        key, status = row.key, row.status
         stock.keys.add(key)
         if status in FAILURES:
             stock.failed.add(key)
-            if status in retry or limits.rose_since(before[session], status):
+            if status in retry or limits.rose_since(before[row.session], status):
                 stock.again.add(key)
     return stock

@@ -21,7 +21,7 @@ from ctid_cli.specification.yaml_source import KeyPath
 
 #: Success rules of systems and of signals.
 _OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
-_OF_SIGNALS = ("band", "by")
+_OF_SIGNALS = ("band", "by", "window")
 
 
 def world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
@@ -102,12 +102,9 @@ def _of_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Ite
     for step in signal.steps:
         if step >= duration - interval:
             yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration - interval:g} s"
-    if spec.tracks is not None:
-        if not interval * (1.0 - 1e-9) <= spec.tracks.interval <= duration:
-            yield ("tracks", "interval"), f"must lie from the sampling interval, {interval:g} s, to {duration:g} s"
-        low, high = spec.tracks.window or (0.0, duration)
-        if high > duration * (1 + 1e-9) or high - low < interval:
-            yield ("tracks", "window"), f"must hold samples of the record, which ends at {duration:g} s"
+    low, high = getattr(spec.success, "window", None) or (0.0, duration)
+    if high > duration * (1 + 1e-9) or high - low < interval:
+        yield ("success", "window"), f"must hold samples of the record, which ends at {duration:g} s"
     by = getattr(spec.success, "by", None) or 0.0
     if by > duration:
         yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s"

@@ -1,15 +1,13 @@
-"""Sections of experiments on the frequencies of a signal: the signal, its disturbance, and what is stored of tracks."""
+"""Sections of experiments on the frequencies of a signal: the signal, its disturbance and its clock."""
 
-from collections.abc import Iterator
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator
 
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
-from ctid_cli.specification.fields import NotNegative, Positive, Swept
-from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.fields import Positive, Swept
 from ctid_cli.specification.option_sections import DisturbanceSection, SamplingSection
 from ctid_cli.specification.sections import Options, Section, WithKey
 
@@ -49,26 +47,3 @@ DisturbanceOrNone = Annotated[
     DisturbanceSection | None, BeforeValidator(lambda value: None if value == "none" else value)
 ]
 AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, SamplingSection, kind="regular")]
-
-
-class TracksSection(Section):
-    """What is stored of the frequencies over time, and where their errors are measured.
-
-    Parameters
-    ----------
-    interval : float, default 0.05
-        Time from one stored estimate to the next [s]
-    window : list of float, optional
-        First and last instant of the window of rms and bias [s]; the last 10 s
-    runs : int, default 1
-        Store the tracks of so many data sets of every data cell
-    """
-
-    interval: Positive = 0.05
-    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
-    runs: int = Field(default=1, ge=0, le=1_000_000)
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say that the window is empty."""
-        if self.window is not None and not self.window[0] < self.window[1]:
-            yield ("window",), f"must begin before it ends; it runs from {self.window[0]:g} to {self.window[1]:g} s"

@@ -18,12 +18,12 @@ from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends, requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.simulation.dataset import MeasuredSource, located
-from ctid_cli.specification.fields import LATER, MAX_WHOLE, Positive, Text, matching
+from ctid_cli.specification.fields import LATER, MAX_WHOLE, NotNegative, Positive, Text, matching
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
 from ctid_cli.specification.sections import Options, Section, variants
-from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection, TracksSection
+from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AnySystemSection
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource, path_text
@@ -131,6 +131,8 @@ class SuccessSection(Section):
         Largest error of a settled frequency of a signal [rad/s]
     by : float, optional
         Frequencies must settle so soon after the start and after their last step [s]
+    window : list of float, optional
+        First and last instant of the window of rms and bias of a frequency [s], no condition itself; the last 10 s
     """
 
     if_empty = (
@@ -143,12 +145,17 @@ class SuccessSection(Section):
     parameter_relative_error: Annotated[Positive | None, LATER] = None
     band: Annotated[Positive | None, LATER] = None
     by: Annotated[Positive | None, LATER] = None
+    window: Annotated[Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None, LATER] = None
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that nothing is asked for, or by when but not what."""
+        """Say that nothing is asked for, or by when but not what, or that the window is empty."""
         yield from super().complaints()
         if self.by is not None and self.band is None:
             yield ("by",), "is the time of settling into a band; add band [rad/s]"
+        if self.window is not None and self.band is None:
+            yield ("window",), "is no condition by itself; add band [rad/s]"
+        if self.window is not None and not self.window[0] < self.window[1]:
+            yield ("window",), f"must begin before it ends; it runs from {self.window[0]:g} to {self.window[1]:g} s"
 
 
 class LimitsSection(Section):
@@ -206,8 +213,6 @@ class Spec(Section):
         When an estimate counts as converged
     measures : list of str, optional
         What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
-    tracks : mapping, optional
-        What is stored of the frequencies of a signal over time; nothing by default
     limits : mapping, optional
         Time and memory that one estimate may take; no limits by default
     """
@@ -227,7 +232,6 @@ class Spec(Section):
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
     measures: Annotated[list[Text] | None, LATER] = None
-    tracks: Annotated[TracksSection | None, LATER] = None
     limits: Annotated[LimitsSection | None, LATER] = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
@@ -239,7 +243,7 @@ class Spec(Section):
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
         """Say which sections are missing or too many."""
         present = {name for name in cls.model_fields if raw.get(name) is not None}
-        of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance", "tracks"), "signal")
+        of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
         for name in of_other:
             if name in present:
                 other = "; what is added to a signal is its disturbance" if name == "noise" else ""

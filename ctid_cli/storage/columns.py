@@ -16,7 +16,7 @@ ByName = Mapping[str, float | None]
 
 
 def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
-    """Names of parameters that any estimate has: b0 ..., a1 ..., then those of submodels, the delay and others."""
+    """Return names of parameters that any estimate has: b0 ..., a1 ..., of submodels, the delay and others."""
 
     def place(name: str) -> tuple[int, int, str, int]:
         found = re.fullmatch(r"(?:g(\d+)_)?([ab])(\d+)", name)
@@ -29,7 +29,7 @@ def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
 
 
 def measure_names(rows: Iterable[ByName | None]) -> list[str]:
-    """Names of measures that any estimate has."""
+    """Return names of measures that any estimate has."""
     from ctid_cli.simulation import frequency_measures
 
     return frequency_measures.measure_names(rows)
@@ -55,7 +55,7 @@ class Column:
 
     @property
     def dtype(self) -> str:
-        """Its type in pandas."""
+        """Return its type in pandas."""
         return "object" if self.type in ("coefficients", "by name", "initial delay") else self.type
 
 
@@ -131,16 +131,16 @@ OF_MEASURES = ("parameter", "measure", "unit", "value", "error", "without_value"
 
 
 def reserved_names() -> frozenset[str]:
-    """Names of the columns of estimates and tables; a swept field of such a name is written with its section."""
+    """Return names of the columns of estimates and tables; a swept field of such a name is written with its section."""
     of_tables = ("table", "sampling", "method", "published_percent", *OF_MEASURES)
     return frozenset((*(c.name for c in COLUMNS), *COUNTS, *of_tables))
 
 
 def failed(message: str, status: str) -> dict[str, Any]:
-    """The result of an estimate that does not exist."""
+    """Return the result of an estimate that does not exist."""
     return no_result() | {"status": status, "message": message}
 
 
 def no_result() -> dict[str, Any]:
-    """A result in which everything is missing; texts are empty, as they are read again."""
+    """Return a result in which everything is missing; texts are empty, as they are read again."""
     return {column.name: "" if column.type == "str" else None for column in COLUMNS if column.source == "result"}

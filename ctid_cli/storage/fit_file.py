@@ -21,11 +21,12 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
-from ctid_cli.storage.exact import decoded, encoded
 from ctid_cli.storage.result_file import (
     ResultKind,
     Source,
     content_of,
+    decoded,
+    encoded,
     path_and_sum,
     refuse,
     require,
@@ -50,7 +51,7 @@ def fit_text(
     folder: Path,
     command: str | None = None,
 ) -> str:
-    """The file's text: what is said of a fit, the fit itself, and its records, seen from the folder that it lies in."""
+    """Return the file's text: what is said of a fit, the fit itself, and its records as seen from its folder."""
     whole = dict(content)
     whole["records"] = [
         {**said, **_source(item, folder)} for said, item in zip(content["records"], measurements, strict=True)
@@ -62,7 +63,7 @@ def fit_text(
 
 
 def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
-    """Where a record lies and how it was read; of one that is no file its samples."""
+    """Return where a record lies and how it was read; of one that is no file its samples."""
     if measurement.path is None:
         return {"path": None, "series": encoded(measurement.record)}
     return {
@@ -76,7 +77,7 @@ def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
 
 
 def _loop(measurement: Measurement) -> dict[str, Any]:
-    """The loop of a record, if it is known."""
+    """Return the loop of a record, if it is known."""
     loop = measurement.record.loop
     if loop is None:
         return {}
@@ -91,7 +92,7 @@ class RecordSource(Source):
     """A record as ``fit.json`` names it."""
 
     def read(self) -> Measurement:
-        """The record, as it was read for the fit."""
+        """Return the record, as it was read for the fit."""
         content = self.content
         if content["path"] is None:
             record = decoded(content["series"], Record, "series")
@@ -122,12 +123,12 @@ class StoredFit:
 
     @cached_property
     def measurements(self) -> tuple[Measurement, ...]:
-        """The records that the fit was estimated from."""
+        """Return the records that the fit was estimated from."""
         return tuple(source.read() for source in self.sources)
 
     @cached_property
     def validation(self) -> Measurement | None:
-        """The record that it was judged on."""
+        """Return the record that it was judged on."""
         return None if self.validation_source is None else self.validation_source.read()
 
     # What is filled in later: methods, since these can be pickled with what they belong to.
@@ -195,7 +196,7 @@ def load_fit(
 def read_fit(
     path: AnyPath, record: AnyPath | Sequence[AnyPath] | None = None, validation: AnyPath | None = None
 ) -> StoredFit:
-    """The file with everything in it; :func:`load_fit` says the rest."""
+    """Return the file with everything in it; :func:`load_fit` says the rest."""
     file = os.fspath(path)
     content = content_of(file, FIT)
     moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)

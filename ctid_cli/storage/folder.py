@@ -1,7 +1,7 @@
 """The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
 
-``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log), ``runs.h5`` (the sealed
-results), ``timings.csv`` and ``provenance/`` (times, hosts, versions).
+``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log) and ``runs.h5`` (the
+estimates that the latest plan asks for).
 """
 
 import fcntl
@@ -10,55 +10,31 @@ import os
 import platform
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, read_journal
+from ctid_cli.storage.identity import Origin, origin_differences
+from ctid_cli.storage.journal import EXPORT, FILE_NAME, JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
 from ctid_cli.written_files import TAKEN, is_leftover
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
-SEALED = "runs.h5"
-TIMINGS = "timings.csv"
-PROVENANCE = "provenance"
 #: Present while a run goes on; says who runs.
 RUNNING = "running.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
-
-
+_ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
 _ELSEWHERE = "choose another results folder (--out), or --fresh to move the old results aside"
-
-
-#: Types of file systems that several machines share.
-_OF_NETWORKS = {
-    "nfs",
-    "nfs4",
-    "cifs",
-    "smb3",
-    "lustre",
-    "gpfs",
-    "beegfs",
-    "ceph",
-    "fuse.sshfs",
-    "9p",
-    "afs",
-    "glusterfs",
-}
 
 
 class InUseError(RefusedError):
     """Another process holds the folder's lock."""
-
-
-_ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
 
 
 @contextmanager
@@ -79,7 +55,10 @@ def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> I
             except BlockingIOError:
                 _wait(folder, deadline)
             except OSError as error:
-                raise StorageError(_unlockable(folder, error)) from error
+                advice = (
+                    "on a file system of a network give --out a folder on a disk of this machine, and copy the results"
+                )
+                raise StorageError(f"{folder} cannot be locked ({error.strerror}); {advice}") from error
         if not shared:
             _refuse_links(folder)
         yield
@@ -96,27 +75,6 @@ def _refuse_links(folder: Path) -> None:
             raise RefusedError(f"{path} is a link, and results are written into their folder alone; remove it")
 
 
-def _unlockable(folder: Path, error: OSError) -> str:
-    """Why a folder cannot be locked; file systems of a network have no locks on folders."""
-    reason = f"{folder} cannot be locked ({error.strerror})"
-    kind = file_system(folder)
-    if kind not in _OF_NETWORKS:
-        return reason
-    advice = "give --out a folder on a disk of this machine, and copy the results when they are complete"
-    return f"{reason}: it lies on a file system of type {kind}, where two runs could write at once; {advice}"
-
-
-def file_system(folder: Path, mounts: Path = Path("/proc/self/mounts")) -> str:
-    """Type of the file system that a folder lies on, such as ``ext4`` or ``nfs4``; empty where that is not known."""
-    found: dict[Path, str] = {}
-    with suppress(OSError, ValueError):
-        for line in mounts.read_text(encoding="utf-8", errors="surrogateescape").splitlines():
-            _, point, kind, *_ = line.split(" ")
-            found[Path(point.replace("\\040", " "))] = kind
-    whole = folder.resolve()
-    return next((found[place] for place in (whole, *whole.parents) if place in found), "")
-
-
 def _is_open(folder: Path, descriptor: int) -> bool:
     try:
         return os.path.samestat(os.stat(folder), os.fstat(descriptor))
@@ -126,9 +84,8 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 
 def clear(folder: Path) -> None:
     """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
-    written = (SPEC, CANONICAL, SEALED, TIMINGS)
-    for path in (*folder.glob(".*"), *(folder / PROVENANCE).glob(".*")):
-        if is_leftover(path.name) and (path.parent != folder or path.name[1:].startswith(written)):
+    for path in folder.glob(".*"):
+        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, EXPORT)):
             with suppress(OSError):
                 path.unlink()
 
@@ -151,7 +108,7 @@ def _wait(folder: Path, deadline: float) -> None:
 
 
 def who_runs(folder: Path) -> dict[str, Any] | None:
-    """What the run that writes to a folder says about itself."""
+    """Return what the run that writes to a folder says about itself."""
     try:
         running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
         return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
@@ -171,7 +128,7 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int)
 
 
 def check_free(
-    folder: Path, manifest: Manifest, origins: Mapping[str, Origin], *, allow_mixed: bool, known: str | None = None
+    folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool, known: str | None = None
 ) -> None:
     """Refuse a folder, whose lock this process holds, if this run must not add to its results.
 
@@ -180,9 +137,11 @@ def check_free(
     experiment = manifest["experiment"]
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
-            if (folder / SEALED).exists():
-                why = f"{SEALED} without the {FILE_NAME} it was made from, so nothing can be added to it"
-                raise RefusedError(f"{folder} holds {why}; {_ELSEWHERE}")
+            if (folder / EXPORT).exists():
+                why = f"{EXPORT} without the {FILE_NAME} it was made from, so nothing can be added to it"
+                raise RefusedError(
+                    f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
+                )
             return
         if known is not None and log.state() == known:
             return
@@ -190,28 +149,16 @@ def check_free(
         if log.experiment() != experiment:
             other = f"the experiment {log.experiment()!r}, not {experiment!r}"
             raise RefusedError(f"{folder} holds {other}; {_ELSEWHERE}")
-        # Estimators that the plan does not name may be of another version, but not their data, nor the platform.
-        cells, some = {cell["hash"] for cell in manifest["data_cells"]}, next(iter(origins.values()))
-        for data, estimator, made in sorted(log.made()):
-            present = origins.get(estimator, some)
-            differs = made != present if estimator in origins else made.shared != present.shared
-            if data in cells and differs and not allow_mixed:
-                raise RefusedError(_other_origin(folder, made, present))
+        cells = {cell["hash"] for cell in manifest["data_cells"]}
+        for data, made in sorted(log.made()):
+            if data in cells and made != origin and not allow_mixed:
+                raise RefusedError(_other_origin(folder, made, origin))
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
     differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in origin_differences(other, origin))
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
-
-
-def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None, str | None]]:
-    """What of two origins differs: its name, and what it is of each."""
-    left, right = dict(one.packages), dict(other.packages)
-    pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
-    pairs += [(name, left.get(name), right.get(name)) for name in left | right]
-    pairs += [("numeric platform", repr(one.platform), repr(other.platform))]
-    return [pair for pair in pairs if pair[1] != pair[2]]
 
 
 @contextmanager
@@ -264,16 +211,9 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
 
 
 def what_is_safe(folder: Path) -> str:
-    """A sentence about the results that can still be read although the journal cannot."""
-    from ctid_cli.storage.sealed import open_sealed
-
-    advice = "'ctid verify' says what else can be read, 'ctid repair' saves it into a new folder."
-    try:
-        found = open_sealed(folder / SEALED)
-    except (StorageError, RefusedError):
-        return f"There is no intact {SEALED} either. {advice}"
-    count = found.table.count
-    return f"{SEALED} is intact and holds {count} estimates of the last finished or interrupted run. {advice}"
+    """Return a sentence about what to do where a journal is damaged."""
+    start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
+    return f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
 
 
 def move_aside(folder: Path) -> Path | None:
@@ -299,11 +239,10 @@ def move_aside(folder: Path) -> Path | None:
 
 
 def experiment_folders(results: Path) -> list[Path]:
-    """Folders of experiments, in a results folder or anywhere below."""
+    """Return folders of experiments, in a results folder or anywhere below."""
     found = []
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))
-        if FILE_NAME in files or SEALED in files:
-            folders[:] = [name for name in folders if name != PROVENANCE]
+        if FILE_NAME in files or EXPORT in files:
             found.append(Path(path))
     return sorted(found)

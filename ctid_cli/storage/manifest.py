@@ -1,22 +1,26 @@
 """A plan as plain data: what the stored estimates are compared with, sorted by and described from.
 
-The journal and the sealed file keep the manifest, so that results can be listed, counted and exported without the
-specification that made them, also by later versions that read specifications differently. `storage.columns` says what
-a row of the table of estimates holds.
+Journal and ``runs.h5`` keep the manifest, so that results can be listed, counted and exported without the specification
+that made them. A shard is the part of a plan that one of several runs computes: whose a data set is follows from its
+place in the plan and the number of shards alone, and what is dealt stays where it is when ``runs`` is raised.
 """
 
 import hashlib
+import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from math import lcm
+from typing import Any, NamedTuple, NoReturn, Self
 
-from ctid_cli.errors import RefusedError
+from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
-from ctid_cli.storage.shards import Shard
+from ctid_cli.written_files import EXPERIMENT
 
 Manifest = dict[str, Any]
+#: Estimates that one plan may ask for.
+MAX_ESTIMATES = 100_000_000
 
 
 class Key(NamedTuple):
@@ -29,7 +33,7 @@ class Key(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Short name of the estimate."""
+        """Return short name of the estimate."""
         return hashlib.sha256(f"{self[0]}/{self[1]}/{self[2]}/{self[3]}".encode()).hexdigest()[:12]
 
 
@@ -55,21 +59,131 @@ class Slot(NamedTuple):
 
     @property
     def swept(self) -> dict[str, Any]:
-        """Values of the swept fields."""
+        """Return values of the swept fields."""
         return {**self.cell["swept"], **self.estimator["swept"]}
 
 
-def refuse_newer(path: Path, written: int, known: int) -> None:
-    """Refuse a file whose format is younger than this program."""
-    if written > known:
-        raise RefusedError(
-            f"{path} has format {written}; this ctid reads formats up to {known}. Use the newer ctid that wrote it, "
-            "another results folder (--out), or --fresh to move the old results aside"
-        )
+@dataclass(frozen=True, order=True)
+class Shard:
+    """One of several shards, counted from 1."""
+
+    number: int
+    of: int
+
+    def __str__(self) -> str:
+        return f"shard {self.number} of {self.of}"
+
+    @classmethod
+    def read(cls, text: str) -> Self:
+        """Return the shard that a text such as ``2/3`` names."""
+        found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
+        if found is None or not 1 <= int(found[1]) <= int(found[2]):
+            raise UsageError(f"--shard {text}: write k/n, for example 2/3 for the second of three, with k from 1 to n")
+        return cls(int(found[1]), int(found[2]))
+
+    def folder(self, experiment: str) -> str:
+        """Return name of the folder of its results."""
+        return f"{experiment}.shard-{self.number}-of-{self.of}"
+
+    def has(self, cell: int, replicate: int, cells: int) -> bool:
+        """Return whether a data set is among those of this shard."""
+        return owner(cell, replicate, cells, self.of) == self.number
+
+
+def owner(cell: int, replicate: int, cells: int, of: int) -> int:
+    """Return number of the shard that a data set is dealt to."""
+    index = replicate * cells + cell
+    # Dealt in turn, a number of cells that has a factor in common with that of the shards would give some shards the
+    # same cells over and over; so each turn through both begins one shard later.
+    return (index + index // lcm(cells, of)) % of + 1
+
+
+def read_json(text: str) -> Any:
+    """Return JSON without the numbers that it has no words for."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"{constant} is no JSON number")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def require_manifest(found: Any) -> Manifest:
+    """Return the plan in a file that anybody may have written; a ValueError says what is wrong with it."""
+    from pydantic import ValidationError
+
+    try:
+        plan: Manifest = found
+        _plan_model().model_validate(found)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        raise ValueError(f"its plan: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    if not re.fullmatch(EXPERIMENT, plan["experiment"]):
+        raise ValueError("its experiment has a name that none may have")
+    if not all(set(estimator["starts"]) <= plan["starts"].keys() for estimator in plan["estimators"]):
+        raise ValueError("a start is not described")
+    number, of = plan.get("shard", (1, 1))
+    if not 1 <= number <= of:
+        raise ValueError("its shard is none")
+    if planned_most(plan) > MAX_ESTIMATES:
+        raise ValueError(f"{planned_most(plan)} planned estimates are too many")
+    return plan
+
+
+def planned_most(plan: Manifest) -> int:
+    """Return the number of estimates of a plan, whatever its shard."""
+    data_sets: int = sum(cell["replicates"] for cell in plan["data_cells"])
+    return data_sets * sum(len(estimator["starts"]) for estimator in plan["estimators"])
+
+
+@cache
+def _plan_model() -> Any:
+    """Return what checks the form of a plan."""
+    from typing import Annotated
+
+    from pydantic import BaseModel, Field, FiniteFloat
+
+    text = Annotated[str, Field(min_length=1, max_length=1000)]
+    whole_number = Annotated[int, Field(strict=True, ge=0, lt=2**63)]
+    number = Annotated[FiniteFloat, Field(strict=True)]
+    rule = dict[str, number | list[number] | None] | None
+
+    class Content(BaseModel):
+        system: dict[str, Any] | None = None
+
+    class Cell(BaseModel):
+        hash: text
+        replicates: whole_number
+        swept: dict[str, Any]
+        content: Content
+
+    class Estimator(BaseModel):
+        name: text
+        kind: text
+        hash: text
+        swept: dict[str, Any]
+        content: dict[str, Any]
+        starts: Annotated[list[str], Field(min_length=1)]
+
+    class Spec(BaseModel):
+        success: rule = None
+
+    class Plan(BaseModel):
+        experiment: text
+        runs: whole_number
+        seed: whole_number | None = None
+        spec_hash: text
+        spec: Spec
+        success: rule
+        starts: dict[str, number | str | None]
+        data_cells: Annotated[list[Cell], Field(min_length=1)]
+        estimators: Annotated[list[Estimator], Field(min_length=1)]
+        shard: tuple[whole_number, whole_number] = (1, 1)
+
+    return Plan
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
-    """Every estimate that a plan asks for, or that its shard is to compute."""
+    """Yield every estimate that a plan asks for, or that its shard is to compute."""
     for estimator, cell, replicates in planned_parts(manifest):
         for replicate in replicates:
             for start in estimator["starts"]:
@@ -77,7 +191,7 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
 
 
 def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], Sequence[int]]]:
-    """Every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
+    """Yield every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
     cells, shard = manifest["data_cells"], shard_of(manifest)
     asked: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
     if shard is not None:
@@ -88,37 +202,45 @@ def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mappi
                 yield estimator, cell, replicates
 
 
+class Planned:
+    """The estimates that a plan asks for, to ask whether a key is among them."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self._parts: dict[tuple[str, str], list[tuple[Container[int], Sequence[str]]]] = {}
+        for estimator, cell, replicates in planned_parts(manifest):
+            asked = replicates if isinstance(replicates, range) else frozenset(replicates)
+            self._parts.setdefault((cell["hash"], estimator["hash"]), []).append((asked, estimator["starts"]))
+
+    def __contains__(self, key: Key) -> bool:
+        parts = self._parts.get((key.data_hash, key.estimator_hash), ())
+        return any(key.replicate in replicates and key.start in starts for replicates, starts in parts)
+
+
 def planned_count(manifest: Manifest) -> int:
-    """How many estimates that are, those that two names share counted twice."""
+    """Return how many estimates that are, those that two names share counted twice."""
     return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
 
 
-def shares_estimates(manifest: Manifest) -> bool:
-    """Whether two names of the same estimator, or data cell, share their estimates."""
-    parts = [[part["hash"] for part in manifest[of]] for of in ("data_cells", "estimators")]
-    return any(len(set(hashes)) < len(hashes) for hashes in parts)
-
-
 def shard_of(manifest: Manifest) -> Shard | None:
-    """Which shard of the experiment it is; None for the whole."""
+    """Return which shard of the experiment it is; None for the whole."""
     return Shard(*manifest["shard"]) if "shard" in manifest else None
 
 
 def whole(manifest: Manifest) -> Manifest:
-    """The plan that a shard was dealt from."""
+    """Return the plan that a shard was dealt from."""
     return {name: value for name, value in manifest.items() if name != "shard"}
 
 
 def assemble(
     slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
 ) -> dict[str, Any]:
-    """An estimate row."""
+    """Return an estimate row."""
     values = {**result, **plan_values(slot, manifest), "seconds": seconds, "cpu_seconds": cpu_seconds}
     return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
 
 
 def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
-    """What the plan says of an estimate, apart from swept fields."""
+    """Return what the plan says of an estimate, apart from swept fields."""
     return {
         "id": slot.key.id,
         "experiment": manifest["experiment"],
@@ -132,7 +254,7 @@ def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
 
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:
-    """The columns of a row as it is computed, before it is compared with the truth."""
+    """Return the columns of a row as it is computed, before it is compared with the truth."""
     return _row_columns(of_signal=is_of_signal(manifest))
 
 
@@ -143,18 +265,18 @@ def _row_columns(*, of_signal: bool) -> list[columns.Column]:
 
 
 def is_of_signal(manifest: Manifest) -> bool:
-    """Whether the estimates are frequencies of a signal."""
+    """Return whether the estimates are frequencies of a signal."""
     return "signal" in manifest["data_cells"][0]["content"]
 
 
 def swept_names(manifest: Manifest) -> list[str]:
-    """Names of the swept fields."""
+    """Return names of the swept fields."""
     parts = [*manifest["data_cells"], *manifest["estimators"]]
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
 def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
-    """True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
+    """Return True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
 
     ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
     parameters of the submodels of a sum, and its delay; the truth that a system of one's own gives.
@@ -176,7 +298,7 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
 
 @cache
 def _coefficients(names: tuple[str, ...]) -> tuple[int, int]:
-    """How many of these names are coefficients of a denominator, and of a numerator."""
+    """Return how many of these names are coefficients of a denominator, and of a numerator."""
     poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names) for letter in "ab")
     return poles, zeros
 
@@ -191,7 +313,7 @@ class Found(NamedTuple):
 
 
 def found_values(row: Mapping[str, Any], names: Iterable[str]) -> Found:
-    """Estimated values, standard errors and quantiles of intervals under the names of the true ones.
+    """Return estimated values, standard errors and quantiles of intervals under the names of the true ones.
 
     Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
     ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.

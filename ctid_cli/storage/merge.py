@@ -1,65 +1,52 @@
 """Merging: what several folders hold of one experiment, as if one run had computed it.
 
 The folders that are merged are only read. Rows go over with their times, and the runs that computed them with all that
-is known of these. The sealed file comes from the rows alone, so that it has the bytes of a single run's.
+is known of these, in one transaction: where anything is in the way, nothing is written. The export comes from the rows
+alone, so that it has the bytes of a single run's.
 """
 
-import json
 import re
+import shutil
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from itertools import islice
 from math import inf
 from pathlib import Path
-from typing import Any, Self
 
-from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.errors import CtidError, RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.identity import Origin, are_mixed
-from ctid_cli.storage.journal import Journal, open_journal
-from ctid_cli.storage.journal_reader import FILE_NAME, JournalReader, Row
-from ctid_cli.storage.manifest import Key, Manifest, Outcome, shard_of, slots, whole
-from ctid_cli.storage.pieces import ROWS
-from ctid_cli.storage.shards import Shard, owner, ranges
-from ctid_cli.storage.store import seal
+from ctid_cli.storage.export import ROWS, open_export, seal
+from ctid_cli.storage.identity import Origin, now, origin_differences
+from ctid_cli.storage.journal import (
+    EXPORT,
+    FILE_NAME,
+    Journal,
+    JournalReader,
+    Row,
+    Session,
+    new_id,
+    open_journal,
+    read_journal,
+)
+from ctid_cli.storage.manifest import (
+    Key,
+    Manifest,
+    Outcome,
+    Planned,
+    Shard,
+    owner,
+    shard_of,
+    slots,
+    whole,
+)
 
-#: What a session is called, apart from what is known of it.
-_OF_SESSION = ("session", "started", "stopped", "reason")
 #: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
 LIMITED = ("TIMEOUT", "MEMORY")
 LIMITS = ("wall_seconds", "cpu_seconds", "memory_mb")
+#: Estimates that a refusal names.
+NAMED = 5
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """What one folder holds."""
-
-    folder: Path
-    manifest: Manifest
-    entries: Mapping[Key, Row]
-    sessions: Sequence[Mapping[str, Any]]
-    #: Where the entries come from, by the number that they have.
-    origins: Mapping[int, Origin]
-
-    @classmethod
-    def of(cls, folder: Path, log: JournalReader, plan: Manifest) -> Self:
-        """What a journal holds of a plan."""
-        planned, entries = {slot.key for slot in slots(whole(plan))}, log.entries()
-        chosen = {key: entries[key] for key in entries if key in planned}
-        return cls(folder, plan, chosen, log.sessions(), log.known_origins())
-
-    def origin_of(self, entry: Row) -> Origin:
-        """Where an entry comes from."""
-        return self.origins[entry.origin]
-
-    @property
-    def shard(self) -> Shard | None:
-        """Which shard it is."""
-        return shard_of(self.manifest)
 
 
 @dataclass(frozen=True)
@@ -80,7 +67,7 @@ class Merged:
 
 
 def find_sources(paths: Iterable[Path]) -> list[Path]:
-    """The folders that are meant: of experiments as they are given, of all shards below others."""
+    """Return the folders that are meant: of experiments as they are given, of all shards below others."""
     found: dict[Path, Path] = {}
     for path in paths:
         if (path / FILE_NAME).exists():
@@ -93,21 +80,6 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
     return list(found.values())
 
 
-@contextmanager
-def _reading(folder: Path) -> Iterator[JournalReader]:
-    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
-        if log is None:
-            raise UsageError(f"there is no {FILE_NAME} with results in {folder}, which a merge reads")
-        yield log
-
-
-def read_source(folder: Path) -> Source:
-    """What a folder holds of its latest plan, each row compared with its checksum."""
-    with _reading(folder) as log:
-        log.check()
-        return Source.of(folder, log, log.manifest())
-
-
 def merge_all(
     folders: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
 ) -> Iterator[Merged]:
@@ -117,175 +89,207 @@ def merge_all(
         with _reading(folder) as log:
             experiments[log.experiment()].append(folder)
     for name, places in experiments.items():
-        yield merge(map(read_source, places), out / name, allow_mixed=allow_mixed, partial=partial)
+        yield merge(places, out / name, allow_mixed=allow_mixed, partial=partial)
 
 
-def merge(sources: Iterable[Source], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
+def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
     """Merge folders of one experiment into another one, which may hold some of its estimates already."""
-    # In the same order whatever the order they are named in.
-    read = sorted(sources, key=lambda source: (source.shard or Shard(0, 0), str(source.folder)))
-    read = [source for source in read if not (target.exists() and source.folder.samefile(target))]
-    if not read:
+    others = [folder for folder in folders if not (target.exists() and folder.samefile(target))]
+    if not others:
         raise UsageError(f"there is nothing to merge into {target} but itself")
-    plan = _common_plan(read)
-    present = _present(target, plan, read, allow_mixed=allow_mixed)
-    if not allow_mixed:
-        _check_origins([*present, *read])
-    new = _new_entries(present, read)
-    planned = {slot.key for slot in slots(plan)}
-    known = {key for source in present for key in source.entries}
-    missing = tuple(_missing(plan, read, planned - known - new.keys()))
-    if missing and not partial:
-        raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
-    with _writing(target):
-        target.mkdir(parents=True, exist_ok=True)
-    with place.lock(target), closing(open_journal(target / FILE_NAME)) as log:
-        if known != planned & log.keys():
-            raise place.InUseError(f"{target} was changed by another process just now; run the command again")
-        with _writing(target):
-            for name in (place.SPEC, place.CANONICAL):
-                log.write_beside(name, (read[0].folder / name).read_bytes())
-        log.replan(plan)
-        for source in read:
-            _take_over(source, {key: entry for key, (own, entry) in new.items() if own is source}, plan, log)
-        count, checksum = seal(target, log)
-        mixed = are_mixed(log.origins())
-    return Merged(plan["experiment"], target, len(read), len(planned), count, len(new), mixed, checksum, missing)
+    plans = {folder: _plan_of(folder) for folder in others}
+    # In the same order whatever the order they are named in.
+    others.sort(key=lambda folder: (shard_of(plans[folder]) or Shard(0, 0), str(folder)))
+    plan = _common_plan([(folder, plans[folder]) for folder in others])
+    shards = [shard_of(plans[folder]) for folder in others]
+    with _new_folder(target), place.lock(target):
+        with place.saying_what_is_safe(target):
+            _require_same_experiment(target, plan)
+            log = open_journal(target / FILE_NAME)
+        with closing(log):
+            taken = _Taken(target, log, plan, allow_mixed=allow_mixed)
+            with log.transaction():
+                for folder in others:
+                    with _reading(folder) as other:
+                        other.check()
+                        log.add_rows(taken.new_rows(folder, other))
+                taken.require_no_conflict()
+                missing = tuple(_missing(plan, shards, taken.missing()))
+                if missing and not partial:
+                    raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
+                log.note_plan(plan)
+            with _writing(target):
+                for name in (place.SPEC, place.CANONICAL):
+                    log.write_beside(name, (others[0] / name).read_bytes())
+            count, checksum = seal(target, log)
+            mixed = len(log.origins()) > 1
+    planned = len({slot.key for slot in slots(plan)})
+    return Merged(plan["experiment"], target, len(others), planned, count, taken.new, mixed, checksum, missing)
 
 
-def _common_plan(read: Sequence[Source]) -> Manifest:
-    """The plan that all folders are of."""
-    first = read[0]
-    plan = whole(first.manifest)
-    for source in read[1:]:
-        other = whole(source.manifest)
+@contextmanager
+def _reading(folder: Path) -> Iterator[JournalReader]:
+    with place.lock(folder, shared=True), place.reading_journal(folder) as log:
+        if log is None:
+            raise UsageError(f"there is no {FILE_NAME} with results in {folder}, which a merge reads")
+        yield log
+
+
+def _plan_of(folder: Path) -> Manifest:
+    with _reading(folder) as log:
+        return log.manifest()
+
+
+def _common_plan(plans: Sequence[tuple[Path, Manifest]]) -> Manifest:
+    """Return the plan that all folders are of."""
+    first, plan = plans[0][0], whole(plans[0][1])
+    for folder, found in plans[1:]:
+        other = whole(found)
         if other != plan:
-            ours, theirs = first.manifest["spec"], source.manifest["spec"]
+            ours, theirs = plan["spec"], other["spec"]
             sections = [name for name in ours | theirs if ours.get(name) != theirs.get(name)]
             where = f" ({', '.join(sections)} differ)" if sections else ""
             raise RefusedError(
-                f"{first.folder} and {source.folder} are of different specifications{where}; run their shards again "
+                f"{first} and {folder} are of different specifications{where}; run their shards again "
                 "with the same specification and options, which computes only what is new"
             )
     return plan
 
 
-def _present(target: Path, plan: Manifest, read: Sequence[Source], *, allow_mixed: bool) -> list[Source]:
-    """What the folder that is merged into holds of the plan."""
-    if not target.exists():
-        return []
-    origins = {key.estimator_hash: source.origin_of(entry) for source in read for key, entry in source.entries.items()}
-    with place.lock(target, shared=True):
-        if origins:
-            place.check_free(target, plan, origins, allow_mixed=allow_mixed)
-        with place.reading_journal(target) as log:
-            return [] if log is None else [Source.of(target, log, plan)]
+@contextmanager
+def _new_folder(target: Path) -> Iterator[None]:
+    """Return a folder that is removed again if it was made here and what follows fails."""
+    made = not target.exists()
+    try:
+        with _writing(target):
+            target.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        if made:
+            shutil.rmtree(target, ignore_errors=True)
+        raise
 
 
-def _check_origins(sources: Sequence[Source]) -> None:
-    """Refuse what other code or another processor has computed than the rest."""
-    seen: dict[str, tuple[Origin, Path]] = {}
-    for source in sources:
-        made = {(key.estimator_hash, source.origin_of(entry)) for key, entry in source.entries.items()}
-        for estimator, origin in sorted(made):
-            # All share what makes their data; those of one estimator share what makes the estimates too.
-            other, folder = seen.get(estimator) or next(iter(seen.values()), (origin, source.folder))
-            if other.shared != origin.shared or (estimator in seen and other != origin):
-                pairs = place.origin_differences(other, origin)
-                differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
-                raise RefusedError(
-                    f"{folder} and {source.folder} were computed by other code or arithmetic ({differences}); run one "
-                    "of them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
-                )
-            seen.setdefault(estimator, (origin, source.folder))
+def _require_same_experiment(target: Path, plan: Manifest) -> None:
+    with read_journal(target / FILE_NAME) as log:
+        if log is None and (target / EXPORT).exists():
+            raise RefusedError(f"{target} holds {EXPORT} without its {FILE_NAME}; merge into another folder (--out)")
+        if log is not None and log.experiment() != plan["experiment"]:
+            raise RefusedError(f"{target} holds the experiment {log.experiment()!r}; merge into another folder (--out)")
 
 
-def _new_entries(present: Sequence[Source], read: Sequence[Source]) -> dict[Key, tuple[Source, Row]]:
-    """What is to be stored, and where it comes from."""
-    found: dict[Key, tuple[Source, Row]] = {}
-    for source in (*present, *read):
-        for key, entry in source.entries.items():
-            other, stored = found.setdefault(key, (source, entry))
-            if stored.result == entry.result or stored.content == entry.content:
+class _Taken:
+    """What has been taken over from several folders into a journal, in one transaction."""
+
+    def __init__(self, target: Path, log: Journal, plan: Manifest, *, allow_mixed: bool) -> None:
+        self._log, self._plan, self._planned, self._allow_mixed = log, plan, Planned(plan), allow_mixed
+        #: Where the runs of the journal come from, by their ids.
+        self._places = {session.id: (target, session) for session in log.sessions()}
+        self._conflicts: list[tuple[Key, Path, Path]] = []
+        self._changed: set[Key] = set()
+        cells = {cell["hash"] for cell in plan["data_cells"]}
+        self._origins = {origin: target for data, origin in log.made() if data in cells}
+
+    @property
+    def new(self) -> int:
+        """Return estimates that were not there before, or exceeded a limit there."""
+        return len(self._changed)
+
+    def new_rows(self, folder: Path, other: JournalReader) -> Iterator[Row]:
+        """Yield the rows of a folder that are to be stored; their runs are noted."""
+        sessions = {session.id: session for session in other.sessions()}
+        for row in other.rows():
+            if row.key not in self._planned:
                 continue
-            if any(one.content["status"] in LIMITED for one in (stored, entry)):
-                found[key] = max(found[key], (source, entry), key=_rank)
-            else:
-                raise RefusedError(
-                    f"estimate {key.id} is one thing in {other.folder} and another in {source.folder}; 'ctid show "
-                    f"{key.id}' prints each, and --fresh computes one of the folders anew"
-                )
-    ours = set(map(id, present))
-    return {key: value for key, value in found.items() if id(value[0]) not in ours}
+            session, present = sessions[row.session], self._log.row(row.key)
+            self._require_origin(folder, session.origin)
+            if present is None or self._is_better(row, session, present, folder):
+                if row.session not in self._places:
+                    self._places[self._log.note_session(session)] = (folder, session)
+                self._changed.add(row.key)
+                yield row
+
+    def _require_origin(self, folder: Path, origin: Origin) -> None:
+        """Refuse what other code or another processor has computed than the rest."""
+        if self._allow_mixed or origin in self._origins or not self._origins:
+            self._origins.setdefault(origin, folder)
+            return
+        other, where = next(iter(self._origins.items()))
+        pairs = origin_differences(other, origin)
+        differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
+        raise RefusedError(
+            f"{folder} and {where} were computed by other code or arithmetic ({differences}); run one of "
+            "them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
+        )
+
+    def _is_better(self, row: Row, session: Session, present: Row, folder: Path) -> bool:
+        """Return whether a row replaces the present one, as where this exceeded a limit; a conflict is noted."""
+        if row.result == present.result:
+            return False
+        where, of_present = self._places[present.session]
+        if row.status in LIMITED or present.status in LIMITED:
+            return _rank(row, session) > _rank(present, of_present)
+        self._conflicts.append((row.key, where, folder))
+        return False
+
+    def require_no_conflict(self) -> None:
+        """Return name the estimates that are one thing here and another there."""
+        if self._conflicts:
+            key, one, other = self._conflicts[0]
+            count = len(self._conflicts)
+            others = ", ".join(key.id for key, _, _ in self._conflicts[1:NAMED])
+            more = f"; {count - 1} more differ too: {others}{', …' if count > NAMED else ''}" if others else ""
+            raise RefusedError(
+                f"estimate {key.id} is one thing in {one} and another in {other}; 'ctid show {key.id}' prints each, "
+                f"and --fresh computes one of the folders anew{more}"
+            )
+
+    def missing(self) -> list[Key]:
+        """Return estimates of the plan that are in none of the folders."""
+        there = {row.key for row in self._log.rows()}
+        return list({slot.key: None for slot in slots(self._plan) if slot.key not in there})
 
 
-def _rank(found: tuple[Source, Row]) -> tuple[bool, list[float], str]:
-    """Which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
-    source, entry = found
-    session = next((one for one in source.sessions if one["session"] == entry.session), {})
-    limits = session.get("limits") or {}
+def _rank(row: Row, session: Session) -> tuple[bool, list[float], str]:
+    """Return which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
+    limits = session.info.get("limits") or {}
     allowed = [inf if (limit := limits.get(name)) is None else float(limit) for name in LIMITS]
-    return entry.content["status"] not in LIMITED, allowed, canonical_json(entry.content)
+    return row.status not in LIMITED, allowed, row.result
 
 
-def _missing(plan: Manifest, read: Sequence[Source], keys: set[Key]) -> Iterator[str]:
-    """What is not there, by shard where all folders are of the same dealing."""
-    dealt = {source.shard.of for source in read if source.shard is not None}
+def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]) -> Iterator[str]:
+    """Yield what is not there, by shard where all folders are of the same dealing."""
+    known = [shard for shard in shards if shard is not None]
     if not keys:
         return
-    if len(dealt) != 1 or any(source.shard is None for source in read):
+    if len({shard.of for shard in known}) != 1 or len(known) < len(shards):
         yield f"{len(keys)} estimates are missing"
         return
-    (of,) = dealt
+    of = known[0].of
     cells = [cell["hash"] for cell in plan["data_cells"]]
     places = {cell: number for number, cell in enumerate(cells)}
     lacking = Counter(owner(places[key.data_hash], key.replicate, len(cells), of) for key in keys)
-    given = {source.shard.number for source in read if source.shard is not None}
+    given = {shard.number for shard in known}
     if absent := lacking.keys() - given:
         number = sum(lacking[shard] for shard in absent)
         what = "is not among the folders" if len(absent) == 1 else "are not among the folders"
-        yield f"{_shards(absent, of)} {what} ({number} estimates)"
+        yield f"{shards_text(absent, of)} {what} ({number} estimates)"
     if unfinished := lacking.keys() & given:
         number, one = sum(lacking[shard] for shard in unfinished), len(unfinished) == 1
         again = f"{'lacks' if one else 'lack'} {number} estimates, which the same 'ctid run' again computes"
-        yield f"{_shards(unfinished, of)} {again}"
+        yield f"{shards_text(unfinished, of)} {again}"
 
 
-def _shards(numbers: Iterable[int], of: int) -> str:
-    """Some shards in words, with numbers as a job array takes them."""
-    text = ranges(numbers)
+def shards_text(numbers: Iterable[int], of: int) -> str:
+    """Return some shards in words, with numbers as job arrays take them: ``shards 1-3,7 of 9``."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and runs[-1][-1] == number - 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    text = ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
-
-
-def _take_over(source: Source, entries: Mapping[Key, Row], plan: Manifest, log: Journal) -> None:
-    """Store estimates of a folder, run by run, with what is known of the runs that computed them."""
-    for run in source.sessions:
-        own = {key: entry for key, entry in entries.items() if entry.session == run["session"]}
-        if own:
-            info = {name: value for name, value in run.items() if name not in _OF_SESSION}
-            origins = {key.estimator_hash: source.origin_of(e) for key, e in own.items()}
-            number = log.begin(plan, origins, run["started"], info)
-            outcomes = (Outcome(key, e.content, e.seconds, e.cpu_seconds) for key, e in own.items())
-            while some := list(islice(outcomes, ROWS)):
-                log.add(some, number)
-            if run["stopped"] is not None:
-                log.end(number, run["stopped"], run["reason"])
-            with _writing(log.path.parent):
-                _copy_provenance(source.folder, run["session"], log, number)
-
-
-def _copy_provenance(source: Path, session: int, log: Journal, number: int) -> None:
-    """Keep what is known of a run, under its new number."""
-    (log.path.parent / place.PROVENANCE).mkdir(exist_ok=True)
-    # One that was killed has left nothing but its line in the journal.
-    for file in (source / place.PROVENANCE).glob(f"{session:04d}-*.json"):
-        try:
-            content = json.loads(file.read_text(encoding="utf-8")) | {"session": number}
-        except (ValueError, TypeError) as error:
-            raise StorageError(f"{file} cannot be read or is damaged ({error})") from error
-        name = f"{number:04d}-{file.name.partition('-')[2]}"
-        text = json.dumps(content, indent=2, ensure_ascii=False)
-        log.write_beside(f"{place.PROVENANCE}/{name}", f"{text}\n".encode())
 
 
 @contextmanager
@@ -296,3 +300,70 @@ def _writing(target: Path) -> Iterator[None]:
         raise StorageError(
             f"{error.filename or target}: {error.strerror or error}; the same merge again goes on"
         ) from error
+
+
+# --- keeping what can be read of a damaged folder -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What was kept of a folder that was moved aside."""
+
+    planned: int
+    #: Estimates out of its journal, and out of ``runs.h5``.
+    from_journal: int
+    from_export: int
+
+    def __str__(self) -> str:
+        text = f"{self.from_journal + self.from_export} of {self.planned} estimates could be read and are kept"
+        return f"{text}, {self.from_export} of them from {EXPORT}" if self.from_export else text
+
+
+def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, allow_mixed: bool = False) -> Kept:
+    """Copy what can be read of a folder that was moved aside into a new journal.
+
+    Row by row: what SQLite still reads of the old journal and agrees with its checksum; where a row is lost, that of
+    ``runs.h5`` if this is whole. Results of other code or arithmetic are left out unless they may be mixed.
+    """
+    keys = dict.fromkeys(slot.key for slot in slots(plan))
+    kept, noted = set[Key](), set[str]()
+
+    def chosen(found: Iterator[tuple[Row, Session]]) -> Iterator[Row]:
+        for row, session in found:
+            if row.key in keys and row.key not in kept and (allow_mixed or session.origin == origin):
+                if session.id not in noted:
+                    noted.add(log.note_session(session))
+                kept.add(row.key)
+                yield row
+
+    with log.transaction():
+        log.note_plan(plan)
+        log.add_rows(chosen(_readable(aside, keys)))
+        from_journal = len(kept)
+        if from_journal < len(keys):
+            log.add_rows(chosen(_exported(aside)))
+    return Kept(len(keys), from_journal, len(kept) - from_journal)
+
+
+def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
+    """Yield the rows of a journal that can be read, each with its run."""
+    with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
+        for key in keys if old is not None else ():
+            # Whatever a damaged page hides, the other rows are worth reading.
+            with suppress(CtidError, ValueError):
+                assert old is not None
+                if (row := old.row(key)) is not None:
+                    yield row, old.session(row.session)
+
+
+def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
+    """Yield the estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
+    with suppress(CtidError):
+        export = open_export(aside / EXPORT)
+        export.verify()
+        if len(export.origins) == 1:
+            session = Session(new_id(), export.origins[0], now(), None, None, {"kept_from": str(aside / EXPORT)})
+            for first in range(0, export.count, ROWS):
+                part = (first, min(first + ROWS, export.count))
+                for key, result in zip(export.keys(*part), export.results(*part), strict=True):
+                    yield Row.of(Outcome(key, result, None), session.id), session

@@ -1,18 +1,30 @@
-"""Files of one result each, such as ``fit.json``: kind, format, checksum, and the records that they are of."""
+"""Files of one result each, such as ``fit.json``: kind, format, checksum, and the records that they are of.
 
+The result is in them as plain data without loss: every number to its last bit, every array with its shape. What is read
+back is what the annotations of the result's classes name, and nothing else: a file cannot ask for a class.
+"""
+
+import dataclasses
 import json
+import math
 import os
-from collections.abc import Iterable, Mapping
+import types
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, Literal, NamedTuple, NoReturn, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
 
 import ctid_cli
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
+from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.signals.files import require_file
 from ctid_cli.simulation.dataset import file_sha256
-from ctid_cli.storage.foreign import read_json
+from ctid_cli.storage.manifest import read_json
 
 #: Bytes of the largest file that is read; ten thousand draws of a bootstrap need less.
 MAX_BYTES = 200_000_000
@@ -34,14 +46,14 @@ class ResultKind(NamedTuple):
 
 
 def result_text(kind: ResultKind, content: Mapping[str, Any], command: str | None) -> str:
-    """The file's text, with what every reader compares."""
+    """Return the file's text, with what every reader compares."""
     whole = {"kind": kind.kind, "format": kind.format, "ctid": ctid_cli.__version__, "command": command, **content}
     text = json.dumps(whole, allow_nan=False)
     return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
 
 
 def path_and_sum(path: str | os.PathLike[str], folder: Path) -> dict[str, Any]:
-    """Where a record lies, seen from a folder, and its SHA-256."""
+    """Return where a record lies, seen from a folder, and its SHA-256."""
     place, home = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
     below = place.is_relative_to(home)
     shown = place.relative_to(home).as_posix() if below else str(place)
@@ -62,7 +74,7 @@ class Source:
 
     @property
     def place(self) -> str:
-        """Where the record is looked for."""
+        """Return where the record is looked for."""
         return self.moved or str(Path(os.path.abspath(self.owner)).parent / str(self.content["path"]))
 
     def require_same(self) -> None:
@@ -76,7 +88,7 @@ class Source:
 
 
 def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
-    """What a file says, if it is one of this kind as it was written."""
+    """Return what a file says, if it is one of this kind as it was written."""
     content = _json_of(file, kind)
     if not isinstance(content, dict) or content.get("kind") != kind.kind:
         refuse(file, kind, _what_else(content, kind))
@@ -91,7 +103,7 @@ def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
 
 
 def kind_in(file: str, kind: ResultKind) -> str | None:
-    """Which kind of result a file says that it is, None if none; one that cannot be read is refused as of a kind."""
+    """Return which kind of result a file says that it is; refuse one that cannot be read as of a kind."""
     content = _json_of(file, kind)
     return content["kind"] if isinstance(content, dict) and isinstance(content.get("kind"), str) else None
 
@@ -109,7 +121,7 @@ def _json_of(file: str, kind: ResultKind) -> Any:
 
 
 def texts(values: Iterable[Any]) -> bool:
-    """Whether all values are texts."""
+    """Return whether all values are texts."""
     return all(isinstance(value, str) for value in values)
 
 
@@ -125,7 +137,7 @@ def refuse(file: str, kind: ResultKind, what: str) -> NoReturn:
 
 
 def _what_else(content: Any, kind: ResultKind) -> str:
-    """What a file is that is of another kind."""
+    """Return what a file is that is of another kind."""
     if not isinstance(content, dict):
         return f"is no {kind.noun}"
     if isinstance(content.get("kind"), str):
@@ -133,3 +145,111 @@ def _what_else(content: Any, kind: ResultKind) -> str:
     if "parameters" in content and "residual_tests" in content:
         return "is a fit of an older ctid, which cannot be read back"
     return f"is another kind of result than a {kind.noun}"
+
+
+# --- results as plain data ------------------------------------------------------------------------------------------
+
+#: Numbers that JSON does not have.
+_NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+def encoded(value: Any) -> Any:
+    """Return a result as JSON can hold it, without what it computes later."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        kept = {name: encoded(getattr(value, name)) for name in _hints(type(value))}
+        return {"type": type(value).__name__, **kept}
+    if isinstance(value, np.ndarray):
+        numbers = [_number(item) for item in value.ravel().tolist()]
+        return numbers if value.ndim == 1 else {"shape": list(value.shape), "values": numbers}
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, tuple | list):
+        return [encoded(item) for item in value]
+    return _number(value.item() if isinstance(value, np.generic) else value)
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, complex):
+        return [_number(value.real), _number(value.imag)]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
+
+
+def decoded(content: Any, hint: Any, place: str = "result") -> Any:
+    """Return the value of an annotation that was encoded."""
+    origin, choices = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return _one_of(content, choices, place)
+    if origin is Literal:
+        return content if content in choices else _refuse_part(place)
+    if origin is np.ndarray:
+        return _array(content, np.dtype(get_args(choices[1])[0]), place)
+    if origin in (tuple, Sequence):
+        return _sequence(content, choices, place)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return _instance(content, hint, place)
+    if isinstance(hint, type) and hasattr(hint, "_fields"):
+        return hint(*_sequence(content, list(get_type_hints(hint).values()), place))
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint[content] if isinstance(content, str) and content in hint.__members__ else _refuse_part(place)
+    return _plain(content, hint, place)
+
+
+def _one_of(content: Any, choices: Sequence[Any], place: str) -> Any:
+    if content is None and type(None) in choices:
+        return None
+    left = [choice for choice in choices if choice is not type(None)]
+    if isinstance(content, Mapping) and len(left) > 1:
+        left = [choice for choice in left if getattr(choice, "__name__", "") == content.get("type")]
+    return decoded(content, left[0], place) if left else _refuse_part(place)
+
+
+def _sequence(content: Any, choices: Sequence[Any], place: str) -> tuple[Any, ...]:
+    if not isinstance(content, list):
+        _refuse_part(place)
+    if choices and choices[-1] is not Ellipsis and len(choices) > 1 and len(choices) != len(content):
+        _refuse_part(place)
+    hints = choices if len(choices) == len(content) and Ellipsis not in choices else [choices[0]] * len(content)
+    return tuple(
+        decoded(item, each, f"{place}[{k}]") for k, (item, each) in enumerate(zip(content, hints, strict=True))
+    )
+
+
+def _array(content: Any, dtype: Any, place: str) -> Any:
+    shape = content.get("shape") if isinstance(content, Mapping) else None
+    values = content.get("values") if isinstance(content, Mapping) else content
+    one: Any = {"f": float, "c": complex, "b": bool}.get(dtype.kind, int)
+    array = np.array(_sequence(values, (one, Ellipsis), place), dtype=dtype)
+    return array if shape is None else array.reshape(_sequence(shape, (int, Ellipsis), place))
+
+
+def _instance(content: Any, kind: type, place: str) -> Any:
+    hints = _hints(kind)
+    if not isinstance(content, Mapping) or set(content) != {"type", *hints} or content["type"] != kind.__name__:
+        _refuse_part(place)
+    values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items()}
+    late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}
+    return kind(**values, **late)
+
+
+def _plain(content: Any, hint: Any, place: str) -> Any:
+    if hint is float and isinstance(content, str) and content in _NOT_FINITE:
+        return _NOT_FINITE[content]
+    if hint is complex and isinstance(content, list) and len(content) == 2:
+        return complex(*(_plain(part, float, place) for part in content))
+    if hint is float and isinstance(content, int) and not isinstance(content, bool):
+        return content
+    return content if type(content) is hint else _refuse_part(place)
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Return the fields that are written, with their annotations."""
+    late = kind.deferred if issubclass(kind, DeferredFields) else ()
+    hints = get_type_hints(kind)
+    return {each.name: hints[each.name] for each in dataclasses.fields(kind) if each.init and each.name not in late}
+
+
+def _refuse_part(place: str) -> NoReturn:
+    raise DataError(f"{place} is not what a fit has there")

@@ -13,11 +13,12 @@ from typing import Any
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
-from ctid_cli.storage.exact import decoded, encoded
 from ctid_cli.storage.result_file import (
     ResultKind,
     Source,
     content_of,
+    decoded,
+    encoded,
     path_and_sum,
     refuse,
     require,
@@ -40,14 +41,14 @@ class Reading:
     stop: float | None = None
 
     def read(self, path: str | os.PathLike[str]) -> SampledSignal:
-        """The signal, with its times in seconds."""
+        """Return the signal, with its times in seconds."""
         return read_sampled_signal(path, **asdict(self)).in_seconds()
 
 
 def track_file_text(
     track: RecordTrack, content: Mapping[str, Any], record: Path, reading: Reading, folder: Path, command: str | None
 ) -> str:
-    """The file's text: what is said of a track, its record as seen from the folder of the file, and its rows."""
+    """Return the file's text: what is said of a track, its record as seen from the folder of the file, and its rows."""
     source = {
         **path_and_sum(record, folder),
         "columns": {"time": reading.time, "signal": reading.signal},
@@ -62,7 +63,7 @@ class SignalSource(Source):
     """A record as ``track.json`` names it."""
 
     def read(self) -> SampledSignal:
-        """The record, as it was read for the track."""
+        """Return the record, as it was read for the track."""
         self.require_same()
         content = self.content
         columns = content["columns"]
@@ -87,7 +88,7 @@ class StoredTrack:
 
 
 def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | None = None) -> StoredTrack:
-    """The file with everything in it; its record may have moved."""
+    """Return the file with everything in it; its record may have moved."""
     file = os.fspath(path)
     content = content_of(file, TRACK)
     try:

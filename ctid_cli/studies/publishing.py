@@ -11,10 +11,10 @@ from pathlib import Path
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.origins import current_versions
+from ctid_cli.running.origins import current_version
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.provenance import public_sessions
+from ctid_cli.storage.status import public_sessions
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part
 from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
 from ctid_cli.written_files import write_file
@@ -46,8 +46,8 @@ def commit_of(found: StudyResults) -> str:
     for results in found.experiments.values():
         if results.stored.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
-        present = current_versions(build_plan(spec_from_canonical(results.settings)))
-        if not {origin.code_version for origin in results.stored.origins} <= present:
+        present = current_version(build_plan(spec_from_canonical(results.settings)))
+        if not {origin.code_version for origin in results.stored.origins} <= {present}:
             other = f"{results.experiment} was not computed by the code that is checked out"
             raise RefusedError(f"{other}; check out the commit that computed it, or run it again with --fresh")
     origins = [origin for results in found.experiments.values() for origin in results.stored.origins]

@@ -54,7 +54,7 @@ def test_show_imports_nothing_that_it_does_not_need(tmp_path):
         "import sys; from ctid_cli.cli.main import app\n"
         f"try: app(['show', '', '--out', {str(tmp_path)!r}])\n"
         "except SystemExit: pass\n"
-        "import ctid_cli.reporting.detail, ctid_cli.storage.sealed\n"
+        "import ctid_cli.reporting.detail, ctid_cli.storage.export\n"
         "slow = {'scipy', 'pandas', 'numba', 'joblib', 'rich'} & set(sys.modules)\n"
         "assert not slow, slow"
     )

@@ -9,8 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.running.test_shards import SPEC
-
+SPEC = """\
+experiment: sharded
+system:      {numerator: [2], denominator: [1, 2]}
+excitation:  {kind: prbs, stages: 6, clock_period: 0.2, amplitude: 1.0}
+sampling:    {kind: regular, interval: 0.1, samples: 200}
+noise:       {kind: white, snr_db: [5, 15]}
+estimators:  {svf: {kind: svf, poles: 1, zeros: 0}}
+monte_carlo: {runs: 5, seed: 1}
+"""
 ROOT = Path(__file__).resolve().parents[2]
 ARRAY = ROOT / "docs" / "examples" / "slurm" / "shards.sbatch"
 

@@ -104,7 +104,7 @@ def test_a_read_only_disk_is_not_taken_for_damage(out: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     "name",
     [
-        *("provenance", "a/provenance", "a/Figures/b", "x.aside-20260101T000000", "tiny/journal.sqlite"),
+        *("figures", "a/figures", "a/Figures/b", "x.aside-20260101T000000", "tiny/journal.sqlite"),
         *("tiny/RUNS.h5", "con", "a/nul.b", "COM1", "tiny.", "a./b", "tiny.tmp", "tiny.shard-1-of-3", "spec.yaml"),
     ],
 )
@@ -119,6 +119,4 @@ def test_names_under_which_results_would_be_lost_are_refused(tmp_path: Path, nam
 
 def test_every_file_of_a_run_is_a_name_that_is_taken(out: Path) -> None:
     assert {path.name for path in (out / "toys").iterdir()} <= set(TAKEN)
-    assert [why_unusable(name) for name in ("quickstart", "a/b", "provenance-2", "conical", "com10x", "x.2")] == [
-        None
-    ] * 6
+    assert [why_unusable(name) for name in ("quickstart", "a/b", "figures-2", "conical", "com10x", "x.2")] == [None] * 6

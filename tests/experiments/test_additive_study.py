@@ -14,7 +14,7 @@ from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
 from ctid_cli.studies.claim import claims_table
 from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.reporting.ideal_results import ideal_results
-from tests.storage.sealed_images import seal_image
+from tests.storage.made_results import export_image
 
 STUDY = find_study("additive")
 measures, claims = STUDY.module("measures"), STUDY.module("claims")
@@ -125,7 +125,7 @@ def ideal(tmp_path_factory):
                 value["parameters"] = {name: 1.000001 * true for name, true in truth.items()}
         folder = out / plan.experiment
         folder.mkdir(parents=True)
-        image, _, _ = seal_image(results.manifest, results.stored.origins, results.stored.results)
+        image = export_image(results.manifest, results.stored.origins, results.stored.results)
         (folder / "runs.h5").write_bytes(image)
     return out
 

@@ -4,7 +4,7 @@ from ctid_cli.running.job import Job
 from ctid_cli.storage.identity import Origin
 from ctid_cli.studies.catalogue import find_study
 from tests.running.fakes import outcomes_of
-from tests.storage.sealed_images import seal_image
+from tests.storage.made_results import export_image
 
 STUDY = find_study("finite-time-frequency")
 
@@ -19,6 +19,5 @@ def run_here(name, out, overrides, study=STUDY):
         results |= {outcome.key: outcome.result for outcome in outcomes_of(job)}
     folder = out / plan.experiment
     folder.mkdir(parents=True)
-    image, _, _ = seal_image(plan.manifest(), (Origin("c", "p", ()),), results)
-    (folder / "runs.h5").write_bytes(image)
+    (folder / "runs.h5").write_bytes(export_image(plan.manifest(), (Origin("c", "p", ()),), results))
     return folder

@@ -1,7 +1,7 @@
 from pathlib import Path
 
 from ctid_cli.reporting.overview import overview_text, status_text
-from ctid_cli.storage.store import ExperimentStatus, GroupStatus
+from ctid_cli.storage.status import ExperimentStatus, GroupStatus
 
 
 def progress(**changes):

@@ -207,12 +207,12 @@ def test_ratios_that_make_no_sense_are_refused(plan, tmp_path):
 
 def test_results_on_disk_give_the_same_errors(plan, tmp_path):
     from ctid_cli.reporting.results import read_results
-    from tests.storage.sealed_images import seal_image
+    from tests.storage.made_results import export_image
 
     results = ideal_results(plan, tmp_path)
     folder = tmp_path / "two-modes"
     folder.mkdir()
-    image, _, _ = seal_image(results.manifest, results.stored.origins, results.stored.results)
+    image = export_image(results.manifest, results.stored.origins, results.stored.results)
     (folder / "runs.h5").write_bytes(image)
     again = read_results(tmp_path, "two-modes")
     assert isinstance(again, Results)

@@ -22,8 +22,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.running.cells import Plan, Task
 from ctid_cli.running.job import Job, run_job
 from ctid_cli.simulation.dataset import DataSet
-from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.shards import Shard
+from ctid_cli.storage.manifest import Key, Outcome, Shard
 
 
 class FakeStatus(Enum):

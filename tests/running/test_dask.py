@@ -22,8 +22,8 @@ from ctid_cli.running.limits import Limits
 from ctid_cli.running.pool import packed
 from ctid_cli.running.retry import Stock
 from ctid_cli.running.todo import Todo
-from ctid_cli.storage.merge import merge, read_source
-from ctid_cli.storage.store import load_estimates
+from ctid_cli.storage.estimates import read_estimates
+from ctid_cli.storage.merge import merge
 from tests.running.fakes import FakePlan, Toy
 from tests.running.hostile import Hostile
 
@@ -70,7 +70,7 @@ def test_one_machine_or_many_give_the_same_bytes(cluster: Any, tmp_path: Path) -
     shards = [tmp_path / f"shard{number}" for number in (1, 2, 3)]
     for number, place in enumerate(shards, start=1):
         run_experiment(plan().part(number, 3), place, jobs=1, warm=lambda: 0.0)
-    merge(map(read_source, shards), tmp_path / "merged")
+    merge(shards, tmp_path / "merged")
     assert len({sealed(tmp_path / name) for name in ("dask", "1", "2", "merged")}) == 1
 
 
@@ -86,7 +86,7 @@ def test_hostile_estimates_are_named_and_all_others_are_stored(cluster: Any, tmp
     summary = run_experiment(hostile, tmp_path, warm=lambda: 0.0, executor=executor)
     assert (summary.planned, summary.computed, summary.missing, summary.failed) == (36, 35, 1, 3)
     assert "1 are missing (toy7 on replicate 1): SIGKILL" in str(summary.machine_error())
-    frame = load_estimates(tmp_path)
+    frame = read_estimates(tmp_path)
     failed = frame[frame["status"] != "CONVERGED"]
     found = list(zip(failed["estimator"], failed["replicate"], failed["status"], strict=True))
     assert found == [("toy1", 1, "TIMEOUT"), ("toy3", 1, "MEMORY"), ("toy5", 1, "CRASHED")]

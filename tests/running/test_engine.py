@@ -21,7 +21,7 @@ from ctid_cli.errors import DataError, RefusedError, StorageError
 from ctid_cli.running import engine, events
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.job_order import JobQueue
-from ctid_cli.running.origins import current_origins
+from ctid_cli.running.origins import current_origin
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.retry import Stock
 from ctid_cli.running.stopping import StopAt
@@ -29,10 +29,11 @@ from ctid_cli.running.todo import Todo
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder
 from ctid_cli.storage.columns import no_result
+from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal_reader import read_journal
+from ctid_cli.storage.journal import read_journal
 from ctid_cli.storage.manifest import Key, Outcome, slots
-from ctid_cli.storage.store import experiment_status, load_estimates
+from ctid_cli.storage.status import experiment_status
 from tests.running import run_toys
 from tests.running.fakes import FakePlan, Toy
 
@@ -87,7 +88,7 @@ def finish(process: subprocess.Popen[str], within: float = 300) -> tuple[list[st
 
 def stored_ids(place: Path) -> set[str]:
     with folder.lock(place), read_journal(place / "journal.sqlite") as log:
-        return set() if log is None else {key.id for key in log.entries()}
+        return set() if log is None else {row.key.id for row in log.rows()}
 
 
 def group_is_gone(process: subprocess.Popen[str], within: float) -> bool:
@@ -138,7 +139,7 @@ def test_every_estimate_of_the_plan_is_stored_once_in_its_order(tmp_path: Path) 
     listed = [slot.key for slot in slots(plan.manifest())]  # type: ignore[arg-type]
     assert set(listed) == expected
     assert len(listed) == len(expected) == summary.planned == summary.computed
-    assert load_estimates(tmp_path)["id"].tolist() == [key.id for key in listed]
+    assert read_estimates(tmp_path)["id"].tolist() == [key.id for key in listed]
     assert summary.exit_code == 0
 
 
@@ -193,7 +194,7 @@ def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
     assert (more_estimators.reused, more_estimators.computed) == (12, 6)
     fewer = run(FakePlan(Toy(), runs=2), tmp_path)
     assert (fewer.reused, fewer.computed, fewer.left_aside) == (8, 0, 10)
-    assert len(load_estimates(tmp_path)) == 8
+    assert len(read_estimates(tmp_path)) == 8
     status = experiment_status(tmp_path)
     assert (status.planned, status.done, status.left_aside) == (8, 8, 10)
     run(FakePlan(Toy(), runs=2), tmp_path / "alone")
@@ -205,19 +206,20 @@ def test_two_names_of_one_estimator_share_its_estimates(tmp_path: Path) -> None:
     twin = dataclasses.replace(plan.estimators[0], name="right")
     plan.estimators = (*plan.estimators, twin)
     summary = run(plan, tmp_path)
-    frame = load_estimates(tmp_path)
+    frame = read_estimates(tmp_path)
     assert summary.planned == summary.computed == 8
     assert frame["estimator"].value_counts().to_dict() == {"left": 8, "right": 8}
 
 
-def test_spec_and_provenance_lie_beside_the_results(tmp_path: Path) -> None:
+def test_the_spec_lies_beside_the_results_and_the_journal_says_where_they_come_from(tmp_path: Path) -> None:
     run(FakePlan(text="# as the user wrote it\n"), tmp_path)
     assert (tmp_path / "spec.yaml").read_text() == "# as the user wrote it\n"
     assert '"experiment": "toys"' in (tmp_path / "spec.canonical.json").read_text()
-    (note,) = (tmp_path / "provenance").iterdir()
-    assert {"host", "argv", "packages", "code_version"} <= set(__import__("json").loads(note.read_text()))
+    with read_journal(tmp_path / "journal.sqlite") as log:
+        assert log is not None
+        assert {"host", "argv", "packages", "limits"} <= set(log.sessions()[0].info)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"spec.yaml", "spec.canonical.json", "journal.sqlite", "runs.h5", "timings.csv", "provenance"}
+    assert names == {"spec.yaml", "spec.canonical.json", "journal.sqlite", "runs.h5"}
 
 
 # Misbehaving estimators
@@ -225,7 +227,7 @@ def test_spec_and_provenance_lie_beside_the_results(tmp_path: Path) -> None:
 
 def test_an_estimator_that_raises_is_recorded_with_the_place(tmp_path: Path) -> None:
     summary = run(FakePlan(Toy("raise", at=1), Toy("exit", at=2)), tmp_path)
-    frame = load_estimates(tmp_path).set_index("replicate")
+    frame = read_estimates(tmp_path).set_index("replicate")
     failed = frame[frame["status"] == "FAILED"]
     assert sorted(failed.index) == [1, 1, 1, 1, 2, 2]
     assert summary.failed == 6
@@ -243,7 +245,7 @@ def test_a_deadly_estimate_is_found_and_all_others_survive(tmp_path: Path, jobs:
     seen: list[events.Event] = []
     plan = FakePlan(Toy(), Toy("die", at=2), levels=(5,), runs=7)
     summary = run(plan, tmp_path, jobs=jobs, on_event=seen.append)
-    frame = load_estimates(tmp_path)
+    frame = read_estimates(tmp_path)
     crashed = frame[frame["status"] == "CRASHED"]
     assert crashed[["estimator", "replicate"]].to_numpy().tolist() == [["toy1", 2]]
     assert "SIGSEGV" in crashed["message"].iloc[0]
@@ -270,7 +272,7 @@ def test_a_first_record_that_cannot_be_used_writes_nothing(tmp_path: Path) -> No
 def test_workers_use_one_blas_thread(tmp_path: Path, jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     run(FakePlan(Toy("count threads")), tmp_path, jobs=jobs)
-    frame = load_estimates(tmp_path)
+    frame = read_estimates(tmp_path)
     assert set(frame["cost"]) == {1.0}
 
 
@@ -312,7 +314,7 @@ def test_a_signal_seals_what_is_finished(tmp_path: Path, undisturbed: bytes, num
     assert process.returncode == code, errors
     assert errors == ""
     assert group_is_gone(process, within=5)
-    frame = load_estimates(place)
+    frame = read_estimates(place)
     assert set(frame["id"]) == {*reported, *rest}
     assert 0 < len(frame) < 120
     assert set(frame["status"]) <= {"CONVERGED", "FAILED"}
@@ -348,7 +350,7 @@ def test_the_callers_event_stops_a_run(tmp_path: Path) -> None:
     assert summary.stopped_by == "stop"
     assert summary.exit_code == 5
     assert 0 < summary.computed < summary.planned
-    assert len(load_estimates(tmp_path)) == summary.computed
+    assert len(read_estimates(tmp_path)) == summary.computed
     assert sum(isinstance(event, events.Stopping) for event in seen) == 1
 
 
@@ -365,10 +367,10 @@ def test_running_jobs_are_abandoned_when_they_take_long(tmp_path: Path) -> None:
 
 
 def change_origin(monkeypatch: pytest.MonkeyPatch, **changes: str) -> None:
-    def other(plan: Any) -> dict[str, Origin]:
-        return {name: dataclasses.replace(origin, **changes) for name, origin in current_origins(plan).items()}  # type: ignore[arg-type]
+    def other(plan: Any) -> Origin:
+        return current_origin(plan)._replace(**changes)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(engine, "current_origins", other)
+    monkeypatch.setattr(engine, "current_origin", other)
 
 
 def newer_format(place: Path) -> None:
@@ -427,11 +429,11 @@ def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path) -> None:
     assert status.running is not None
     assert status.running["pid"] == process.pid
     # Others see what is stored, and more of it a little later.
-    first = now = len(load_estimates(place))
+    first = now = len(read_estimates(place))
     while now == first:
         # A line for each data set; a data set may have been stored before its line was read here.
         read_ids(process, 3)
-        now = len(load_estimates(place))
+        now = len(read_estimates(place))
     assert now < 3000
     assert 0 < status.done < status.planned == 3000
     os.killpg(process.pid, signal.SIGKILL)
@@ -445,7 +447,7 @@ def test_sealed_results_without_their_journal_are_not_overwritten(tmp_path: Path
     with pytest.raises(RefusedError, match="without the journal"):
         run(FakePlan(), tmp_path)
     assert snapshot(tmp_path) == before
-    assert len(load_estimates(tmp_path)) == 36
+    assert len(read_estimates(tmp_path)) == 36
 
 
 def test_fresh_moves_the_old_folder_aside(tmp_path: Path) -> None:
@@ -473,7 +475,7 @@ def test_mixing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     change_origin(monkeypatch, code_version="feedfacefeedface")
     summary = run(FakePlan(runs=3), tmp_path, allow_mixed=True)
     assert summary.mixed
-    assert load_estimates(tmp_path).attrs["mixed"]
+    assert read_estimates(tmp_path).attrs["mixed"]
     assert experiment_status(tmp_path).mixed
     with pytest.raises(RefusedError, match="allow-mixed"):
         run(FakePlan(runs=4), tmp_path)
@@ -511,7 +513,7 @@ def test_a_full_disk_while_sealing_keeps_the_old_file(tmp_path: Path, monkeypatc
             run(FakePlan(runs=3), tmp_path)
     assert sealed(tmp_path) == before
     assert not list(tmp_path.glob("*.tmp"))
-    assert len(load_estimates(tmp_path)) == 18
+    assert len(read_estimates(tmp_path)) == 18
 
 
 @pytest.mark.parametrize("change", ["rename", "delete", "replace"])
@@ -537,7 +539,7 @@ def test_a_folder_that_is_gone_ends_the_run_before_anything_is_reported(
         run(FakePlan(Toy(seconds=0.02), runs=20), place, on_event=lose_it)
     assert len(reported) == gone[0]
     if change == "replace":
-        assert len(load_estimates(place)) == 6
+        assert len(read_estimates(place)) == 6
     if change != "delete":
         assert set(reported) <= stored_ids(elsewhere)
     else:
@@ -551,7 +553,7 @@ def test_a_damaged_journal_is_reported_and_not_touched(tmp_path: Path) -> None:
     data[4096:] = bytes(len(data) - 4096)
     path.write_bytes(data)
     before = snapshot(tmp_path)
-    with pytest.raises(StorageError, match=r"runs\.h5 is intact and holds 36 estimates"):
+    with pytest.raises(StorageError, match=r"is damaged.*--fresh --keep-readable"):
         run(FakePlan(), tmp_path)
     assert snapshot(tmp_path) == before
 
@@ -563,7 +565,7 @@ def test_the_shipped_quickstart_gives_the_same_bytes_from_any_number_of_jobs(tmp
         assert (summary.missing, summary.failed) == (0, 0)
     assert sealed(tmp_path / "1") == sealed(tmp_path / "2")
     keys = [key for task in plan.tasks() for key, _, _ in plan.keys(task)]
-    assert {key.id for key in keys} == set(load_estimates(tmp_path / "1")["id"])
+    assert {key.id for key in keys} == set(read_estimates(tmp_path / "1")["id"])
     assert (tmp_path / "1" / "spec.yaml").read_text() == (ROOT / "configs" / "quickstart.yaml").read_text()
 
 

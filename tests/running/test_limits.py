@@ -20,7 +20,7 @@ from ctid_cli.running.hindrances import advice
 from ctid_cli.running.limits import Limits, usage
 from ctid_cli.running.pool import cause_of
 from ctid_cli.running.stopping import StopAt
-from ctid_cli.storage.store import load_estimates
+from ctid_cli.storage.estimates import read_estimates
 from tests.running.fakes import FakePlan, Toy
 from tests.running.hostile import Hostile
 
@@ -38,13 +38,13 @@ def toys(*hostile: Toy, runs: int = 3, **options: Any) -> Any:
 
 def failures(place: Path) -> dict[tuple[str, int, str], str]:
     """Status of what did not converge, by estimator, replicate and start."""
-    frame = load_estimates(place)
+    frame = read_estimates(place)
     bad = frame[frame["status"] != "CONVERGED"]
     return dict(zip(zip(bad["estimator"], bad["replicate"], bad["start"], strict=True), bad["status"], strict=True))
 
 
 def messages(place: Path) -> set[str]:
-    frame: pd.DataFrame = load_estimates(place)
+    frame: pd.DataFrame = read_estimates(place)
     return set(frame["message"][frame["status"] != "CONVERGED"])
 
 
@@ -81,7 +81,7 @@ def test_what_is_finished_of_a_data_set_is_stored_while_the_rest_goes_on(tmp_pat
     stop = StopAt(seconds=4)
     summary = run(toys(Hostile("sleep", at=0, order=5), runs=1), tmp_path, jobs=1, stop=stop, on_event=seen.append)
     assert (summary.computed, summary.stopped_by, summary.exit_code) == (2, "time budget", 5)
-    assert set(load_estimates(tmp_path)["estimator"]) == {"toy0"}
+    assert set(read_estimates(tmp_path)["estimator"]) == {"toy0"}
     assert any(isinstance(event, events.Stopping) and event.reason == "time budget" for event in seen)
 
 
@@ -145,7 +145,7 @@ def test_texts_that_no_file_can_hold_are_stored_readably(tmp_path: Path) -> None
         r"ValueError: half a character: \ud83d, a \x00 and\x1b[31m red",
         "SpeechlessError: (its text cannot be made)",
     }
-    assert len(load_estimates(tmp_path)) == 18
+    assert len(read_estimates(tmp_path)) == 18
 
 
 @pytest.mark.parametrize(
@@ -189,9 +189,9 @@ def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_p
     assert done.stdout == "ready\n"
     assert "18 are missing" in done.stderr
     assert "Too many open files). What helps: raise the number of open files ('ulimit -n" in done.stderr
-    assert len(load_estimates(tmp_path / "toys")) == 0
+    assert len(read_estimates(tmp_path / "toys")) == 0
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, len(load_estimates(tmp_path / "toys"))) == (0, 18)
+    assert (done.returncode, len(read_estimates(tmp_path / "toys"))) == (0, 18)
 
 
 @pytest.mark.parametrize(("at_most", "least"), [(1, 1), (3, 3)])

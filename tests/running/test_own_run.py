@@ -12,7 +12,7 @@ from ctid_cli.running.job import Job
 from ctid_cli.running.own_check import check_components
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.store import read_stored
+from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import outcomes_of
 
 CODE = """\

@@ -27,7 +27,7 @@ from ctid_cli.running import events
 from ctid_cli.running.cell_precision import cell_precisions
 from ctid_cli.running.engine import RunSummary, preview, run_experiment
 from ctid_cli.running.stopping import StopAt
-from ctid_cli.storage.store import read_stored
+from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import FakePlan
 
 NOTHING = np.empty((5000, 0))

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import UsageError
-from ctid_cli.storage.shards import Shard, owner, ranges
+from ctid_cli.storage.manifest import Shard, owner
+from ctid_cli.storage.merge import shards_text
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 60))
@@ -32,5 +33,5 @@ def test_a_wrong_shard_is_told_how_to_write_it(text: str) -> None:
 
 
 def test_numbers_are_written_as_job_arrays_take_them() -> None:
-    assert ranges([7, 1, 3, 2]) == "1-3,7"
+    assert [shards_text(some, 9) for some in ([7, 1, 3, 2], [4])] == ["shards 1-3,7 of 9", "shard 4 of 9"]
     assert Shard.read("2/3").folder("a/b") == "a/b.shard-2-of-3"

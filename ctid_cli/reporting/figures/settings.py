@@ -18,7 +18,7 @@ from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.option_docs import option_docs
-from ctid_cli.specification.signal_sections import RegularDurationSection, TracksSection
+from ctid_cli.specification.signal_sections import RegularDurationSection
 from ctid_cli.specification.start_sections import StartsSection
 from ctid_cli.specification.system_sections import AdditiveSystemSection, SystemSection
 
@@ -32,7 +32,6 @@ _SECTIONS = {
     "recorder": Recorder,
     "signal": SumOfSinusoids,
     "data": MeasuredSource,
-    "tracks": TracksSection,
 }
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]

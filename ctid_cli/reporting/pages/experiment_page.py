@@ -23,10 +23,10 @@ from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_blocks import success_sentence
 from ctid_cli.reporting.tables import experiment_report, notes_of
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.folder import SPEC
 from ctid_cli.storage.manifest import true_values
-from ctid_cli.storage.provenance import public_sessions
-from ctid_cli.storage.stored import Rows
+from ctid_cli.storage.status import public_sessions
 
 #: What is measured of every simulated system, beside what the specification asks for.
 MEASURES = ("bias", "rmse", "coverage")
@@ -64,7 +64,7 @@ def experiment_page(results: Results, out: Path) -> str:
         reports=_tables(results),
         figures=list(_figures(results, out)),
         comparisons=list(_comparisons(results, out)),
-        outcomes=_outcomes(results.rows, out),
+        outcomes=_outcomes(results.stored, out),
         notes=notes_of(results, out),
         surprises=surprises(results),
         spec_hash=results.manifest["spec_hash"],
@@ -132,12 +132,12 @@ def _comparisons(results: Results, out: Path) -> Iterator[Report]:
             continue
 
 
-def _outcomes(rows: Rows, out: Path) -> list[dict[str, Any]]:
+def _outcomes(rows: Estimates, out: Path) -> list[dict[str, Any]]:
     """How the estimates ended that did not end well, with the command that shows one of them."""
     first: dict[tuple[str, str, str], str] = {}
     found: Counter[tuple[str, str, str]] = Counter()
     well = np.isin(rows.column("status"), [status.encode() for status in SUCCESSES])
-    for row in rows.chosen(~well).only("estimator", "status", "message", "id"):
+    for row in rows.chosen(~well).rows("estimator", "status", "message", "id"):
         how = (row["estimator"], row["status"], sentence_of(row))
         found[how] += 1
         first.setdefault(how, row["id"])

@@ -1,0 +1,457 @@
+"""The stored estimates of one plan, by column and by row, and as a table of pandas.
+
+However many they are: columns are arrays, read when they are asked for, and rows are made some at a time.
+
+An estimate has *converged* if it satisfies every condition of the specification's ``success``:
+
+- ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
+- ``fit_percent``: the fit on the record it was estimated from is at least this [%];
+- ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
+- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
+  counted from the start, and after its last step from that.
+
+Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
+settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
+converged and counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.errors import DamageError, StorageError, UsageError
+from ctid_cli.storage import columns
+from ctid_cli.storage import folder as place
+from ctid_cli.storage.export import (
+    MISSING,
+    ROWS,
+    AnyArray,
+    Export,
+    export_in_memory,
+    open_export,
+    sha256_of,
+)
+from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal import EXPORT
+from ctid_cli.storage.manifest import (
+    Key,
+    Manifest,
+    Slot,
+    found_values,
+    is_of_signal,
+    row_columns,
+    swept_names,
+    true_values,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Columns of the times, which are in the journal only.
+CLOCKS = ("seconds", "cpu_seconds")
+#: What parameters of an estimate are found in, and what says which of these places are filled.
+_OF_PARAMETERS = {
+    "numerator": "length",
+    "denominator": "length",
+    "delay": "",
+    "parameters": "present",
+    "standard_errors": "present",
+    "quantiles": "present",
+}
+_OF_ERRORS = ("standard_errors", "quantiles")
+#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both; None where
+#: they are not known.
+Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]] | None]
+
+
+def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
+    """Return estimates of the latest plan of an experiment, or some columns of them, as a table."""
+    return read_stored(folder).frame(names)
+
+
+def read_stored(folder: Path) -> Estimates:
+    """Return the estimates of the latest plan of an experiment."""
+    with place.reading_journal(folder) as log:
+        if log is None:
+            # There is a journal without a plan where the run was killed before it had planned anything.
+            if not (folder / EXPORT).exists():
+                raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
+            return Estimates(open_export(folder / EXPORT))
+        exported = log.exported()
+        if exported is not None and sha256_of(folder / EXPORT) == exported:
+            return Estimates(open_export(folder / EXPORT), _times_of(folder, exported))
+        log.check()
+        export = export_in_memory(log)
+        parts = {(block.cell["hash"], block.hash) for block in Estimates(export).blocks}
+        times = {part: log.times(*part) for part in parts}
+        return Estimates(export, lambda *part: times[part])
+
+
+def _times_of(folder: Path, exported: str) -> Times:
+    """Return times out of a journal, as long as that is the one of ``runs.h5``."""
+
+    def read(data_hash: str, estimator_hash: str) -> Any:
+        with place.reading_journal(folder) as log:
+            return None if log is None or log.exported() != exported else log.times(data_hash, estimator_hash)
+
+    return read
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """The rows of one estimator on one data cell."""
+
+    first: int
+    last: int
+    cell: Mapping[str, Any]
+    estimator: Mapping[str, Any]
+    #: Hash of the estimator.
+    hash: str
+
+
+class Estimates:
+    """The stored estimates of one plan, or some of them, in the order of ``runs.h5``."""
+
+    def __init__(self, export: Export, times: Times | None = None, places: range | IndexArray | None = None) -> None:
+        self.export = export
+        self._times = times
+        self._places = places
+        #: All estimates where these are some, chosen one by one.
+        self._all: Estimates = self
+        self._read: dict[str, AnyArray] = {}
+
+    @property
+    def places(self) -> range | IndexArray:
+        """Return numbers of their rows in the export."""
+        return range(self.export.count) if self._places is None else self._places
+
+    def part(self, start: int, stop: int) -> Estimates:
+        """Return some that follow each other, whose columns are read without those of others."""
+        return self._some(self.places[start:stop])
+
+    def chosen(self, which: BoolArray | IndexArray) -> Estimates:
+        """Return some of them, whose columns are taken out of those of all."""
+        some = self._some(np.asarray(self.places)[which])
+        some._all = self._all
+        return some
+
+    def _some(self, places: range | IndexArray) -> Estimates:
+        return Estimates(self.export, self._times, places)
+
+    @property
+    def manifest(self) -> Manifest:
+        """Return the plan."""
+        return self.export.manifest
+
+    @property
+    def origins(self) -> tuple[Origin, ...]:
+        """Return where they come from."""
+        return self.export.origins
+
+    @property
+    def mixed(self) -> bool:
+        """Return whether several versions of the code, or platforms, computed what is compared here."""
+        return len(self.origins) > 1
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    # --- columns ----------------------------------------------------------------------------------------------------
+
+    def has(self, name: str) -> bool:
+        """Return whether there is such a column."""
+        return name in CLOCKS or self.export.has(name)
+
+    def column(self, name: str) -> AnyArray:
+        """Return a column as an array."""
+        if self._all is not self:
+            return np.asarray(self._all.column(name)[self.places])
+        if name not in self._read:
+            if name in CLOCKS:
+                self._read |= zip(CLOCKS, self._clocks(), strict=True)
+            else:
+                self._read[name] = self._span(lambda first, last: self.export.read(name, first, last))
+        return self._read[name]
+
+    def _span(self, read: Callable[[int, int], Any]) -> Any:
+        """Return what is read of the rows from the first to the last of them, without those between."""
+        places = self.places
+        if not len(places):
+            return read(0, 0)
+        first, last = int(places[0]), int(places[-1]) + 1
+        found = read(first, last)
+        if last - first == len(places):
+            return found
+        inside = np.asarray(places) - first
+        return found[inside] if isinstance(found, np.ndarray) else [found[k] for k in inside.tolist()]
+
+    def values(self, name: str) -> list[Any]:
+        """Return a column as it is in rows: None where there is no value."""
+        known = {column.name: column for column in columns.COLUMNS}
+        if name not in known:
+            return self._by_block(lambda block: {**block.cell["swept"], **block.estimator["swept"]}.get(name))
+        if name in CLOCKS:
+            return [None if value != value else value for value in self.column(name).tolist()]
+        if name == "experiment":
+            return [self.manifest["experiment"]] * len(self)
+        if name == "initial_delay":
+            return [self.manifest["starts"].get(start) for start in self.values("start")]
+        if name == "true_delay":
+            return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
+        if name == "converged":
+            found = self._judged
+            return [value for part in found for value in ([None] * part if isinstance(part, int) else part.tolist())]
+        values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
+        if name == "standard_errors" and self.has("denominator"):
+            # An estimate with a model has a table of errors, if an empty one.
+            models = (self.column("denominator_length") != MISSING).tolist()
+            values = [value or ({} if there else None) for value, there in zip(values, models, strict=True)]
+        return values
+
+    def _by_block(self, value: Callable[[Block], Any]) -> list[Any]:
+        return [one for block in self.blocks for one in [value(block)] * (block.last - block.first)]
+
+    def _clocks(self) -> tuple[Array, Array]:
+        """Return times of the estimates [s]; NaN where they are not known."""
+        found = np.full((2, len(self)), np.nan)
+        if self._times is not None and len(self):
+            replicates, starts = self.column("replicate").tolist(), self.values("start")
+            for block in self.blocks:
+                times = self._times(block.cell["hash"], block.hash)
+                inside = range(block.first, block.last)
+                if times is not None:
+                    try:
+                        pairs = [times[replicates[k], starts[k]] for k in inside]
+                    except KeyError as error:
+                        lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
+                        raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
+                    found[:, inside] = np.array(pairs, dtype=float).T
+        return found[0], found[1]
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Return the rows of every estimator on every data cell, which follow each other."""
+        known = {(part["hash"], part["name"]): part for part in self.manifest["estimators"]}
+        cells = {cell["hash"]: cell for cell in self.manifest["data_cells"]}
+        parts = [self.column(name) for name in ("estimator_hash", "estimator", "cell")]
+        differs: BoolArray = np.zeros(max(len(self) - 1, 0), dtype=bool)
+        for part in parts:
+            differs |= part[1:] != part[:-1]
+        places = [*([0] if len(self) else []), *(np.flatnonzero(differs) + 1).tolist(), len(self)]
+        found = []
+        for first, last in pairwise(places):
+            estimator, name, cell = (part[first].decode() for part in parts)
+            if cell not in cells or (estimator, name) not in known:
+                what = f"estimates of {name} on the data cell {cell} are stored that the plan does not have"
+                raise StorageError(f"{self.export.path}: {what}")
+            found.append(Block(first, last, cells[cell], known[estimator, name], estimator))
+        return found
+
+    @property
+    def failures(self) -> BoolArray:
+        """Return which of them failed."""
+        return np.isin(self.column("status"), [name.encode() for name in columns.FAILURES])
+
+    # --- comparison with the truth ----------------------------------------------------------------------------------
+
+    @cached_property
+    def _truths(self) -> dict[str, dict[str, float]]:
+        """Return True values by name of every data cell."""
+        if self._all is not self:
+            return self._all._truths
+        try:
+            return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
+        # Somebody else may have written the plan.
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
+
+    @property
+    def converged(self) -> BoolArray | None:
+        """Return which of them satisfy the rule of success; None where there is none for all of them."""
+        known = [part for part in self._judged if not isinstance(part, int)]
+        return np.concatenate(known) if known and len(known) == len(self._judged) else None
+
+    @cached_property
+    def _judged(self) -> list[BoolArray | int]:
+        """Return by block which of the estimates satisfy the rule; where there is none, their number."""
+        success = self.manifest["success"]
+        if not success:
+            return [block.last - block.first for block in self.blocks]
+        failures, fits = self.failures, self.column("fit_percent")
+        measures = self.values("measures") if success.get("band") is not None else None
+        found: list[BoolArray | int] = []
+        for block in self.blocks:
+            own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
+            values = dict(zip(truth, self._found(own, tuple(truth), errors=False)[0].T, strict=True))
+            hits = judged(success, truth, failures[own], values, fits[own], measures and measures[own])
+            found.append(block.last - block.first if hits is None else hits)
+        return found
+
+    def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
+        """Return values, standard errors and quantiles under the true names, NaN where none is, shape (n, p)."""
+        return self._found(slice(None), names)
+
+    def _found(self, own: slice, names: Sequence[str], *, errors: bool = True) -> tuple[Array, Array, Array]:
+        """Return `found` of some of them, or its values only.
+
+        Rows that have the same form take their numbers from the same places: what `found_values` says of places.
+        """
+        there = [name for name in _OF_PARAMETERS if self.has(name) and (errors or name not in _OF_ERRORS)]
+        names_of_forms = [f"{name}_{_OF_PARAMETERS[name]}" for name in there if _OF_PARAMETERS[name]]
+        held = {name: self.column(name)[own] for name in (*there, *names_of_forms)}
+        count = len(range(len(self))[own])
+        forms = [held[name].reshape(count, -1) for name in names_of_forms]
+        form: AnyArray = np.hstack(forms) if forms else np.zeros((count, 1), dtype=int)
+        targets = np.full((3, count, len(names)), np.nan)
+        left = np.ones(count, dtype=bool)
+        while left.any():
+            some = int(left.argmax())
+            alike = left & (form == form[some]).all(axis=1)
+            row = self._places_in(some, held)
+            for target, places in zip(targets, found_values(row, names), strict=True):
+                for k, name in enumerate(names):
+                    at = places[name]
+                    if isinstance(at, tuple):
+                        target[alike, k] = held[at[0]].reshape(count, -1)[alike, at[1]]
+                    elif at is not None:
+                        target[alike, k] = at
+            left &= ~alike
+        return targets[0], targets[1], targets[2]
+
+    def _places_in(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
+        """Return one of some rows with the places of its numbers in their place."""
+        row: dict[str, Any] = {"delay": ("delay", 0) if "delay" in held else None}
+        for name, form in _OF_PARAMETERS.items():
+            if form and name in held:
+                there = held[f"{name}_{form}"][number]
+                if form == "length":
+                    row[name] = None if there < 0 else [(name, k) for k in range(there)]
+                else:
+                    row[name] = {part: (name, k) for k, part in enumerate(self.export.parts(name)) if there[k]} or None
+        return row
+
+    # --- rows -------------------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> list[str]:
+        """Return names of what a row has."""
+        own = [column.name for column in row_columns(self.manifest)]
+        compared = [column.name for column in columns.COLUMNS if column.source == "truth"]
+        return [*own, *swept_names(self.manifest), *compared]
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return self.rows()
+
+    def rows(self, *names: str) -> Iterator[dict[str, Any]]:
+        """Yield all of them one after the other, or some columns of them; some thousand are read at a time."""
+        for start in range(0, self.export.count, ROWS):
+            inside = slice(*np.searchsorted(np.asarray(self.places), (start, start + ROWS)))
+            some = self.part(inside.start, inside.stop)
+            if len(some):
+                fields = {name: some.values(name) for name in names or self.names}
+                yield from (dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True))
+
+    def slot(self, number: int) -> Slot:
+        """Return what an estimate is of."""
+        (block,) = (block for block in self.blocks if block.first <= number < block.last)
+        start, replicate = self.column("start")[number].decode(), int(self.column("replicate")[number])
+        return Slot(Key(block.cell["hash"], replicate, block.hash, start), block.cell, block.estimator)
+
+    @cached_property
+    def results(self) -> dict[Key, dict[str, Any]]:
+        """Return all results by key."""
+        return dict(zip(self.export.keys(), self.export.results(0, self.export.count), strict=True))
+
+    def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
+        """Return all of them as a table, with the units of its columns; the types of swept fields may be given."""
+        import pandas as pd
+
+        # Where there is no system, the columns of one would be empty.
+        left_out = "systems" if is_of_signal(self.manifest) else ""
+        known = {c.name: c for c in columns.COLUMNS}
+        shown = [n for n in names or self.names if n not in known or known[n].of != left_out]
+        dtypes = {name: known[name].dtype if name in known else (types or {}).get(name) for name in shown}
+        frame = pd.DataFrame({name: pd.Series(self.values(name), dtype=dtype) for name, dtype in dtypes.items()})
+        frame.attrs["mixed"] = self.mixed
+        frame.attrs["units"] = {name: known[name].unit for name in shown if name in known and known[name].unit}
+        return frame
+
+
+# --- success and flat tables ----------------------------------------------------------------------------------------
+
+
+def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, truth: Mapping[str, float]) -> bool | None:
+    """Return whether an estimate satisfies the success rule, from the true values by name."""
+    found = {name: _array(value) for name, value in found_values(row, truth)[0].items()}
+    failures = np.array([row["status"] in columns.FAILURES])
+    hits = judged(success, truth, failures, found, _array(row.get("fit_percent")), [row.get("measures")])
+    return None if hits is None else bool(hits[0])
+
+
+def _array(value: float | None) -> Array:
+    return np.array([value], dtype=np.float64)
+
+
+def judged(
+    success: Mapping[str, Any] | None,
+    truth: Mapping[str, float],
+    failures: BoolArray,
+    found: Mapping[str, Array],
+    fit_percent: Array,
+    measures: Sequence[Mapping[str, float | None] | None] | None,
+) -> BoolArray | None:
+    """Return which estimates satisfy the success rule: from what they found by name, NaN where there is nothing."""
+    rule = success or {}
+    conditions: list[BoolArray] = []
+    if rule.get("delay_relative_error") is not None and "delay" in truth:
+        conditions.append(_near(found["delay"], truth["delay"], rule["delay_relative_error"]))
+    others = truth.keys() - {"delay"}
+    if rule.get("parameter_relative_error") is not None and others:
+        conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
+    if rule.get("band") is not None and measures is not None:
+        from ctid_cli.simulation.frequency_measures import is_settled
+
+        conditions.append(np.array([is_settled(one, rule["band"], rule.get("by")) for one in measures], dtype=bool))
+    if rule.get("fit_percent") is not None:
+        conditions.append(fit_percent >= rule["fit_percent"])
+    return np.logical_and.reduce([~failures, *conditions]) if conditions else None
+
+
+def _near(values: Array, true: float, tolerance: float) -> BoolArray:
+    return np.abs(values - true) <= tolerance * abs(true)
+
+
+def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
+    """Return estimates as a flat table for other programs, with one number per cell."""
+    import pandas as pd
+
+    parts = {column.name: column for column in columns.COLUMNS if column.type in ("coefficients", "by name")}
+    flat: dict[str, Any] = {}
+    for name in estimates.columns:
+        if name not in parts:
+            flat[name] = estimates[name]
+            continue
+        for part, values in _parts(parts[name], estimates[name]):
+            key, column = f"{parts[name].prefix}{part}", pd.Series(values, dtype="float64", index=estimates.index)
+            # Parameters that make a model are its coefficients too; other names that are taken get a longer one.
+            if key in estimates.columns and key != "delay":
+                key = f"parameters.{key}"
+            flat[key] = flat[key].combine_first(column) if key in flat else column
+    return pd.DataFrame(flat)
+
+
+def _parts(column: columns.Column, cells: Iterable[Any]) -> Iterator[tuple[Any, list[float | None]]]:
+    """Yield the parts of a column with several numbers in a cell, each with its values."""
+    # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
+    rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in cells]
+    found: list[Any] = column.names(rows) if column.type == "by name" else []
+    for part in found or sorted({k for row in rows for k in row if k or column.name != "denominator"}):
+        yield part, [row.get(part) for row in rows]

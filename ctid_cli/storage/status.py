@@ -1,0 +1,195 @@
+"""How much of an experiment is stored, and where one estimate is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.errors import UsageError
+from ctid_cli.storage import columns
+from ctid_cli.storage import folder as place
+from ctid_cli.storage.estimates import Estimates, read_stored
+from ctid_cli.storage.folder import InUseError
+from ctid_cli.storage.identity import as_text
+from ctid_cli.storage.manifest import Manifest, Planned, Slot, planned_parts, shard_of
+
+#: A data cell and an estimator by their hashes.
+Part = tuple[str, str]
+#: What may be published of a run: nothing that names a machine, a user or a folder.
+PUBLIC = ("jobs", "processors", "numeric_platform", "packages")
+
+
+@dataclass(frozen=True)
+class FoundEstimate:
+    """One estimate among those of its plan."""
+
+    folder: Path
+    #: It alone.
+    stored: Estimates
+
+    @cached_property
+    def row(self) -> dict[str, Any]:
+        """Return its row."""
+        return next(self.stored.rows())
+
+    @cached_property
+    def slot(self) -> Slot:
+        """Return what it is of."""
+        return self.stored.slot(0)
+
+
+def find_estimate(results: Path, prefix: str) -> FoundEstimate:
+    """Find one estimate among all experiments."""
+    matches: dict[str, FoundEstimate] = {}
+    in_use = ""
+    for folder in place.experiment_folders(results):
+        try:
+            stored = read_stored(folder)
+        except InUseError as error:
+            in_use = f"; it may come later: {error}"
+            continue
+        ids = stored.column("id")
+        for number in np.flatnonzero(np.char.startswith(ids, prefix.encode())).tolist():
+            matches.setdefault(ids[number].decode(), FoundEstimate(folder, stored.part(number, number + 1)))
+    if not matches:
+        raise UsageError(f"no id in {results} begins with {prefix!r}{in_use}; 'ctid export' lists all ids")
+    if len(matches) > 1:
+        some = ", ".join(sorted(matches)[:5])
+        raise UsageError(f"{len(matches)} estimates have an id that begins with {prefix!r}: {some}…; give more of it")
+    return next(iter(matches.values()))
+
+
+def spec_folder(folder: Path) -> Path | None:
+    """Return folder of the specification that an experiment was last run with."""
+    with place.reading_journal(folder) as log:
+        infos = [] if log is None else [session.info for session in log.sessions()]
+    return next((Path(info["spec_folder"]) for info in reversed(infos) if "spec_folder" in info), None)
+
+
+def public_sessions(folder: Path) -> list[dict[str, Any]]:
+    """Return the runs that computed an experiment, as far as they may be published."""
+    with place.reading_journal(folder) as log:
+        if log is None:
+            return []
+        counts, sessions = log.counts(), log.sessions()
+    return [
+        {
+            "started": session.started,
+            "stopped": session.stopped,
+            "computed": sum(count for (id, _), count in counts.items() if id == session.id),
+            "failed": sum(counts[session.id, status] for status in columns.FAILURES),
+            "code_version": session.origin.code_version,
+            **{key: session.info.get(key) for key in PUBLIC},
+        }
+        for session in sessions
+    ]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How many estimates are asked for, are stored, and are stored as failures."""
+
+    planned: int
+    done: int
+    failed: int
+
+    @property
+    def todo(self) -> int:
+        """Return estimates that are still to be computed."""
+        return self.planned - self.done
+
+
+@dataclass(frozen=True)
+class GroupStatus(Progress):
+    """Progress of one estimator on one data cell."""
+
+    estimator: str
+    cell: str
+    swept: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ExperimentStatus(Progress):
+    """Progress of an experiment."""
+
+    experiment: str
+    folder: Path
+    left_aside: int | None
+    mixed: bool
+    running: dict[str, Any] | None
+    groups: tuple[GroupStatus, ...]
+    #: Which shard it is, of how many; None for all of an experiment.
+    shard: tuple[int, int] | None = None
+
+
+def experiment_status(folder: Path) -> ExperimentStatus:
+    """Count what is done and what is missing."""
+    done: Counter[Part] = Counter()
+    failed: Counter[Part] = Counter()
+    try:
+        with place.reading_journal(folder) as log:
+            if log is not None:
+                manifest, aside = log.manifest(), 0
+                planned = Planned(manifest)
+                for row in log.rows():
+                    if row.key in planned:
+                        done[row.data_hash, row.estimator_hash] += 1
+                        failed[row.data_hash, row.estimator_hash] += row.status in columns.FAILURES
+                    else:
+                        aside += 1
+                running = _running(folder) if log.live else None
+                return _status(folder, manifest, done, failed, aside, len(log.origins()) > 1, running)
+        stored = read_stored(folder)
+        for block in stored.blocks:
+            part = (block.cell["hash"], block.hash)
+            done[part], failed[part] = block.last - block.first, int(stored.failures[block.first : block.last].sum())
+        return _status(folder, stored.manifest, done, failed, None, stored.mixed, None)
+    except InUseError:
+        # A run that is just beginning has nothing to read yet.
+        running = _running(folder)
+        name = str(running.get("experiment") or folder.name)
+        return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
+
+
+def _running(folder: Path) -> dict[str, Any]:
+    """Return who runs, how far it is, how fast, and when it will have ended at that speed."""
+    running = place.who_runs(folder)
+    if running is None:
+        return {"pid": None, "host": None}
+    about: dict[str, Any] = {"data_sets_per_second": None, "expected_end": None}
+    with suppress(KeyError, TypeError, ValueError, OverflowError):
+        present = datetime.now(UTC)
+        elapsed = (present - datetime.fromisoformat(running["started"])).total_seconds()
+        if running["done"] > 0 and elapsed > 0:
+            speed = running["done"] / elapsed
+            left = timedelta(seconds=(running["total"] - running["done"]) / speed)
+            about = {"data_sets_per_second": speed, "expected_end": as_text(present + left)}
+    return running | about
+
+
+def _status(
+    folder: Path,
+    manifest: Manifest,
+    done: Mapping[Part, int],
+    failed: Mapping[Part, int],
+    left_aside: int | None,
+    mixed: bool,
+    running: dict[str, Any] | None,
+) -> ExperimentStatus:
+    groups = []
+    for estimator, cell, replicates in planned_parts(manifest):
+        part = (cell["hash"], estimator["hash"])
+        counts = (len(replicates) * len(estimator["starts"]), done.get(part, 0), failed.get(part, 0))
+        groups.append(GroupStatus(*counts, estimator["name"], cell["hash"], {**cell["swept"], **estimator["swept"]}))
+    counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
+    name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)
+    shard = None if dealt is None else (dealt.number, dealt.of)
+    return ExperimentStatus(*counts, name, folder, left_aside, mixed, running, found_groups, shard)
