@@ -3,18 +3,16 @@
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 from ctid_cli.running.cells import DataCell, DataCells, EstimatorCell, Plan, starts_of
-from ctid_cli.signals.recorder import Recorder
-from ctid_cli.simulation.dataset import SimulatedSource, Source, located
+from ctid_cli.simulation.components import CustomEstimation, is_custom
+from ctid_cli.simulation.dataset import Source, located
 from ctid_cli.simulation.frequency_measures import Measuring
 from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
-from ctid_cli.simulation.own_components import OwnSystem
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
 from ctid_cli.specification.start_points import NO_START, start_points
@@ -79,28 +77,19 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            if isinstance(options["system"], OwnSystem):
-                truth, own = content["system"]["truth"], content["system"]
+            if is_custom(options["system"]):
+                truth, system = content["system"]["truth"], content["system"]
                 # The name of an option stands for its value.
-                own["truth"] = {name: own[value] if isinstance(value, str) else value for name, value in truth.items()}
-            fresh = "fresh_fit" in (spec.measures or ())
+                system["truth"] = {
+                    name: system[value] if isinstance(value, str) else value for name, value in truth.items()
+                }
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
-            content |= {"fresh_fit": True} if fresh else {}
-            # Any seed will do where nothing is random.
-            source = _simulated_source(options, seed or 0, folder, fresh=fresh)
+            content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
+            source = spec.simulated_source(options, folder)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         return DataCell(content, content_hash(content), swept, source)
 
     return DataCells(math.prod(map(len, ways)), make)
-
-
-def _simulated_source(options: Mapping[str, Any], seed: int, folder: Path, *, fresh: bool) -> SimulatedSource:
-    """What simulates the data sets of a cell, from the options of its sections."""
-    sampling, loop = options["sampling"], options.get("loop")
-    if loop is not None:
-        loop = dataclasses.replace(loop, reference=located(loop.reference, folder)).at(sampling.interval)
-    excitation, recorder = located(options.get("excitation"), folder), options.get("recorder", Recorder())
-    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, recorder, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -115,8 +104,11 @@ def _measuring(spec: Spec) -> Measuring:
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
-    of_frequencies = content["kind"] in KINDS["frequency_estimator"]
-    estimator = FrequencyEstimation(variant.options) if of_frequencies else variant.options
+    estimator = variant.options
+    if is_custom(estimator):
+        estimator = CustomEstimation(estimator)
+    elif content["kind"] in KINDS["frequency_estimator"]:
+        estimator = FrequencyEstimation(estimator)
     return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.models.additive import Term
+from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
-from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
+from ctid_cli.specification.checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Variant, over, variants
-from ctid_cli.specification.signal_checks import signal_warnings
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -28,7 +28,7 @@ ON_TIME = 1e-6
 def joint_warnings(spec: Spec) -> list[Complaint]:
     """What is allowed but unwise."""
     if spec.signal is not None:
-        return signal_warnings(spec)
+        return _signal_warnings(spec)
     warnings = [] if spec.system is None else _simulation_warnings(spec)
     if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.most > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
@@ -52,16 +52,16 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
     """What is unwise where the truth is known."""
     warnings: list[Complaint] = []
-    if spec.noise is not None and not getattr(spec.noise, "own", False):
+    if spec.noise is not None and not spec.noise.custom:
         for name, section in spec.estimators.items():
             at = ("estimators", name)
             warnings += over({("noise",): variants(spec.noise), at: variants(section)}, partial(_of_white_formula, at))
-    # What is one's own is asked in a worker process only.
-    samplings = [] if getattr(spec.sampling, "own", False) else variants(spec.sampling)
-    if spec.excitation is not None and not getattr(spec.excitation, "own", False):
+    # Custom components are tried in a process of their own only.
+    samplings = [] if spec.sampling is None or spec.sampling.custom else variants(spec.sampling)
+    if spec.excitation is not None and not spec.excitation.custom:
         told: dict[KeyPath, list[Variant]] = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
         warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
-    # A system of one's own need not have poles.
+    # A custom system need not have poles.
     systems = [case for case in variants(spec.system) if hasattr(case.options, "poles")]
     if not systems:
         return warnings
@@ -172,3 +172,31 @@ def _degrees(model: Any) -> tuple[int, int] | None:
 def _fraction_degrees(terms: Sequence[Term]) -> tuple[int, int]:
     order = sum(term.order for term in terms)
     return order, max(order - term.order + term.zeros for term in terms)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Frequencies of a signal
+
+
+def _signal_warnings(spec: Spec) -> list[Complaint]:
+    """What is allowed but unwise in an experiment on a signal."""
+    signal = variants(spec.signal)[0].options
+    warnings: list[Complaint] = []
+    for name, section in spec.estimators.items():
+        at, cases = ("estimators", name), variants(section)
+        warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
+        warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
+        if not cases[0].options.online and signal.frequency_steps:
+            warnings.append(((*at, "kind"), "gives one estimate of the whole record, in which a frequency steps"))
+    return warnings
+
+
+def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
+    if hasattr(options, "h") and highest > math.pi / options.h:
+        limit = f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s"
+        yield (*at, "h"), f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+
+
+def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    for note in options.start(clock.interval).notes if options.online else ():
+        yield (*at, "h"), note

@@ -1,7 +1,9 @@
-"""What is wrong with a value, in sentences: the one table from pydantic's errors to our own."""
+"""What is wrong with a value, in sentences, and what docstrings say about options: the words of all messages."""
 
+import inspect
 import re
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 from pydantic import ValidationError
@@ -39,7 +41,6 @@ SENTENCES = {
     "too_long": "must be a list of at most {max_length}, not {shown}{meaning}",
     "model_type": "must be a mapping with the keys {keys}, not {shown}",
     "extra_forbidden": "there is no such key here{near} allowed: {keys}",
-    "search_retired": "is no longer needed: there is one search now; delete this line",
     "missing": "is missing; add it{meaning}",
     "no_kind": "must be one of {allowed}, not {shown}",
     "kind_missing": "is missing; allowed: {allowed}",
@@ -69,7 +70,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in parts
-    path, kind, value, context = _told(path, kind, value, context, descriptions)
+    path, kind, value, context = _told(path, kind, value, context)
     if kind not in SENTENCES:
         return path, error["msg"], at_key
     words = _words(path, descriptions) | {"shown": shown(value)} | context
@@ -79,9 +80,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
 
 
-def _told(
-    path: KeyPath, kind: str, value: Any, context: dict[str, Any], descriptions: Mapping[str, str]
-) -> tuple[KeyPath, str, Any, dict[str, Any]]:
+def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tuple[KeyPath, str, Any, dict[str, Any]]:
     """What is to be told of an error, where pydantic's own type, or place, says too little."""
     if kind == "no_kind" and not isinstance(value, Mapping):
         text = f"a mapping with a 'kind' (one of {context['allowed']})"
@@ -92,8 +91,6 @@ def _told(
     if kind == "float_type" and type(value) is int:
         # An integer beyond all floating-point numbers.
         return path, "finite_number", float("inf"), context
-    if kind == "extra_forbidden" and path == ("search",) and "delay_bounds" in descriptions:
-        return path, "search_retired", value, context
     return path, kind, value, context
 
 
@@ -123,6 +120,20 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
     if kind in ("literal_error", "no_kind") and isinstance(value, str):
         return did_you_mean(value, words["allowed"].replace("'", "").split(", "))
     return ""
+
+
+@cache
+def option_docs(target: type) -> dict[str, str]:
+    """The text about every option of a class and its bases, by name: the section Parameters of their docstrings."""
+    docs: dict[str, str] = {}
+    for base in reversed(target.__mro__):
+        text = inspect.cleandoc(base.__dict__.get("__doc__") or "")
+        section = re.search(r"^Parameters\n-+\n(.*?)(?=\n\n\S[^\n]*\n-{3,}|\Z)", text, re.DOTALL | re.MULTILINE)
+        for entry in re.split(r"\n(?=\S)", section[1]) if section else ():
+            head, _, body = entry.partition("\n")
+            plain = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", body).replace("``", "")
+            docs |= dict.fromkeys(head.partition(" : ")[0].split(", "), " ".join(plain.split()))
+    return docs
 
 
 def shown(value: Any) -> str:

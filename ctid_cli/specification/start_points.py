@@ -14,7 +14,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.streams import stream
 
 if TYPE_CHECKING:
-    from ctid_cli.specification.start_sections import StartsSection
+    from ctid_cli.specification.system_sections import StartsSection
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def additive_form(model: TransferFunction | AdditiveModel) -> AdditiveModel:
 def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
     """The starts that a specification names."""
     # A worker draws starts and never reads a section, which would take it half a second to import.
-    from ctid_cli.specification.start_sections import RelativeStart, UniformStart
+    from ctid_cli.specification.system_sections import RelativeStart, UniformStart
 
     if section is None:
         return ()

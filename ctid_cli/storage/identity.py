@@ -29,7 +29,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Self, TypeGuard
 
-from ctid_cli import own_code
+from ctid_cli import custom_code
 from ctid_cli.canonical import content_hash
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,9 +38,7 @@ COMPUTING_FLOORS = {"arrays", "signals", "models", "filtering"}
 COMPUTING_FLOORS |= {"inference", "estimation", "estimators", "frequency", "simulation"}
 #: Modules of other floors that every estimate goes through.
 PATH = (
-    *("ctid_cli.specification.system_sections", "ctid_cli.specification.loop_section"),
-    *("ctid_cli.specification.signal_sections", "ctid_cli.specification.start_sections"),
-    *("ctid_cli.specification.option_sections", "ctid_cli.specification.start_points"),
+    *("ctid_cli.specification.system_sections", "ctid_cli.specification.start_points", "ctid_cli.specification.spec"),
     *("ctid_cli.running.plan", "ctid_cli.running.cells", "ctid_cli.running.job", "ctid_cli.canonical"),
 )
 #: Libraries whose version decides what is computed.
@@ -115,7 +113,7 @@ def modules_behind(names: Iterable[str], root: Path = ROOT) -> dict[str, str]:
         name = waiting.pop()
         if name in found or name in own:
             continue
-        source = own_code.source_of(name)
+        source = custom_code.source_of(name)
         if source is None:
             found[name], imports = _tree(name, root)
         else:
@@ -131,7 +129,7 @@ def modules_of(value: Any) -> set[str]:
     return {type(value).__module__}.union(*(modules_of(part) for part in parts if dataclasses.is_dataclass(part)))
 
 
-def _own_tree(source: own_code.Source, name: str, root: Path) -> tuple[str, list[str]]:
+def _own_tree(source: custom_code.Source, name: str, root: Path) -> tuple[str, list[str]]:
     """The same as `_tree` of a module of one's own; one without a readable source counts by its bytes."""
     try:
         digest = hashlib.sha256(ast.dump(_Reduced().visit(ast.parse(source.content))).encode()).hexdigest()
@@ -140,13 +138,13 @@ def _own_tree(source: own_code.Source, name: str, root: Path) -> tuple[str, list
     if source.data:
         digest = content_hash([digest, source.data])
     imports = []
-    for other in sorted(own_code.imports_of(source, name)):
+    for other in sorted(custom_code.imports_of(source, name)):
         package, _, attribute = other.rpartition(".")
         # Names that the package gives away are those of a module further down.
         module = getattr(sys.modules[package], attribute, None) if package == "ctid_cli" else None
         imports.append(getattr(module, "__module__", other))
     computing = [other for other in imports if _is_computing(other) and _file_of(other, root).is_file()]
-    return digest, computing + [other for other in imports if own_code.source_of(other) is not None]
+    return digest, computing + [other for other in imports if custom_code.source_of(other) is not None]
 
 
 def _is_computing(name: str) -> bool:

@@ -214,29 +214,6 @@ def test_canonical_form_comes_back(tmp_path):
     assert build_plan(again).data_cells[0].hash == build_plan(spec).data_cells[0].hash
 
 
-def test_what_is_new_leaves_no_trace_where_it_is_not_used(tmp_path):
-    text = """\
-experiment: plain
-system: {numerator: [1], denominator: [1, 1], delay: 1.0}
-excitation: {kind: gaussian}
-sampling: {kind: regular, interval: 0.1, samples: 100}
-noise: {kind: white, standard_deviation: 1}
-estimators: {one: {kind: td_srivc, poles: 1, zeros: 0, delay_bounds: [0, 2]}}
-starts: {initial_delay: 1}
-monte_carlo: {runs: 1, seed: 1}
-success: {delay_relative_error: 0.1}
-"""
-    canonical = load(tmp_path, text).canonical()
-    assert canonical.keys() == {
-        *("experiment", "system", "excitation", "sampling", "noise", "data", "estimators", "starts", "monte_carlo"),
-        "success",
-    }
-    assert canonical["system"].keys() == {"numerator", "denominator", "delay"}
-    assert canonical["noise"] == {"kind": "white", "snr_db": None, "standard_deviation": 1.0}
-    assert canonical["starts"] == {"initial_delay": [1.0]}
-    assert canonical["success"] == {"delay_relative_error": 0.1, "fit_percent": None}
-
-
 @pytest.mark.parametrize(
     "override",
     [

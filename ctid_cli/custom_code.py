@@ -1,4 +1,4 @@
-"""Code of one's own: classes that a specification names by file or module, or that packages offer as entry points.
+"""Custom code: classes that a specification names by file or module.
 
 Files are read once and served to imports as they were read, in this process and in its workers: a run ends with the
 code that it began with, whatever happens to the files meanwhile.
@@ -14,7 +14,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -24,13 +24,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
-#: Part of a specification to the group of entry points that offers kinds for it.
-GROUPS = {name: f"ctid.{name}s" for name in ("estimator", "excitation", "noise", "sampling", "system")}
+#: Letters of the text that names a class.
+MAX_LENGTH = 200
 _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 
-class OwnCodeError(ValueError):
-    """Code of one's own that cannot be used, and why."""
+class CustomCodeError(ValueError):
+    """Custom code that cannot be used, and why."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Source:
                 data.append((name, hashlib.sha256((file.parent / name).read_bytes()).hexdigest()))
             except OSError as error:
                 text = f"{name}, which FILES in {file.name} names, cannot be read: {error.strerror}"
-                raise OwnCodeError(text) from None
+                raise CustomCodeError(text) from None
         return cls(str(file), content, tuple(data))
 
     @property
@@ -61,42 +61,29 @@ class Source:
         return Path(self.path).name == "__init__.py"
 
 
-def find_class(kind: str, folder: Path) -> Any:
-    """What ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
+def find_class(kind: str, folder: Path) -> type[Any]:
+    """Return the class that ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
     place, _, name = kind.rpartition(":")
-    if not place or not name.isidentifier():
-        raise OwnCodeError(f"{kind!r} names no code; write './file.py:Class' or 'package.module:Class'")
+    if not place or not name.isidentifier() or len(kind) > MAX_LENGTH:
+        raise CustomCodeError(f"must be './file.py:Class' or 'package.module:Class', not the text {kind[:40]!r}")
     of_file = "/" in place or place.endswith(".py")
     module = _serve_file(Path(os.path.abspath(folder / place)), place) if of_file else place
-    found = _tried(place, lambda: getattr(importlib.import_module(module), name, None))
-    if found is None:
-        raise OwnCodeError(f"{place} has no class {name}")
-    return found
-
-
-def find_entry_point(section: str, name: str) -> Any:
-    """What an installed package offers as a kind of a part of a specification; None where none does."""
-    from importlib.metadata import entry_points
-
-    for found in entry_points(group=GROUPS[section], name=name):
-        return _tried(f"the entry point {name} ({found.value})", found.load)
-    return None
-
-
-def _tried(place: str, load: Callable[[], Any]) -> Any:
     try:
-        # What it prints must not stand between the lines of an answer.
+        # What it prints must not stand between the lines of a command's output.
         with redirect_stdout(sys.stderr):
-            return load()
+            found = getattr(importlib.import_module(module), name, None)
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise OwnCodeError(f"{place} cannot be imported: {reason(error)}") from None
+        raise CustomCodeError(f"{place} cannot be imported: {reason(error)}") from None
+    if not isinstance(found, type):
+        raise CustomCodeError(f"{place} has no class {name}" if found is None else f"{kind} is no class")
+    return found
 
 
 def reason(error: BaseException) -> str:
-    """An exception in a clause: what it says, and the last line of one's own code that it came through."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
+    """An exception in a clause: what it says, and the last line of custom code that it came through."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_custom_file(frame.filename)]
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}{': ' if text else ''}{text[:200]}{where}"
@@ -112,7 +99,7 @@ _SERVED: dict[str, Source] = {}
 class _Loader(SourceLoader):
     """Loads a module from what was read of its file; it imports its neighbours as they were read with it.
 
-    These have names of their own in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
+    These have private names in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
     """
 
     def __init__(self, source: Source) -> None:
@@ -183,15 +170,15 @@ def _serve_file(path: Path, place: str) -> str:
     try:
         sources = _with_neighbours(path)
     except FileNotFoundError:
-        raise OwnCodeError(f"there is no file {place}; names start at the folder of the specification") from None
-    except OwnCodeError:
+        raise CustomCodeError(f"there is no file {place}; names start at the folder of the specification") from None
+    except CustomCodeError:
         raise
     except (OSError, ValueError) as error:
-        raise OwnCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise CustomCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     contents = [(name, source.content, source.data) for name, source in sorted(sources.items())]
     digest = hashlib.sha256(repr(contents).encode())
     # Named by content, so that a changed file is another module.
-    main = f"own_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
+    main = f"custom_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
     _serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
     return main
 
@@ -218,7 +205,7 @@ def _beside(folder: Path, name: str) -> Path | None:
 # What a module is made of
 
 
-def is_own_file(file: str | None) -> bool:
+def is_custom_file(file: str | None) -> bool:
     """Whether a file is neither part of Python, nor of an installed package, nor of ctid."""
     if not file or not os.path.isabs(file):
         return False
@@ -228,13 +215,13 @@ def is_own_file(file: str | None) -> bool:
 
 
 def source_of(name: str) -> Source | None:
-    """What a module of one's own is made from; None for any other name."""
+    """What a custom module is made from; None for any other name."""
     if name in _SERVED:
         return _SERVED[name]
     # What has side effects when it is imported may do anything.
     with suppress(BaseException):
         spec = importlib.util.find_spec(name)
-        if spec is not None and is_own_file(spec.origin):
+        if spec is not None and is_custom_file(spec.origin):
             return Source.read(Path(str(spec.origin)))
     return None
 
@@ -244,7 +231,7 @@ def _is_installed(name: str) -> bool:
     with suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(top)
         places: Iterable[str | None] = () if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
-        return spec is not None and not any(map(is_own_file, places))
+        return spec is not None and not any(map(is_custom_file, places))
     return False
 
 
@@ -267,7 +254,7 @@ def _data_files(content: bytes, place: str) -> tuple[str, ...]:
                 names = ast.literal_eval(node.value)
                 if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
                     return tuple(names)
-            raise OwnCodeError(f'FILES in {place} must be a list of names that stands there: FILES = ["table.csv"]')
+            raise CustomCodeError(f'FILES in {place} must be a list of names that stands there: FILES = ["table.csv"]')
     return ()
 
 

@@ -9,7 +9,7 @@ import pytest
 from ctid_cli.errors import RefusedError, SpecError
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.job import Job
-from ctid_cli.running.own_check import check_components
+from ctid_cli.running.custom_check import check_components
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.store import read_stored
