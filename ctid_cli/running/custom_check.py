@@ -1,6 +1,8 @@
 """A first look at custom components before a run: data sets and estimates, twice, in a process of its own."""
 
+import os
 import random
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +20,7 @@ from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
-from ctid_cli.specification.checks import MAX_TRIALS, trial
+from ctid_cli.specification.joint_checks import MAX_TRIALS, trial
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import found_values, true_values
@@ -115,6 +117,8 @@ def _uncounted(
 
 
 def _after_code(code: Served, function: Callable[..., Look], given: tuple[Any, ...]) -> Look:
+    # What components print must not stand between the lines of a command's output.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     return function(*given)
 
 

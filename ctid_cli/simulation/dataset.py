@@ -343,7 +343,7 @@ class MeasuredSource:
     hold: Hold = "zoh"
     offset: Offset = "none"
     estimation_samples: int | None = None
-    reference: str | None = field(default=None, metadata={"added_later": True})
+    reference: str | None = None
     loop: LoopOptions | None = None
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
-from ctid_cli.specification.checks import MAX_TRIALS, Extent, extents, has_relay
+from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Variant, over, variants
 from ctid_cli.specification.spec import Spec
@@ -36,7 +36,7 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
         for name, section in spec.estimators.items():
             warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
     if spec.starts is not None:
-        taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
+        taken = {getattr(variants(section)[0].options, "start_from", None) for section in spec.estimators.values()}
         for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
             if getattr(spec.starts, name) and kind not in taken:
                 warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))

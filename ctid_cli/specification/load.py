@@ -13,7 +13,7 @@ from ctid_cli.kinds import KINDS
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.files import is_inside
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
-from ctid_cli.specification.checks import joint_complaints, presence_complaints, too_many_cases
+from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.sections import case_count, names_code, replaced, variants

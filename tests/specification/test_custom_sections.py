@@ -1,4 +1,4 @@
-"""Components of one's own in a specification: what is wrong with them is said with its place, and never a traceback."""
+"""Custom components in a specification: what is wrong with them is said with its place, and never a traceback."""
 
 import random
 import re
@@ -7,17 +7,15 @@ import sys
 import numpy as np
 import pytest
 
+from ctid_cli.custom_code import find_class
 from ctid_cli.errors import CtidError, RefusedError, SpecError
-from ctid_cli.own_code import find_class
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.drifts import noise_at
-from ctid_cli.specification import own_sections
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 
 CODE = '''\
 from dataclasses import dataclass, field
 from typing import Literal
-from ctid_cli import HeldSignal
+from ctid_cli import Estimator as Base, Excitation, HeldSignal, Noise as NoiseBase, Sampling, System
 from gains import GAIN
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class Part:
     size: float = 1.0
 
 @dataclass(frozen=True)
-class Estimator:
+class Estimator(Base):
     """An estimator.
 
     Parameters
@@ -50,32 +48,32 @@ class Estimator:
         return {"parameters": {"tau": 1.0}}
 
 @dataclass(frozen=True)
-class Noise:
+class Noise(NoiseBase):
     deviation: float
     def generate(self, output, rng):
         return GAIN * self.deviation * rng.standard_normal(output.size)
 
 @dataclass(frozen=True)
-class Steps:
+class Steps(Excitation):
     deterministic = True
     def generate(self, times, rng):
         return HeldSignal(times, times % 2)
 
 @dataclass(frozen=True)
-class Clock:
+class Clock(Sampling):
     interval: float = 0.1
     def times(self, rng):
         return [self.interval * k for k in range(300)]
 
 @dataclass(frozen=True)
-class Tank:
+class Tank(System):
     area: float = 2.0
     def simulate(self, input, times):
         return times
 '''
 
 SPEC = """\
-experiment: own
+experiment: custom
 system:      {kind: "./parts.py:Tank", area: [1.0, 2.0], truth: {area: area, b0: 0.5}}
 excitation:  {kind: "./parts.py:Steps"}
 sampling:    {kind: "./parts.py:Clock", interval: 0.1}
@@ -151,30 +149,22 @@ def test_nothing_is_imported_without_permission(folder):
         spec_from_canonical(canonical)
 
 
-def test_installed_packages_offer_kinds_without_permission(folder, monkeypatch):
-    target = find_class("./parts.py:Noise", folder)
-    offered = {("noise", "hum"): target}
-    monkeypatch.setattr(own_sections, "find_entry_point", lambda section, name: offered.get((section, name)))
-    text = re.sub(r"\{kind: \"\./parts.py:Tank.*", "{numerator: [2], denominator: [1, 2]}", SPEC.replace("area", "x"))
-    text = text.replace('{kind: "./parts.py:Steps"}', "{kind: step, time: 1.0}").replace(
-        '{kind: "./parts.py:Clock", interval', "{kind: regular, samples: 300, interval"
-    )
-    text = re.sub(r"  mine:(.|\n)*  srivc", "  srivc", text.replace('"./parts.py:Noise"', "hum"))
-    text = re.sub(r"starts.*\n|success.*", "", text)
-    (folder / "spec.yaml").write_text(text, encoding="utf-8")
-    plan = build_plan(load_spec(folder / "spec.yaml"))
-    assert plan.data_cells[0].source.noise.options == target(0.1)
-    assert plan.data_cells[0].content["noise"]["kind"] == "hum"
-
-
 def test_a_noise_may_ask_for_the_instants(folder):
-    edited(folder, "parts.py", "generate(self, output, rng)", "generate(self, output, times, rng)")
+    edited(folder, "parts.py", "generate(self, output, rng)", "generate_at(self, times, output, rng)")
     edited(folder, "parts.py", "return GAIN * self.deviation * rng", "return times + 0 * GAIN * rng")
-    noise = build_plan(load(folder)).data_cells[0].source.noise
-    times = np.array([0.0, 0.1, 0.3])
-    np.testing.assert_array_equal(noise_at(noise, times, np.zeros(3), np.random.default_rng(0)), times)
-    edited(folder, "parts.py", "output, times, rng", "output")
-    assert "needs generate(self, output, rng) or generate(self, output, times, rng)" in str(problem(folder))
+    record = build_plan(load(folder)).data_cells[0].dataset(0).record
+    np.testing.assert_allclose(record.y, record.noise_free + record.t)
+    edited(folder, "parts.py", "times, output, rng", "output")
+    assert "needs generate(self, output, rng) or generate_at(self, times, output, rng)" in str(problem(folder))
+
+
+def test_a_class_with_a_fitting_fit_alone_is_an_estimator(folder):
+    edited(folder, "parts.py", "class Estimator(Base)", "class Estimator")
+    assert build_plan(load(folder)).estimators[0].estimator.start_from == "delay"
+    (folder / "parts.py").write_text(CODE + "class Plain:\n    def fit(self, record, start):\n        return {}\n")
+    edited(folder, "spec.yaml", "./parts.py:Estimator\n    order: 2\n    cutoff: [1.0, 2.0]", "./parts.py:Plain")
+    edited(folder, "spec.yaml", "    mode: slow\n    bounds: [0, 1]\n    names: [a1, b0]\n    inner: {size: 2.0}\n", "")
+    assert build_plan(load(folder)).estimators[0].content == {"kind": "./parts.py:Plain"}
 
 
 WRONG = {
@@ -185,9 +175,10 @@ WRONG = {
     "no name": ("spec.yaml", "./parts.py:Estimator", '"./parts.py:"', "8:11", "'./file.py:Class'"),
     "other method": ("spec.yaml", "./parts.py:Estimator", "./parts.py:Noise", "8:11", "fit(self, record, start)"),
     "another kind": ("spec.yaml", '"./parts.py:Tank"', "tank", "2:21", "'package.module:Class', not the text 'tank'"),
+    "no base": ("parts.py", "Tank(System)", "Tank", "2:21", "Tank is no ctid_cli.System; derive it from that"),
     "no dataclass": ("parts.py", "@dataclass(frozen=True)\nclass Noise", "class Noise", "5:21", "@dataclass"),
     "arguments": ("parts.py", "def fit(self, record, start)", "def fit(self, record)", "8:11", "cannot be called so"),
-    "syntax": ("parts.py", "class Steps:", "class Steps", "", "SyntaxError"),
+    "syntax": ("parts.py", "class Steps(Excitation):", "class Steps(Excitation)", "", "SyntaxError"),
     "import": ("gains.py", "GAIN = 2.0", "GAIN = 1 / 0", "", "ZeroDivisionError: division by zero (gains.py:1)"),
     "exit": ("gains.py", "GAIN = 2.0", "exit(3)", "", "SystemExit: 3"),
     "type": ("parts.py", "    deviation: float", "    deviation: dict", "5:21", "Noise.deviation: a field of type"),

@@ -11,7 +11,6 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ctid_cli
 from ctid_cli.canonical import canonical_json, content_hash
 from ctid_cli.errors import SpecError, UsageError
 from ctid_cli.kinds import KINDS, classes

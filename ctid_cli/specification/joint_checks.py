@@ -312,7 +312,7 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
-    if options.start_from != "delay" or not hasattr(options, "delay_bounds"):
+    if getattr(options, "start_from", None) != "delay" or not hasattr(options, "delay_bounds"):
         return
     low, high = options.delay_bounds
     for k, point in enumerate(delays):

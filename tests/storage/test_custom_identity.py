@@ -1,11 +1,10 @@
-"""The identity of results that code of one's own made: what it contains counts, and nothing else."""
+"""The identity of results that custom code made: what it contains counts, and nothing else."""
 
 from pathlib import Path
 
 import pytest
 
-from ctid_cli.own_code import OwnCodeError, find_class
-from ctid_cli.simulation.own_components import OwnNoise
+from ctid_cli.custom_code import CustomCodeError, find_class
 from ctid_cli.storage.identity import modules_behind, modules_of
 
 PART = '''\
@@ -37,7 +36,7 @@ def behind(folder: Path, **changed: str) -> dict[str, str]:
         (folder / name).parent.mkdir(exist_ok=True, parents=True)
         (folder / name).write_text(changed.get(Path(name).stem, text), encoding="utf-8")
     options = find_class("./part.py:Noise", folder)()
-    return modules_behind(modules_of(OwnNoise(options)))
+    return modules_behind(modules_of(options))
 
 
 def test_the_folder_and_the_words_do_not_matter(tmp_path: Path) -> None:
@@ -70,9 +69,11 @@ def test_data_files_that_a_module_names_matter(tmp_path: Path) -> None:
     first = with_data("1,2")
     assert with_data("1,2") == first
     assert with_data("1,3") != first
-    with pytest.raises(OwnCodeError, match=r"no\.csv, which FILES in levels\.py names, cannot be read: No such file"):
+    with pytest.raises(
+        CustomCodeError, match=r"no\.csv, which FILES in levels\.py names, cannot be read: No such file"
+    ):
         with_data("1", '["no.csv"]')
-    with pytest.raises(OwnCodeError, match=r"FILES in levels\.py must be a list of names"):
+    with pytest.raises(CustomCodeError, match=r"FILES in levels\.py must be a list of names"):
         with_data("1", "[name for name in ()]")
 
 
@@ -88,11 +89,11 @@ def test_a_module_that_python_imports_itself_counts_as_far_as_it_is_not_installe
     (package / "levels.py").write_text("LEVEL = 2.0\n")
     monkeypatch.syspath_prepend(tmp_path)
     options = find_class("mine_for_test.noise:Noise", tmp_path)()
-    first = modules_behind(modules_of(OwnNoise(options)))
+    first = modules_behind(modules_of(options))
     (package / "levels.py").write_text("LEVEL = 2.5\n")
-    second = modules_behind(modules_of(OwnNoise(options)))
+    second = modules_behind(modules_of(options))
     assert [sum(name.startswith("own ") for name in found) for found in (first, second)] == [3, 3]
     assert first != second
     # Without a readable source the bytes count.
     (package / "levels.py").write_bytes(b"\x00\x01")
-    assert modules_behind(modules_of(OwnNoise(options))) not in (first, second)
+    assert modules_behind(modules_of(options)) not in (first, second)
