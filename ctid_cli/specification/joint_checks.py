@@ -35,6 +35,7 @@ from ctid_cli.specification.sections import (
     grouped,
     over,
     place_of,
+    replaced,
     swept_in,
     variants,
 )
@@ -179,8 +180,9 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     yield from _success_complaints(spec)
     of_data = list(_data_complaints(spec, [] if too_long else records))
     yield from of_data
-    if not (too_long or of_data or spec.data) and files_are_good:
-        yield from _trial_complaints(spec)
+    # A wrong level of the noise leaves the rest to be tried.
+    if not (too_long or spec.data) and files_are_good and {path[0] for path, _ in of_data} <= {"noise"}:
+        yield from _trial_complaints(replaced(spec, ("noise",), None) if of_data else spec)
 
 
 def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
@@ -361,7 +363,7 @@ def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> It
 
 
 def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
-    if options.start_from != "parameters":
+    if getattr(options, "start_from", None) != "parameters":
         return
     if hasattr(options, "terms"):
         if model.terms != tuple(options.terms):
