@@ -179,7 +179,7 @@ Estimator.register(common.Estimator)
 
 def is_custom(component: Any) -> bool:
     """Whether a component is none of ctid's."""
-    return not type(component).__module__.startswith("ctid_cli.")
+    return component is not None and not type(component).__module__.startswith("ctid_cli.")
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -163,6 +163,24 @@ class SimulatedSource:
         data = self._realised(replicate)
         return replace(data, fresh=lambda: self._realised(FRESH + replicate).record) if self.fresh else data
 
+    def require_stable(self) -> None:
+        """Refuse a loop whose signals would grow without end; a relay bounds them, and oscillates on purpose."""
+        from ctid_cli.filtering.loop import loop_radius
+
+        if self.loop is None or isinstance(self.loop.controller, Relay):
+            return
+        interval = self.sampling.mean_interval
+        with at("loop.controller"):
+            try:
+                with np.errstate(all="ignore"):
+                    radius = loop_radius(self.system, self.loop.at(interval).controller, interval)  # type: ignore[arg-type]
+            except np.linalg.LinAlgError:
+                overflow = f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
+                raise DataError(overflow) from None
+            if not radius < 1.0:
+                largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
+                raise DataError(f"the loop with the true system is unstable: {largest}; lower the gain")
+
     @property
     def parts(self) -> dict[str, Any]:
         """What makes the data, by its place in a specification and in the order of its work."""
@@ -229,7 +247,6 @@ class SimulatedSource:
                 u, x = simulate_relay(system, controller, *signals)
                 closed = None  # estimators know the loops of linear controllers only
             else:
-                _require_stable(system, controller, interval)
                 u, x = simulate_loop(system, controller, *signals)
                 closed = Loop(r, controller, loop.enters)
         y = self._with_losses(self.recorder.rounded(x + noise), replicate)
@@ -256,21 +273,6 @@ def at(place: str) -> Iterator[None]:
     except DataError as error:
         error.section = error.section or place
         raise
-
-
-def _require_stable(system: TransferFunction | AdditiveModel, controller: DiscreteController, interval: float) -> None:
-    """Refuse a loop whose signals would grow without end."""
-    from ctid_cli.filtering.loop import loop_radius
-
-    try:
-        with np.errstate(all="ignore"):
-            radius = loop_radius(system, controller, interval)
-    except np.linalg.LinAlgError:
-        overflow = f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
-        raise DataError(overflow) from None
-    if not radius < 1.0:
-        largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
-        raise DataError(f"the loop with the true system is unstable: {largest}; lower the gain")
 
 
 def made(component: Any, method: str, *given: Any) -> Any:

@@ -492,6 +492,7 @@ def trial(source: SimulatedSource) -> Iterator[Complaint]:
     try:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            source.require_stable()
             source.dataset(0)
     except DataError as error:
         yield tuple(error.section.split(".")) if error.section else (), str(error)

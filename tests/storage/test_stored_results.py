@@ -11,10 +11,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from ctid_cli.errors import RefusedError
-from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import columns, manifest
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.journal_reader import read_journal
@@ -131,15 +127,6 @@ def test_the_journal_is_upgraded_without_loss(name: str, tmp_path: Path) -> None
     with read_journal(path) as new:
         assert new is not None
         assert (new.entries(), new.made(), len(new.sessions())) == (before, made, 1)
-
-
-def test_nothing_of_the_present_code_is_added_to_them(tmp_path: Path) -> None:
-    place = Path(shutil.copytree(STORED / "system", tmp_path / "system"))
-    before = {file.name: file.read_bytes() for file in place.iterdir()}
-    plan = build_plan(load_spec(STORED / "system" / "spec.yaml"))
-    with pytest.raises(RefusedError, match=r"code version 64dead06a043ab0d then, [0-9a-f]+-[0-9a-f]+ now"):
-        run_experiment(plan, place, warm=lambda: 0.0)
-    assert {file.name: file.read_bytes() for file in place.iterdir()} == before
 
 
 def test_the_documentation_lists_the_columns() -> None:
