@@ -170,11 +170,10 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
 
 def _measuring(spec: Spec) -> Measuring:
     """What is measured of the frequencies of a signal."""
-    band = None if spec.success is None else spec.success.band
-    if spec.tracks is None:
-        return Measuring(band)
-    window = None if spec.tracks.window is None else (spec.tracks.window[0], spec.tracks.window[1])
-    return Measuring(band, window, spec.tracks.interval, spec.tracks.runs)
+    if spec.success is None:
+        return Measuring()
+    window = spec.success.window
+    return Measuring(spec.success.band, None if window is None else (window[0], window[1]))
 
 
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:

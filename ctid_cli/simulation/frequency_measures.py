@@ -1,4 +1,4 @@
-"""What is measured of frequencies over time against the true ones, and how tracks are stored.
+"""What is measured of frequencies over time against the true ones.
 
 Names of the measures, each with the number of the tone behind it where it is one number per tone, by rising frequency:
 
@@ -17,14 +17,11 @@ An estimate of a whole record has ``omega``, ``rms`` and ``bias`` of this one er
 
 from __future__ import annotations
 
-import base64
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids
@@ -54,15 +51,12 @@ _ALARMING = ("restarting_least_squares",)
 
 @dataclass(frozen=True)
 class Measuring:
-    """What is measured of every estimate, and which tracks are stored."""
+    """What is measured of every estimate."""
 
     #: Largest error of a settled frequency [rad/s]; without it no settling times are measured.
     band: float | None = None
     #: First and last instant of the window of rms and bias [s]; the last 10 s if not given.
     window: tuple[float, float] | None = None
-    #: Time from one row of a stored track to the next [s]; None stores none.
-    interval: float | None = None
-    runs: int = 0
 
 
 def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
@@ -135,30 +129,6 @@ def is_settled(measures: Mapping[str, float | None] | None, band: float, by: flo
         return all(time is not None and (by is None or time <= by) for time in times)
     errors = [value for name, value in measures.items() if base_name(name)[0] == "rms"]
     return all(error is not None and error <= band for error in errors)
-
-
-def thinned(track: FrequencyTrack, interval: float, sampling_interval: float) -> FrequencyTrack:
-    """Every so many rows of a track."""
-    every = max(1, round(interval / sampling_interval))
-    return type(track)(track.t[::every], track.omega[::every], track.flags[::every], track.uncertainty[::every])
-
-
-def pack_track(track: FrequencyTrack) -> dict[str, Any]:
-    """A track as plain data."""
-    packed = {}
-    for name, kind in (("t", "<f8"), ("omega", "<f8"), ("flags", "<u2"), ("uncertainty", "<f4")):
-        array = np.ascontiguousarray(getattr(track, name), dtype=kind)
-        data = base64.b64encode(zlib.compress(array.tobytes())).decode("ascii")
-        packed[name] = {"kind": kind, "shape": list(array.shape), "data": data}
-    return packed
-
-
-def unpack_track(packed: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The columns of a packed track."""
-    return {
-        name: np.frombuffer(zlib.decompress(base64.b64decode(part["data"])), part["kind"]).reshape(part["shape"])
-        for name, part in packed.items()
-    }
 
 
 def _numbered(name: str, values: Array) -> dict[str, float | None]:

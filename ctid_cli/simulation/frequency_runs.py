@@ -16,8 +16,6 @@ from ctid_cli.simulation.frequency_measures import (
     Measuring,
     measure_estimate,
     measure_track,
-    pack_track,
-    thinned,
     true_frequencies,
 )
 
@@ -43,9 +41,8 @@ class SignalDataSet:
 
     def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
         """What is stored of a fit to the record."""
-        source, interval = self.source, self.record.interval
-        measuring = source.measuring
-        times = interval * np.arange(self.record.samples.size, dtype=float)
+        source, measuring = self.source, self.source.measuring
+        times = self.record.interval * np.arange(self.record.samples.size, dtype=float)
         true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
         last = fit.last
         result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
@@ -53,10 +50,7 @@ class SignalDataSet:
             result = {"status": "INVALID", "message": " ".join(last.reasons)}
         if not isinstance(fit.found, FrequencyTrack):
             return result | {"measures": measure_estimate(last, true, measuring.window, times)}
-        result["measures"] = measure_track(fit.found, true, source.signal, measuring, fit.options)
-        if measuring.interval is not None and self.replicate < measuring.runs:
-            result["track"] = pack_track(thinned(fit.found, measuring.interval, interval))
-        return result
+        return result | {"measures": measure_track(fit.found, true, source.signal, measuring, fit.options)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ _SIMULATED = ("system", "excitation", "sampling")
 _OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
-_RULES_OF_SIGNALS = ("band", "by")
+_RULES_OF_SIGNALS = ("band", "by", "window")
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -67,7 +67,7 @@ _RULES_OF_SIGNALS = ("band", "by")
 def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
     """Say which sections are missing or too many, whatever they hold."""
     present = {name for name in Spec.model_fields if raw.get(name) is not None}
-    of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance", "tracks"), "signal")
+    of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
     for name in of_other:
         if name in present:
             other = "; what is added to a signal is its disturbance" if name == "noise" else ""
@@ -539,12 +539,9 @@ def _of_tone_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -
     for step in signal.steps:
         if step >= duration - interval:
             yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration - interval:g} s"
-    if spec.tracks is not None:
-        if not interval * (1.0 - 1e-9) <= spec.tracks.interval <= duration:
-            yield ("tracks", "interval"), f"must lie from the sampling interval, {interval:g} s, to {duration:g} s"
-        low, high = spec.tracks.window or (0.0, duration)
-        if high > duration * (1 + 1e-9) or high - low < interval:
-            yield ("tracks", "window"), f"must hold samples of the record, which ends at {duration:g} s"
+    low, high = getattr(spec.success, "window", None) or (0.0, duration)
+    if high > duration * (1 + 1e-9) or high - low < interval:
+        yield ("success", "window"), f"must hold samples of the record, which ends at {duration:g} s"
     by = getattr(spec.success, "by", None) or 0.0
     if by > duration:
         yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s"

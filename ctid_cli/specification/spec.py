@@ -102,29 +102,6 @@ DisturbanceOrNone = Annotated[
 EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
 
 
-class TracksSection(Section):
-    """What is stored of the frequencies over time, and where their errors are measured.
-
-    Parameters
-    ----------
-    interval : float, default 0.05
-        Time from one stored estimate to the next [s]
-    window : list of float, optional
-        First and last instant of the window of rms and bias [s]; the last 10 s
-    runs : int, default 1
-        Store the tracks of so many data sets of every data cell
-    """
-
-    interval: Positive = 0.05
-    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
-    runs: int = Field(default=1, ge=0, le=1_000_000)
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say that the window is empty."""
-        if self.window is not None and not self.window[0] < self.window[1]:
-            yield ("window",), f"must begin before it ends; it runs from {self.window[0]:g} to {self.window[1]:g} s"
-
-
 # --------------------------------------------------------------------------------------------------------------------
 # Number of data sets, and what counts
 
@@ -205,6 +182,8 @@ class SuccessSection(Section):
         Largest error of a settled frequency of a signal [rad/s]
     by : float, optional
         Frequencies must settle so soon after the start and after their last step [s]
+    window : list of float, optional
+        First and last instant of the window of rms and bias of a frequency [s], no condition itself; the last 10 s
     """
 
     if_empty = (
@@ -217,12 +196,17 @@ class SuccessSection(Section):
     parameter_relative_error: Positive | None = None
     band: Positive | None = None
     by: Positive | None = None
+    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that nothing is asked for, or by when but not what."""
+        """Say that nothing is asked for, or by when but not what, or that the window is empty."""
         yield from super().complaints()
         if self.by is not None and self.band is None:
             yield ("by",), "is the time of settling into a band; add band [rad/s]"
+        if self.window is not None and self.band is None:
+            yield ("window",), "is no condition by itself; add band [rad/s]"
+        if self.window is not None and not self.window[0] < self.window[1]:
+            yield ("window",), f"must begin before it ends; it runs from {self.window[0]:g} to {self.window[1]:g} s"
 
 
 class LimitsSection(Section):
@@ -280,8 +264,6 @@ class Spec(Section):
         When an estimate counts as converged
     measures : list of str, optional
         What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
-    tracks : mapping, optional
-        What is stored of the frequencies of a signal over time; nothing by default
     limits : mapping, optional
         Time and memory that one estimate may take; no limits by default
     """
@@ -301,7 +283,6 @@ class Spec(Section):
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
     measures: list[Text] | None = None
-    tracks: TracksSection | None = None
     limits: LimitsSection | None = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())

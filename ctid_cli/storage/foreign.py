@@ -63,7 +63,10 @@ def _require_shard(shard: Any) -> None:
 def _require_success(rule: Any) -> None:
     if rule is None:
         return
-    if any(not (value is None or _is_number(value)) for value in _mapping(rule, "the success rule").values()):
+    values = _mapping(rule, "the success rule").values()
+    if not all(
+        value is None or all(map(_is_number, value if isinstance(value, list) else [value])) for value in values
+    ):
         raise ValueError("the success rule holds something else than numbers")
 
 

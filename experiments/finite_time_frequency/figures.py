@@ -9,12 +9,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ctid_cli.errors import UsageError
+from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import Results
+from ctid_cli.running.cells import DataCell, EstimatorCell
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.store import read_tracks
 
 #: What estimators are called that the paper compares with, but that are not theirs.
 DERIVED = "derived, not the published algorithm"
@@ -59,29 +59,30 @@ def figure_4(results: Results) -> bytes:
 
 
 def _row(results: Results, title: str = "", *, reference: bool = False, **swept: str) -> Row:
-    """Stored tracks of the first data set, with the truth."""
+    """Tracks of the first data set, with the truth."""
     plan = build_plan(spec_from_canonical(dict(results.settings)))
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
-    first = [row for row in results.rows if row["replicate"] == 0 and row["cell"] == cell.hash]
-    ids = {row["estimator"]: row["id"] for row in first}
-    source, tracks = cell.source, read_tracks(results.folder)
+    parts, source = {part.name: part for part in plan.estimators}, cell.source
     groups = []
     for name, members in GROUPS.items():
         curves = []
-        for estimator in (member for member in members if member in ids):
-            track = tracks.get(ids[estimator])
-            if track is None:
-                nothing = f"the results of {results.experiment} hold no frequencies over time of {estimator!r}"
-                raise UsageError(f"{nothing}; run its specification with tracks.runs of 1 or more")
-            every = max(1, round(DRAWN_INTERVAL / float(track["t"][1] - track["t"][0])))
-            t = np.asarray(track["t"][::every])
-            true = source.signal.frequencies_at(t)
-            curves.append(Curve(members[estimator], t, track["omega"][::every], true, track["flags"][::every] == 0))
+        for estimator in (member for member in members if member in parts):
+            track = track_of(cell, 0, parts[estimator], DRAWN_INTERVAL)
+            true = source.signal.frequencies_at(track.t)
+            curves.append(Curve(members[estimator], track.t, track.omega, true, track.valid))
         groups.append(Group(name, curves))
     options = next(part.estimator.options for part in plan.estimators if part.name == "finite_time")
     exact_from = options.tones * (2 * options.h + options.d)
     whole = _whole_record_error(results) if reference else None
     return Row(title, groups, source.sampling.samples * source.sampling.interval, exact_from, whole)
+
+
+def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: float) -> FrequencyTrack:
+    """Return the track of an online estimator on a data set, its rows an interval [s] apart."""
+    record = cell.dataset(replicate).record
+    track = part.estimator.prepare(record).fit().found
+    every = max(1, round(interval / record.interval))
+    return FrequencyTrack(track.t[::every], track.omega[::every], track.flags[::every], track.uncertainty[::every])
 
 
 def _whole_record_error(results: Results) -> float:

@@ -12,14 +12,17 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_runs import SignalSource
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.store import read_tracks
 
-from .figures import DERIVED, GROUPS
+from .figures import DERIVED, GROUPS, track_of
 
 Row = dict[str, Any]
 
 #: Errors below which settling is measured [rad/s].
 BANDS = (0.05, 0.01, 1e-3)
+#: Rows of the tracks that settling is measured on are so far apart [s].
+TRACK_INTERVAL = 0.01
+#: Number of data sets of each data cell whose tracks are measured, by the experiments that have any.
+TRACKED = {"two-tones": 1, "harmonic": 1, "random": 20, "step": 1}
 #: Readings of the step.
 READINGS = ("jump", "continuous")
 
@@ -48,12 +51,15 @@ def grouped(results: Results) -> Iterator[tuple[Row, list[Row]]]:
 
 
 def followed(results: Results) -> Iterator[tuple[Row, list[tuple[SignalSource, FrequencyTrack]]]]:
-    """The same with the signals and stored tracks of estimators that have any."""
-    cells, tracks = sources(results), read_tracks(results.folder)
+    """The same with the signals and tracks of the first data sets, of online estimators."""
+    plan = build_plan(spec_from_canonical(dict(results.settings)))
+    cells, parts = {cell.hash: cell for cell in plan.data_cells}, {part.name: part for part in plan.estimators}
+    runs = TRACKED.get(results.experiment.rpartition("/")[2], 0)
     for common, rows in grouped(results):
-        stored = [(cells[row["cell"]][1], FrequencyTrack(**tracks[row["id"]])) for row in rows if row["id"] in tracks]
-        if stored:
-            yield common, stored
+        part = parts[common["estimator"]]
+        if part.estimator.options.online and runs:
+            tracked = [(cells[row["cell"]], row["replicate"]) for row in rows if row["replicate"] < runs]
+            yield common, [(cell.source, track_of(cell, k, part, TRACK_INTERVAL)) for cell, k in tracked]
 
 
 def measured(results: Results) -> Iterator[tuple[Row, list[Row]]]:
@@ -88,7 +94,7 @@ def settle(t: Array, error: Array, band: float, since: float = 0.0, until: float
 
 
 def settling(results: Results) -> Iterator[Row]:
-    """Settling times of the stored tracks, to the interval of their rows, before and after a step."""
+    """Settling times of the tracks, to the interval of their rows, before and after a step."""
     for common, stored in followed(results):
         pieces: dict[str, list[list[float]]] = {}
         wrong = []

@@ -60,7 +60,7 @@ def paper_tables(results: Results) -> list[str]:
         of_piece = f", {piece}" if several else ""
         header += [f"{'within ' if not k else ''}{band:g}{of_piece}" for k, band in enumerate(BANDS)]
     header += ["rms w1", "rms w2", "valid [%]", "valid, off by 0.05 [s]"]
-    window, runs = results.settings["tracks"]["window"], max(row["data_sets"] for row in left)
+    window, runs = results.settings["success"]["window"], max(row["data_sets"] for row in left)
     explained = (
         f"Time until both errors are below a band to stay{', each piece from its beginning' if several else ''}, to "
         f"0.01 s; root-mean-square errors over {window[0]:g} to {window[1]:g} s "

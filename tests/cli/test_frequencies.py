@@ -17,8 +17,7 @@ estimators:
   restarting: {kind: restarting_least_squares, tones: 2, h: [0.6, 0.7], prefilter: 0.5}
   finite: {kind: drem_finite_time, tones: 2, h: 0.7, d: 0.4, epsilon: 0.1, gamma: 1.0, initial_frequencies: [2, 4]}
   whole: {kind: esprit, tones: 2}
-success: {band: 0.05, by: 8}
-tracks: {interval: 0.1, window: [18, 20]}
+success: {band: 0.05, by: 8, window: [18, 20]}
 monte_carlo: {runs: 3, seed: 1}
 """
 SETTLING = ("settling_time_1", "settling_time_2", "settling_after_step_1", "settling_after_step_2")

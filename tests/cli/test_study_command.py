@@ -12,7 +12,7 @@ from ctid_cli.studies.claim import Claim
 from tests.reporting.frequency_results import run_here
 
 STUDIES = all_studies()
-SHORT = ("sampling.interval=0.01", "sampling.duration=33", "tracks.window=[28, 33]")
+SHORT = ("sampling.interval=0.01", "sampling.duration=33", "success.window=[28, 33]")
 
 
 @pytest.fixture(scope="module")

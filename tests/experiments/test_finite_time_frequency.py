@@ -7,7 +7,6 @@ import pytest
 
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.store import read_tracks
 from ctid_cli.studies.catalogue import read_study
 from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.experiments import frequency_acceptance as acceptance
@@ -79,7 +78,7 @@ def out(tmp_path_factory):
     for name in ("two-tones", "harmonic"):
         run_here(name, folder, [*COARSE, *BLOCKS])
     run_here("step", folder, COARSE)
-    run_here("random", folder, [*COARSE, *BLOCKS, "monte_carlo.runs=3", "tracks.runs=3"])
+    run_here("random", folder, [*COARSE, *BLOCKS, "monte_carlo.runs=3"])
     finer = "sampling.interval=0.005"
     run_here("recovery", folder, [finer])
     # As much noise in every second as with the published clock.
@@ -121,12 +120,12 @@ def test_a_step_is_measured_piece_by_piece_and_what_is_valid_but_wrong_is_found(
         slow = one(rows, estimator="finite_time", piece="from 30 s", reading=reading)
         assert slow["within_0.001"] > 13
     row = one(rows, estimator="restarting_prefiltered", piece="from 30 s", reading="continuous")
-    (stored,) = (
-        r for r in study["step"].rows if r["estimator"] == row["estimator"] and r["phase_at_steps"] == "continuous"
-    )
-    track = read_tracks(study["step"].folder)[stored["id"]]
-    truth = np.where((track["t"] > 29.999)[:, None], [2.0, 3.0], [1.8, 3.2])
-    wrong = (track["flags"] == 0) & (np.abs(track["omega"] - truth) > 0.05).any(axis=1)
+    plan = STUDY.plan("step", COARSE)
+    (cell,) = (cell for cell in plan.data_cells if cell.swept["phase_at_steps"] == "continuous")
+    (part,) = (part for part in plan.estimators if part.name == row["estimator"])
+    track = part.estimator.prepare(cell.dataset(0).record).fit().found
+    truth = np.where((track.t > 29.999)[:, None], [2.0, 3.0], [1.8, 3.2])
+    wrong = track.valid & (np.abs(track.omega - truth) > 0.05).any(axis=1)
     assert wrong.any()
     assert row["valid_but_off_by_0.05"] == pytest.approx(0.01 * wrong.sum())
 

@@ -10,14 +10,13 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures import error_plot
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import read_results
-from ctid_cli.storage.store import read_tracks
 from ctid_cli.studies.catalogue import find_figures, require_results
 from tests.reporting.frequency_results import STUDY, run_here
 
 figures = STUDY.module("figures")
 NAMES = ("two-tones", "harmonic", "random", "step")
 #: A slow clock and short records; the step must come before their end.
-SHORT = ("sampling.interval=0.01", "sampling.duration=33", "tracks.window=[28, 33]", "monte_carlo.runs=2")
+SHORT = ("sampling.interval=0.01", "sampling.duration=33", "success.window=[28, 33]", "monte_carlo.runs=2")
 
 
 @pytest.fixture(scope="module")
@@ -58,23 +57,19 @@ def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, 
     assert ("nonlinear least squares, whole record" in common) is (number in "23")
 
 
-def test_lines_are_the_stored_tracks_and_thick_where_valid(out, drawn):
+def test_lines_are_the_tracks_of_the_first_data_set_and_thick_where_valid(out, drawn):
     results = read_results(out, "finite-time-frequency/step")
     figures.figure_4(results)
-    tracks = read_tracks(results.folder)
+    plan = STUDY.plan("step", SHORT)
     panels = np.array(drawn[0].axes).reshape(4, 3)
-    cells = {cell["hash"]: cell["swept"]["phase_at_steps"] for cell in results.manifest["data_cells"]}
     for k, reading in enumerate(("jump", "continuous")):
+        (cell,) = (cell for cell in plan.data_cells if cell.swept["phase_at_steps"] == reading)
         for column, names in enumerate(figures.GROUPS.values()):
             above, below = panels[2 * k : 2 * k + 2, column]
             for place, name in enumerate(names):
-                (row,) = (
-                    row
-                    for row in results.rows
-                    if (row["estimator"], cells[row["cell"]], row["replicate"]) == (name, reading, 0)
-                )
-                track = tracks[row["id"]]
-                t, omega, valid = track["t"][::10], track["omega"][::10], track["flags"][::10] == 0
+                (part,) = (part for part in plan.estimators if part.name == name)
+                track = part.estimator.prepare(cell.dataset(0).record).fit().found
+                t, omega, valid = track.t[::10], track.omega[::10], track.valid[::10]
                 truth = np.where((t >= 30 - 1e-9)[:, None], [2.0, 3.0], [1.8, 3.2])
                 for tone in (0, 1):
                     thin = lines_of(above, error_plot.FAINT)[2 * place + tone]
@@ -134,13 +129,6 @@ def test_missing_results_name_the_command(tmp_path, monkeypatch):
         require_results(drawn, Path("results"))
     with pytest.raises(UsageError, match=r"run first: ctid run configs/finite_time_frequency/harmonic\.yaml$"):
         drawn[1].svg(Path("results"))
-
-
-def test_results_without_tracks_are_refused(tmp_path):
-    overrides = ("sampling.interval=0.05", "sampling.duration=12", "tracks.window=[7, 8]", "tracks.runs=0")
-    run_here("two-tones", tmp_path, [*overrides, "tracks.interval=0.05"])
-    with pytest.raises(UsageError, match=r"hold no frequencies over time of 'finite_time'.*tracks\.runs"):
-        find_figures(["finite-time-frequency/1"])[0].svg(tmp_path)
 
 
 def test_figures_are_those_of_the_specifications():

@@ -1,12 +1,7 @@
 """Experiments on the frequencies of a signal: specification, measures, storage."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
 
-import h5py
 import numpy as np
 import pytest
 
@@ -21,12 +16,9 @@ from ctid_cli.simulation.frequency_measures import (
     Measuring,
     is_settled,
     measure_track,
-    pack_track,
-    thinned,
-    unpack_track,
 )
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.store import load_estimates, read_stored, read_tracks
+from ctid_cli.storage.store import load_estimates, read_stored
 from ctid_cli.storage.summary import export_rows
 from tests.running.fakes import outcomes_of
 from tests.specification.written import load, problems
@@ -41,8 +33,7 @@ sampling: {kind: regular, interval: 0.01, duration: 30}
 estimators:
   restarting: {kind: restarting_least_squares, tones: 2, h: 0.7, prefilter: 0.5}
   esprit: {kind: esprit, tones: 2, averaging: 0.05}
-success: {band: 0.05, by: 8}
-tracks: {interval: 0.05, window: [25, 30]}
+success: {band: 0.05, by: 8, window: [25, 30]}
 monte_carlo: {runs: 2, seed: 1}
 """
 SYSTEM = "system: {numerator: [1], denominator: [1, 1]}\nexcitation: {kind: gaussian}\n"
@@ -71,10 +62,11 @@ BROKEN = {
     "a pole beyond the clock": ("{kind: esprit, tones: 2, averaging: 0.05}",
                                 "{kind: filter_regression, tones: 2, pole: 1e300}", 9, "estimators.esprit.pole",
                                 "beyond what samples every 0.01 s can show"),
-    "window": ("[25, 30]", "[25, 31]", 11, "tracks.window", "ends at 30 s"),
-    "track interval": ("tracks: {interval: 0.05", "tracks: {interval: 0.001", 11, "tracks.interval", "0.01 s"),
-    "rule of systems": ("{band: 0.05, by: 8}", "{delay_relative_error: 1}", 10, "success.delay_relative_error", "band"),
-    "no band": ("{band: 0.05, by: 8}", "{by: 8}", 10, "success.by", "add band"),
+    "window": ("[25, 30]", "[25, 31]", 10, "success.window", "ends at 30 s"),
+    "rule of systems": ("{band: 0.05, by: 8, window: [25, 30]}",
+                        "{delay_relative_error: 1}", 10, "success.delay_relative_error", "band"),
+    "no band": ("{band: 0.05, by: 8, window: [25, 30]}", "{by: 8}", 10, "success.by", "add band"),
+    "window alone": ("{band: 0.05, by: 8, window: [25, 30]}", "{window: [25, 30]}", 10, "success.window", "add band"),
     "h too long": ("h: 0.7", "h: 8", 8, "estimators.restarting.h", "delays are filled after 32.5 s"),
     "prefilter too long": ("prefilter: 0.5", "prefilter: 1e9", 8, "estimators.restarting.prefilter", "longer than"),
     "too many samples": ("interval: 0.01, d", "interval: 1e-300, d", 6, "sampling.duration", "samples in a record"),
@@ -136,7 +128,7 @@ def test_no_disturbance_has_three_spellings(tmp_path):
 
 def test_what_is_measured_belongs_to_the_identity_and_the_time_limit_does_not(tmp_path):
     (cell,) = build_plan(load(tmp_path, SPEC)).data_cells
-    for override, same in (("success.by=9", True), ("success.band=0.02", False), ("tracks.window=[20, 30]", False)):
+    for override, same in (("success.by=9", True), ("success.band=0.02", False), ("success.window=[20, 30]", False)):
         (other,) = build_plan(load(tmp_path, SPEC, override)).data_cells
         assert (other.hash == cell.hash) is same
         assert np.array_equal(other.dataset(1).record.samples, cell.dataset(1).record.samples)
@@ -171,15 +163,6 @@ def test_measures_of_a_made_up_track():
     assert not is_settled(never, 0.05, None)
 
 
-def test_a_packed_track_is_the_track():
-    t = 0.01 * np.arange(1001)
-    track = thinned(made(t, np.sin(t) + 2), 0.05, 0.01)
-    assert track.t.tolist() == t[::5].tolist()
-    packed = json.loads(json.dumps(pack_track(track)))
-    for name, values in unpack_track(packed).items():
-        assert np.array_equal(values, getattr(track, name))
-
-
 def test_results_are_sealed_and_read_back(tmp_path):
     plan = build_plan(load(tmp_path, SPEC))
     folder = tmp_path / "out"
@@ -192,14 +175,6 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
         assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
-    tracks = read_tracks(folder)
-    (online,) = [outcome for outcome in outcomes if "track" in outcome.result]
-    assert list(tracks) == [online.key.id], "of one data set, and none of an estimate of the whole record"
-    for name, values in unpack_track(online.result["track"]).items():
-        assert np.array_equal(tracks[online.key.id][name], values, equal_nan=True)
-    with h5py.File(folder / "runs.h5") as file:
-        assert file[f"tracks/{online.key.id}/omega"].attrs["unit"] == "rad/s"
-        assert file[f"tracks/{online.key.id}/flags"].attrs["bits"].startswith("1 starting, 2 gap, 4 changed, ")
     flat = export_rows(load_estimates(folder))
     assert {"omega_1", "settling_after_step_2", "rms_2", "false_alarms", "converged"} <= set(flat)
     assert not {"numerator", "delay", "b0", "measures"} & set(flat)
@@ -210,54 +185,3 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert (esprit["valid_share"] == 0).all(), "a step lies in the record"
     again = run_experiment(plan, folder, jobs=1)
     assert (again.computed, again.reused) == (0, 4)
-
-
-#: Runs the specification in a folder of its own, and says so after each data set that is stored.
-RUN = """\
-import sys
-from pathlib import Path
-from ctid_cli.running import events
-from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
-
-def tell(event):
-    if isinstance(event, events.EstimatesDone):
-        print("stored", flush=True)
-
-run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, on_event=tell)
-"""
-
-
-def test_killed_and_resumed_gives_the_same_bytes_with_all_its_tracks(tmp_path):
-    text = SPEC.replace("runs: 2", "runs: 25").replace("tracks: {", "tracks: {runs: 25, ")
-    spec, place = load(tmp_path, text), tmp_path / "killed"
-    command = [sys.executable, "-c", RUN, str(tmp_path / "spec.yaml"), str(place)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
-        assert [process.stdout.readline() for _ in range(2)] == ["stored\n"] * 2
-        os.killpg(process.pid, signal.SIGKILL)
-    assert not (place / "runs.h5").exists()
-    stored = len(read_tracks(place))
-    assert 2 <= stored < 25, "of every data set that was stored, from the journal"
-    resumed = run_experiment(build_plan(spec), place, jobs=1)
-    # The other estimates of a data set may not have been stored when it was killed.
-    assert resumed.reused >= stored
-    assert resumed.reused + resumed.computed == 50
-    run_experiment(build_plan(spec), tmp_path / "undisturbed", jobs=2)
-    assert (place / "runs.h5").read_bytes() == (tmp_path / "undisturbed" / "runs.h5").read_bytes()
-    assert len(read_tracks(place)) == 25
-
-
-def test_a_sealed_file_alone_has_the_tracks_and_the_measures(tmp_path):
-    folder = tmp_path / "out"
-    run_experiment(build_plan(load(tmp_path, SPEC)), folder, jobs=1)
-    tracks, rows = read_tracks(folder), read_stored(folder).rows()
-    (folder / "journal.sqlite").unlink()
-    again = read_stored(folder).rows()
-    assert [row["measures"] for row in again] == [row["measures"] for row in rows]
-    alone = read_tracks(folder)
-    assert alone.keys() == tracks.keys()
-    for name, columns in tracks.items():
-        for column, values in columns.items():
-            assert np.array_equal(alone[name][column], values, equal_nan=True)
-            assert alone[name][column].dtype == values.dtype

@@ -17,7 +17,7 @@ from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.messages import option_docs
-from ctid_cli.specification.spec import RegularDurationSection, TracksSection
+from ctid_cli.specification.spec import RegularDurationSection
 from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ _SECTIONS = {
     "recorder": Recorder,
     "signal": SumOfSinusoids,
     "data": MeasuredSource,
-    "tracks": TracksSection,
 }
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]

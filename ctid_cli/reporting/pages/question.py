@@ -21,7 +21,6 @@ TITLES = {
     "disturbance": "Disturbance",
     "recorder": "Recorder",
     "starts": "Starts",
-    "tracks": "Stored tracks",
 }
 
 #: What of a system is in its equation.
