@@ -419,7 +419,7 @@ def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimation.compilation import compile_kernels
     from ctid_cli.signals.sampling import RegularSampling
     from ctid_cli.simulation.components import CustomEstimation
-    from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
+    from ctid_cli.simulation.frequency_measures import FrequencyEstimation, SignalSource
 
     source = plan.data_cells[0].source
     if not isinstance(source, SignalSource):

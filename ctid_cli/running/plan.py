@@ -12,13 +12,12 @@ from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 from ctid_cli.running.cells import DataCell, DataCells, EstimatorCell, Plan, starts_of
 from ctid_cli.simulation.components import CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import DataSet, Source, located
-from ctid_cli.simulation.frequency_measures import Measuring
-from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalDataSet, SignalSource
+from ctid_cli.simulation.dataset import NO_START, DataSet, Source, located
+from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
-from ctid_cli.specification.start_points import NO_START, start_points
+from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
 

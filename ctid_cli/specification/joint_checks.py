@@ -23,7 +23,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.components import is_custom
-from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.dataset import SimulatedSource, additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
@@ -40,7 +40,6 @@ from ctid_cli.specification.sections import (
     variants,
 )
 from ctid_cli.specification.spec import OF_DATA, Spec
-from ctid_cli.specification.start_points import additive_form
 from ctid_cli.specification.system_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
 

@@ -1,18 +1,20 @@
 """Sections for the system to simulate, for what closes a loop around it, and for where estimators start."""
 
 from collections.abc import Iterator, Mapping
+from decimal import Decimal
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from ctid_cli.arrays import ComplexArray
+from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
-from ctid_cli.simulation.dataset import LoopOptions
+from ctid_cli.simulation.dataset import LoopOptions, StartPoint
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     ByShape,
@@ -362,3 +364,34 @@ class StartsSection(Section):
 
     initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = None
     parameters: Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None = None
+
+
+def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
+    """The starts that a specification names."""
+    if section is None:
+        return ()
+    points: list[StartPoint] = []
+    for delay in section.initial_delay or []:
+        if isinstance(delay, UniformStart):
+            low, high = delay.uniform
+            points.append(StartPoint(f"uniform({_short(low)}, {_short(high)})", "delay", "random", (low, high)))
+        else:
+            points.append(StartPoint(_short(delay), "delay", delay))
+    for parameters in section.parameters or []:
+        values = parameters.model_dump(mode="json")
+        if isinstance(parameters, RelativeStart):
+            spread = parameters.relative_uniform
+            points.append(StartPoint(f"parameters({_percent(spread)}%)", "parameters", spread=spread))
+        else:
+            points.append(StartPoint(f"given {content_hash(values)[:8]}", "parameters", model=parameters.options()))
+    return tuple(points)
+
+
+def _short(value: float) -> str:
+    """The shortest text that is the number again, without a trailing ``.0``."""
+    return repr(value).removesuffix(".0")
+
+
+def _percent(value: float) -> str:
+    """A fraction in percent, as exactly as the fraction was written."""
+    return f"{(100 * Decimal(repr(value))).normalize():f}"

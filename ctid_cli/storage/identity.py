@@ -38,7 +38,7 @@ COMPUTING_FLOORS = {"arrays", "signals", "models", "filtering"}
 COMPUTING_FLOORS |= {"inference", "estimation", "estimators", "frequency", "simulation"}
 #: Modules of other floors that every estimate goes through.
 PATH = (
-    *("ctid_cli.specification.system_sections", "ctid_cli.specification.start_points", "ctid_cli.specification.spec"),
+    *("ctid_cli.specification.system_sections", "ctid_cli.specification.spec"),
     *("ctid_cli.running.plan", "ctid_cli.running.cells", "ctid_cli.running.job", "ctid_cli.canonical"),
 )
 #: Libraries whose version decides what is computed.

@@ -12,8 +12,8 @@ from ctid_cli.running.cells import Task
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.csv_file import read_record
 from ctid_cli.signals.streams import stream
+from ctid_cli.simulation.dataset import StartPoint
 from ctid_cli.specification.load import load_spec, spec_from_canonical
-from ctid_cli.specification.start_points import StartPoint
 
 SPEC = """\
 experiment: toy

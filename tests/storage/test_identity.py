@@ -89,7 +89,7 @@ def mutated(source: str) -> str:
 def test_a_changed_number_or_operator_is_noticed_in_every_module_on_the_way(tree: Path) -> None:
     before = {name: versions(plan, tree) for name, plan in PLANS.items()}
     assert before == {name: versions(plan, ROOT) for name, plan in PLANS.items()}
-    assert set(COMPUTING) >= {f"ctid_cli.simulation.{name}" for name in ("dataset", "frequency_runs")}
+    assert set(COMPUTING) >= {f"ctid_cli.simulation.{name}" for name in ("dataset", "frequency_measures")}
     for module in (*COMPUTING, *PATH):
         file = path_of(module, tree)
         text = file.read_text(encoding="utf-8")
