@@ -1,9 +1,19 @@
 """Specifications that tests write to a file, and what is wrong with them."""
 
+from pathlib import Path
+
 import pytest
 
 from ctid_cli.errors import SpecError
 from ctid_cli.specification.load import load_spec
+
+SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP, RECORD = (
+    Path(__file__).with_name(name).read_text(encoding="utf-8")
+    for name in (
+        *("simulated.yaml", "closed_loop.yaml", "signal.yaml", "open_loop.yaml", "measured.yaml", "measured_loop.yaml"),
+        "record.csv",
+    )
+)
 
 
 def load(folder, text, *overrides):
