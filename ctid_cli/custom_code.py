@@ -24,6 +24,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
+#: What Python's parser may raise.
+_UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)
 #: Letters of the text that names a class.
 MAX_LENGTH = 200
 _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
@@ -45,6 +47,8 @@ class Source:
     @classmethod
     def read(cls, file: Path) -> Self:
         """A module's file, and what the data files that it names hold now."""
+        if file.exists() and not file.is_file():
+            raise CustomCodeError(f"{file.name} is no ordinary file")
         content = file.read_bytes()
         data = []
         for name in _data_files(content, file.name):
@@ -246,7 +250,7 @@ def _data_files(content: bytes, place: str) -> tuple[str, ...]:
     """What a module assigns to FILES: names of data files, seen from its folder."""
     try:
         body = ast.parse(content).body
-    except (SyntaxError, ValueError):
+    except _UNREADABLE:
         return ()
     for node in body:
         if isinstance(node, ast.Assign) and any(isinstance(at, ast.Name) and at.id == "FILES" for at in node.targets):
@@ -262,7 +266,7 @@ def _data_files(content: bytes, place: str) -> tuple[str, ...]:
 def _named(content: bytes, package: str) -> set[str]:
     try:
         nodes = list(ast.walk(ast.parse(content)))
-    except (SyntaxError, ValueError):
+    except _UNREADABLE:
         return set()
     return {parent for node in nodes for full in _imported(node, package) for parent in _parents(full)}
 

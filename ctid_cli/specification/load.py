@@ -108,15 +108,15 @@ def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
         raise SpecError(in_order)
 
 
-def _code_in(tree: Any, path: KeyPath = ()) -> Iterator[KeyPath]:
-    """Where kinds name code, anywhere in a tree."""
-    if isinstance(tree, list):
-        tree = dict(enumerate(tree))
-    if isinstance(tree, Mapping):
-        for key, value in tree.items():
-            if key == "kind" and isinstance(value, str) and names_code(value):
-                yield (*path, key)
-            yield from _code_in(value, (*path, key))
+def _code_in(tree: Any) -> Iterator[KeyPath]:
+    """Where kinds name code, anywhere in a tree, however deep."""
+    waiting: list[tuple[KeyPath, Any]] = [((), tree)]
+    while waiting:
+        path, node = waiting.pop()
+        items = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
+        waiting += (((*path, key), value) for key, value in items)
+        if path and path[-1] == "kind" and isinstance(node, str) and names_code(node):
+            yield path
 
 
 def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Located]]:
@@ -124,9 +124,9 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     tree = source.tree
     # A specification may come from anywhere.
     ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
-    code = [str(source.problem(path, ask)) for path in _code_in(tree)]
+    code = [source.problem(path, ask) for path in _code_in(tree)]
     if code and not allow_code:
-        raise RefusedError("\n".join(code))
+        raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     found: dict[str, Any] = {"experiment": "", "estimators": {}}
     complaints: list[Located] = []
     wanted = KINDS["frequency_estimator" if "signal" in tree else "estimator"]
