@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,11 @@ import numpy as np
 from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import Served, reason, served
 from ctid_cli.errors import SpecError
-from ctid_cli.running.cells import Plan, Task
+from ctid_cli.running.cells import EstimatorCell, Plan, Task
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.dataset import SimulatedSource, StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS, trial
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.storage.columns import FAILURES
@@ -142,16 +143,23 @@ def _parts(source: Any) -> dict[str, Any]:
     return {place: part for place, part in parts.items() if part is not None and is_custom(part)}
 
 
-def _set_global(seed: int) -> None:
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
+    """What is computed with the global generators in two states; only once what takes long."""
+    results = []
+    for seed in (0, 1):
+        begun = time.monotonic()
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+        results.append(compute())
+        if time.monotonic() - begun > SLOW:
+            break
+    return results[0], results[-1]
 
 
 def _of_data(source: SimulatedSource) -> Iterator[Complaint]:
     custom = _parts(source)
-    for path, message in trial(source):
-        yield (*path, "kind") if ".".join(map(str, path)) in custom else path, message
-        return
+    wrong = list(trial(source))
+    yield from (((*path, "kind") if ".".join(map(str, path)) in custom else path, text) for path, text in wrong)
     made: dict[str, Callable[[Any], Any]] = {
         "sampling": lambda r: r.t,
         "excitation": lambda r: r.input.values,
@@ -159,16 +167,13 @@ def _of_data(source: SimulatedSource) -> Iterator[Complaint]:
         "system": lambda r: r.noise_free,
         "noise": lambda r: r.y,
     }
-    records: list[Any] = []
     with suppress(Exception):  # of which the run says more
-        for seed in (0, 1):
-            _set_global(seed)
-            records.append(source.dataset(0).record)
-    for place in custom if len(records) == 2 else ():
-        first, second = (np.asarray(made[place](record), dtype=float) for record in records)
-        if not np.array_equal(first, second, equal_nan=True):
-            yield (*place.split("."), "kind"), f"{GLOBAL} the rng that it is given"
-            return
+        records = _twice(lambda: source.dataset(0).record)
+        for place in custom if not wrong else ():
+            first, second = (np.asarray(made[place](record), dtype=float) for record in records)
+            if not np.array_equal(first, second, equal_nan=True):
+                yield (*place.split("."), "kind"), f"{GLOBAL} the rng that it is given"
+                return
 
 
 def _of_estimators(job: Job, found: Look) -> None:
@@ -177,31 +182,30 @@ def _of_estimators(job: Job, found: Look) -> None:
     except Exception:
         # The run stores that for every estimate.
         return
-    seen: set[str] = set()
+    firsts: dict[str, tuple[EstimatorCell, StartPoint]] = {}
     for key, cell, start in job.wanted:
-        if key.estimator_hash not in seen:
-            seen.add(key.estimator_hash)
+        firsts.setdefault(key.estimator_hash, (cell, start))
+    for cell, start in firsts.values():
+        path = ("estimators", cell.name, "kind")
+        try:
             drawn = start.draw(job.seed, job.replicate, data.true_model)
-            path = ("estimators", cell.name, "kind")
-            results: list[dict[str, Any]] = []
-            try:
-                for seed in (0, 1):
-                    begun = time.monotonic()
-                    _set_global(seed)
-                    fit = cell.estimator.prepare(data.record).fit(drawn)
-                    results.append(plain(data.result_of(fit, drawn, job.terms)))
-                    if time.monotonic() - begun > SLOW:
-                        break
-                if canonical_json(results[0]) != canonical_json(results[-1]):
-                    raise ComponentError(f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options")
-            except ComponentError as error:
-                found.wrong.append((path, str(error)))
-            except MISTAKES as error:
-                found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
-            except BaseException as error:
-                # Of another kind of failure others may be free.
-                text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
-                found.odd.append((path, text))
-            else:
-                if results[0]["status"] not in FAILURES:
-                    found.returned[cell.name] = results[0]
+            first, second = _twice(partial(_estimated, cell.estimator, data, drawn, job.terms))
+            if canonical_json(first) != canonical_json(second):
+                raise ComponentError(f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options")
+        except ComponentError as error:
+            found.wrong.append((path, str(error)))
+        except MISTAKES as error:
+            found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
+        except BaseException as error:
+            # Of another kind of failure others may be free.
+            text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
+            found.odd.append((path, text))
+        else:
+            if first["status"] not in FAILURES:
+                found.returned[cell.name] = first
+
+
+def _estimated(estimator: Any, data: Any, start: Any, terms: Any) -> dict[str, Any]:
+    """An estimate as it would be stored."""
+    found: dict[str, Any] = plain(data.result_of(estimator.prepare(data.record).fit(start), start, terms))
+    return found

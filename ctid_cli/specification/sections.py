@@ -38,7 +38,7 @@ from pydantic_core import CoreSchema
 
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import CustomCodeError, find_class, reason
-from ctid_cli.errors import CtidError
+from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling, geometric_sizes
@@ -150,15 +150,6 @@ def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item
 # Sections
 
 
-class RefusedOptionsError(ValueError):
-    """An option dataclass refused its values; where that is and why."""
-
-    def __init__(self, path: KeyPath, message: str) -> None:
-        super().__init__(message)
-        self.path = path
-        self.message = message
-
-
 class Section(BaseModel):
     """A mapping of the specification."""
 
@@ -225,39 +216,32 @@ class Section(BaseModel):
 
     def part(self, name: str) -> Any:
         """What an option dataclass is given for a field."""
-        return _part(getattr(self, name), (name,))
+        return _part(getattr(self, name))
 
     def options(self) -> Any:
-        """Build the options; what is refused is refused with its place."""
+        """Build the options; an OptionError says which of them is refused and why."""
         try:
             with np.errstate(all="ignore"):  # what overflows is refused, or found by the section's own complaints
                 return self.build()
-        except RefusedOptionsError:
-            raise
         except (Exception, SystemExit) as error:
             if self.custom and not isinstance(error, (ValueError, CtidError)):
-                raise RefusedOptionsError(("kind",), f"refuses these options: {reason(error)}") from None
+                raise OptionError("kind", f"refuses these options: {reason(error)}") from None
             if not isinstance(error, (ValueError, ArithmeticError, CtidError)):
                 raise
             message = str(error).strip() or f"these values were refused ({type(error).__name__})"
-            raise RefusedOptionsError(place_of(error, type(self).model_fields), message) from None
+            raise OptionError("".join(place_of(error, type(self).model_fields)), message) from None
 
 
-def place_of(error: Exception, options: Container[str]) -> KeyPath:
+def place_of(error: Exception, options: Container[str]) -> tuple[str, ...]:
     """The option that an error is about, if it is about one of them."""
     field = getattr(error, "field", "")
     return (field,) if field in options else ()
 
 
-def _part(value: Any, path: KeyPath) -> Any:
+def _part(value: Any) -> Any:
     if isinstance(value, Section):
-        try:
-            return value.options()
-        except RefusedOptionsError as refused:
-            raise RefusedOptionsError((*path, *refused.path), refused.message) from None
-    if isinstance(value, list):
-        return tuple(_part(item, (*path, k)) for k, item in enumerate(value))
-    return value
+        return value.options()  # which nothing has against it: the section was validated before the one it is in
+    return tuple(map(_part, value)) if isinstance(value, list) else value
 
 
 class Geometric(Section):
@@ -568,13 +552,13 @@ def _option_complaints(section: Section) -> list[Complaint]:
         tried.append(swept)
         try:
             one.options()
-        except RefusedOptionsError as refused:
-            if refused.path in swept:
+        except OptionError as refused:
+            path: KeyPath = (refused.field,) if refused.field else ()
+            if path in swept:
                 # Point at the offending item of the list; its value then needs no repetition.
-                place = axes[refused.path].index(swept[refused.path])
-                failures.append(((*refused.path, place), refused.message, {}))
+                failures.append(((*path, axes[path].index(swept[path])), str(refused), {}))
             else:
-                failures.append((refused.path, refused.message, swept))
+                failures.append((path, str(refused), swept))
     return grouped(failures, tried)
 
 

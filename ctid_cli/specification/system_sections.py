@@ -24,7 +24,6 @@ from ctid_cli.specification.sections import (
     Number,
     OneOf,
     Options,
-    RefusedOptionsError,
     Section,
     Swept,
     WithKey,
@@ -123,7 +122,7 @@ class AdditiveSection(Section):
         try:
             return AdditiveModel(self.part("additive"), getattr(self, "delay", 0.0))
         except DataError as error:
-            raise RefusedOptionsError(("additive",), str(error)) from None
+            raise DataError(str(error), "additive") from None
 
 
 _TWICE = "gives the system a second time, 'additive' has it already; keep one of the two forms"
