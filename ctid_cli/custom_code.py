@@ -46,7 +46,7 @@ class Source:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """A module's file, and what the data files that it names hold now."""
+        """Return a module's file, and what the data files that it names hold now."""
         if file.exists() and not file.is_file():
             raise CustomCodeError(f"{file.name} is no ordinary file")
         content = file.read_bytes()
@@ -86,7 +86,7 @@ def find_class(kind: str, folder: Path) -> type[Any]:
 
 
 def reason(error: BaseException) -> str:
-    """An exception in a clause: what it says, and the last line of custom code that it came through."""
+    """Return an exception in a clause: what it says, and the last line of custom code that it came through."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_custom_file(frame.filename)]
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split())
@@ -153,7 +153,7 @@ class Served:
 
 
 def served() -> Served:
-    """What a worker must be told before it reads the rest of a job."""
+    """Return what a worker must be told before it reads the rest of a job."""
     return Served(dict(_SERVED))
 
 
@@ -170,7 +170,7 @@ def _serve(sources: dict[str, Source]) -> None:
 
 
 def _serve_file(path: Path, place: str) -> str:
-    """Name of the module that a file is now served as; the modules beside it that it imports are inside that."""
+    """Return the name of the module that a file is now served as; the neighbours that it imports are inside that."""
     try:
         sources = _with_neighbours(path)
     except FileNotFoundError:
@@ -188,7 +188,7 @@ def _serve_file(path: Path, place: str) -> str:
 
 
 def _with_neighbours(path: Path) -> dict[str, Source]:
-    """A file, under no name, and the modules in its folder that it imports, directly or not."""
+    """Return a file, under no name, and the modules in its folder that it imports, directly or not."""
     found, waiting = {"": Source.read(path)}, [""]
     while waiting:
         name = waiting.pop()
@@ -210,7 +210,7 @@ def _beside(folder: Path, name: str) -> Path | None:
 
 
 def is_custom_file(file: str | None) -> bool:
-    """Whether a file is neither part of Python, nor of an installed package, nor of ctid."""
+    """Return whether a file is neither part of Python, nor of an installed package, nor of ctid."""
     if not file or not os.path.isabs(file):
         return False
     parts = Path(file).parts
@@ -219,7 +219,7 @@ def is_custom_file(file: str | None) -> bool:
 
 
 def source_of(name: str) -> Source | None:
-    """What a custom module is made from; None for any other name."""
+    """Return what a custom module is made from; None for any other name."""
     if name in _SERVED:
         return _SERVED[name]
     # What has side effects when it is imported may do anything.
@@ -240,14 +240,14 @@ def _is_installed(name: str) -> bool:
 
 
 def imports_of(source: Source, name: str) -> set[str]:
-    """Modules, and names that may be modules, that a module imports by a statement anywhere in it."""
+    """Return the modules, and names that may be modules, that a module imports by a statement anywhere in it."""
     found = _named(source.content, name if source.is_package else name.rpartition(".")[0])
     neighbours = {other: f"{name.partition('.')[0]}.{other}" for other in found}
     return {private if private in _SERVED else other for other, private in neighbours.items()} - {name}
 
 
 def _data_files(content: bytes, place: str) -> tuple[str, ...]:
-    """What a module assigns to FILES: names of data files, seen from its folder."""
+    """Return what a module assigns to FILES: names of data files, seen from its folder."""
     try:
         body = ast.parse(content).body
     except _UNREADABLE:

@@ -138,13 +138,13 @@ def _look(sources: list[SimulatedSource], job: Job) -> Look:
 
 
 def _parts(source: Any) -> dict[str, Any]:
-    """Custom components that make a data set, by their place in the specification, in the order of their work."""
+    """Return the custom components that make a data set, by their places, in the order of their work."""
     parts = source.parts if isinstance(source, SimulatedSource) else {}
     return {place: part for place, part in parts.items() if part is not None and is_custom(part)}
 
 
 def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
-    """What is computed with the global generators in two states; only once what takes long."""
+    """Return what is computed with the global generators in two states; only once what takes long."""
     results = []
     for seed in (0, 1):
         begun = time.monotonic()
@@ -206,6 +206,6 @@ def _of_estimators(job: Job, found: Look) -> None:
 
 
 def _estimated(estimator: Any, data: Any, start: Any, terms: Any) -> dict[str, Any]:
-    """An estimate as it would be stored."""
+    """Return an estimate as it would be stored."""
     found: dict[str, Any] = plain(data.result_of(estimator.prepare(data.record).fit(start), start, terms))
     return found

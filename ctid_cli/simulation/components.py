@@ -178,7 +178,7 @@ Estimator.register(common.Estimator)
 
 
 def is_custom(component: Any) -> bool:
-    """Whether a component is none of ctid's."""
+    """Return whether a component is none of ctid's."""
     return component is not None and not type(component).__module__.startswith("ctid_cli.")
 
 
@@ -287,7 +287,7 @@ def taken(found: Any, record: Record, what: str) -> Fit:
 
 
 def _stated(found: Any, what: str) -> Status:
-    """The status of a mapping that has only keys which it may have."""
+    """Return the status of a mapping that has only keys which it may have."""
     if not isinstance(found, Mapping):
         wanted = "a Fit or a mapping with parameters, standard_errors and status is expected"
         raise ComponentError(f"{what} returned {type(found).__name__}, and {wanted}")
@@ -302,7 +302,7 @@ def _stated(found: Any, what: str) -> Status:
 
 
 def _numbers(found: Any, what: str, *, finite: bool) -> dict[str, float]:
-    """Numbers by name."""
+    """Return checked numbers by name."""
     if not isinstance(found, Mapping):
         raise ComponentError(f"{what}: {type(found).__name__}; numbers by name are expected, such as {{'b0': 2.0}}")
     values = {}
@@ -319,7 +319,7 @@ def _numbers(found: Any, what: str, *, finite: bool) -> dict[str, float]:
 
 
 def _model(named: Mapping[str, float], what: str) -> TransferFunction | None:
-    """The transfer function that ``b0 …``, ``a1 …`` and ``delay`` make, in descending powers; None without them."""
+    """Return the transfer function that ``b0 …``, ``a1 …`` and ``delay`` make, in descending powers, if they do."""
     given = {letter: [name for name in named if re.fullmatch(rf"{letter}\d+", name)] for letter in "ba"}
     if not given["b"] or not given["a"]:
         return None
@@ -339,7 +339,7 @@ def _model(named: Mapping[str, float], what: str) -> TransferFunction | None:
 
 
 def _agreement(model: TransferFunction, record: Record) -> tuple[float, float]:
-    """Mean squared output error [output unit^2] and fit [%] from rest; NaN where the model cannot be simulated."""
+    """Return mean squared output error [output unit^2] and fit [%] from rest; NaN where there is no simulation."""
     from ctid_cli.filtering.simulate import simulate
 
     try:

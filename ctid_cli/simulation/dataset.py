@@ -51,7 +51,7 @@ class LoopOptions:
     enters: Enters = "controller"
 
     def at(self, interval: float) -> Self:
-        """The loop with the controller that acts at a sampling interval."""
+        """Return the loop with the controller that acts at a sampling interval."""
         if not isinstance(self.controller, ContinuousPid):
             return self
         return dataclasses.replace(self, controller=self.controller.discrete(interval))
@@ -67,7 +67,7 @@ class InSubmodels(NamedTuple):
 
 
 def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
-    """Parameters of the submodels of an estimate, with errors and quantiles where it has them in another form.
+    """Return the submodels' parameters of an estimate, with errors and quantiles where it has them in another form.
 
     The covariance of a fraction's coefficients goes with the Jacobian of its partial fractions. A fraction has none in
     the given terms if its poles are repeated, not as many, or more of them complex than the terms have room for.
@@ -110,7 +110,7 @@ class DataSet:
     fresh: Callable[[], Record] | None = None
 
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
-        """What is stored of a fit to the record."""
+        """Return what is stored of a fit to the record."""
         parameters, errors, quantiles = additive_parameters(fit, terms)
         errors, quantiles = {**fit.standard_errors, **errors}, {**fit.quantiles, **quantiles}
         law = fit.law
@@ -219,7 +219,7 @@ class SimulatedSource:
         return DataSet(record, true_model=true_model)
 
     def _applied(self, times: Array, replicate: int) -> HeldSignal:
-        """What drives the simulation: the input, or the reference of the loop."""
+        """Return what drives the simulation: the input, or the reference of the loop."""
         generator = self.excitation if self.loop is None else self.loop.reference
         if generator is None:  # a relay needs no reference
             return HeldSignal(times[:1], np.zeros(1))
@@ -306,7 +306,7 @@ def samples_of(component: Any, method: str, *given: Any, size: int | None = None
 
 
 def _called(component: Any, method: str) -> str:
-    """How a message names a method of a component."""
+    """Return how a message names a method of a component."""
     return f"{type(component).__name__}.{method}"
 
 
@@ -356,7 +356,7 @@ class MeasuredSource:
             raise OptionError("hold", "must be zoh in a loop: a discrete controller holds the input")
 
     def dataset(self, replicate: int) -> DataSet:
-        """The record."""
+        """Read the record."""
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         if self.sha256 is not None:
@@ -398,7 +398,7 @@ Source = SimulatedSource | MeasuredSource
 
 
 def _simulated(system: TransferFunction | AdditiveModel, applied: HeldSignal, times: Array) -> Array:
-    """Output of a model."""
+    """Return the output of a model."""
     from ctid_cli.filtering.simulate import simulate, simulate_additive
 
     if isinstance(system, AdditiveModel):
@@ -418,17 +418,17 @@ def _fit_percent(model: Any, record: Record | None, output: str) -> float | None
 
 
 def joined(folder: Path, file: str) -> str:
-    """Name of a file as seen from the working directory."""
+    """Return the name of a file as seen from the working directory."""
     return Path(os.path.normpath(folder / file)).as_posix()
 
 
 def located(options: Any, folder: Path) -> Any:
-    """Options with the name of the file that they read, if any, as seen from the working directory."""
+    """Return the options with the name of the file that they read, if any, as seen from the working directory."""
     return dataclasses.replace(options, file=joined(folder, options.file)) if hasattr(options, "file") else options
 
 
 def file_sha256(path: str) -> str:
-    """Content hash of a file."""
+    """Return the content hash of a file."""
     if not Path(path).exists():
         raise DataError(f"{path}: there is no such file; names start at the folder of the specification")
     require_file(path)
@@ -456,7 +456,7 @@ UNEXPLAINED = 0.05
 
 
 def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
-    """The measurement with its reference and controller; a DataError says why they cannot be those of the record."""
+    """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
     record, r = measured.record, measured.reference_values
     assert r is not None
     if isinstance(loop.controller, Relay):
@@ -485,7 +485,7 @@ _IGNORE = "{}; correct --loop or --reference, or give --ignore-loop to fit as if
 
 
 def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:
-    """Root mean square of ``A u - B e`` relative to that of its terms, where ``C = B/A``; of any initial state."""
+    """Return the root mean square of ``A u - B e`` relative to that of its terms; ``C = B/A``, any initial state."""
     a, b = controller.denominator, controller.numerator
     b = np.concatenate((np.zeros(a.size - b.size), b))
     at_controller = enters == "controller"
@@ -532,7 +532,7 @@ class StartPoint:
     def draw(
         self, seed: int | None, replicate: int, true_model: TransferFunction | AdditiveModel | None = None
     ) -> Start | None:
-        """The start on one data set.
+        """Return the start on one data set.
 
         Every random start stretches the same numbers of the replicate's stream over its own range, so that no start
         depends on which others there are.
@@ -557,5 +557,5 @@ NO_START = StartPoint("none")
 
 
 def additive_form(model: TransferFunction | AdditiveModel) -> AdditiveModel:
-    """A model as a sum of submodels."""
+    """Return a model as a sum of submodels."""
     return model if isinstance(model, AdditiveModel) else factored(model)

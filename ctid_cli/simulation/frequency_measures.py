@@ -60,7 +60,7 @@ class Measuring:
 
 
 def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
-    """The frequencies that an estimator of so many tones should find."""
+    """Return the frequencies that an estimator of so many tones should find."""
     true = signal.frequencies_at(times)
     if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
         true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)
@@ -104,7 +104,7 @@ def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[flo
 
 
 def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
-    """Names of the measures that any estimate has, in the order of columns."""
+    """Return the names of the measures that any estimate has, in the order of columns."""
     order = list(MEASURE_UNITS)
 
     def place(name: str) -> tuple[int, int]:
@@ -115,13 +115,13 @@ def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
 
 
 def base_name(name: str) -> tuple[str, int]:
-    """A measure without the number of its tone, and that number."""
+    """Return a measure without the number of its tone, and that number."""
     base, _, tone = name.rpartition("_")
     return (base, int(tone)) if tone.isdigit() else (name, 0)
 
 
 def is_settled(measures: Mapping[str, float | None] | None, band: float, by: float | None) -> bool:
-    """Whether all frequencies came into the band in time and stayed there."""
+    """Return whether all frequencies came into the band in time and stayed there."""
     if not measures:
         return False
     times = [value for name, value in measures.items() if name.startswith("settling_")]
@@ -179,7 +179,7 @@ class SignalDataSet:
     true_model: ClassVar[None] = None
 
     def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
-        """What is stored of a fit to the record."""
+        """Return what is stored of a fit to the record."""
         source, measuring = self.source, self.source.measuring
         times = self.record.interval * np.arange(self.record.samples.size, dtype=float)
         true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
@@ -203,7 +203,7 @@ class SignalSource:
     measuring: Measuring
 
     def dataset(self, replicate: int) -> SignalDataSet:
-        """One realisation."""
+        """Make one realisation."""
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
         signal = self.signal.generate(times)
         samples = disturb(signal, times, self.disturbance, stream(self.seed, "noise", replicate))

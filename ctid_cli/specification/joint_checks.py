@@ -112,13 +112,13 @@ def _has_relay(loop: Mapping[str, Any]) -> bool:
 
 
 def _reference(raw: Mapping[str, Any], section: str) -> Any:
-    """The reference in a section, whatever the section is."""
+    """Return the reference in a section, whatever the section is."""
     content = raw.get(section)
     return content.get("reference") if isinstance(content, Mapping) else None
 
 
 def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> str:
-    """A section of simulated data that draws random numbers; empty if none does."""
+    """Return a section of simulated data that draws random numbers; empty if none does."""
     if "data" in present:
         return ""
     parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
@@ -131,7 +131,7 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
 
 
 def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
-    """Whether the class that a section, which may be broken, names draws no random number with its options."""
+    """Return whether the class that a section, which may be broken, names draws no random number with its options."""
     target = None if section is None else section.target
     options = content if isinstance(content, Mapping) else {}
     kind = options.get("kind")
@@ -148,7 +148,7 @@ def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
 
 
 def too_many_cases(spec: Spec) -> str:
-    """Why not even the combinations of a specification can be looked at; empty if they can."""
+    """Return why not even the combinations of a specification can be looked at; empty if they can."""
     cells = math.prod(case_count(getattr(spec, name)) for name in OF_DATA)
     estimators = sum(map(case_count, spec.estimators.values()))
     if cells > MAX_COMBINATIONS:
@@ -255,14 +255,14 @@ class Extent:
         return self.interval * (self.samples - 1)
 
     def samples_after(self, delay: float) -> int:
-        """How many samples a delay [s] leaves."""
+        """Return how many samples a delay [s] leaves."""
         if self.times is not None:
             return int(np.count_nonzero(self.times >= delay))
         return max(self.samples - math.ceil(delay / self.interval), 0)
 
 
 def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
-    """How long the records are: the measured one, or one for each sampling."""
+    """Return how long the records are: the measured one, or one for each sampling."""
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
@@ -294,7 +294,7 @@ def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]
 
 
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
-    """What each estimator of a system has against the record, the loop and the initial delays."""
+    """Say what each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
         if section.kind in KINDS["frequency_estimator"] or section.custom:
             continue
@@ -340,7 +340,7 @@ def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str])
 
 
 def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
-    """What a start around the true parameters has against the system."""
+    """Say what a start around the true parameters has against the system."""
     if spec.data is not None:
         yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
     elif spec.system is not None and spec.system.custom:
@@ -414,7 +414,7 @@ def _truth_complaints(path: KeyPath, truth: Mapping[str, Any], rule: str) -> Ite
 
 
 def has_relay(spec: Spec) -> bool:
-    """Whether a relay closes the loop: estimators know nothing of it, and take the record for one in open loop."""
+    """Return whether a relay closes the loop: to estimators the record is one in open loop."""
     return spec.loop is not None and hasattr(spec.loop.controller, "relay")
 
 
@@ -504,7 +504,7 @@ def trial(source: SimulatedSource) -> Iterator[Complaint]:
 
 
 def _signal_complaints(spec: Spec) -> Iterator[Complaint]:
-    """What the sections of an experiment on a signal have against each other."""
+    """Say what the sections of an experiment on a signal have against each other."""
     clocks = variants(spec.sampling)
     if any(not isinstance(clock.options, RegularSampling) for clock in clocks):
         yield ("sampling", "kind"), "must be regular: estimators of frequencies compare samples at fixed delays"

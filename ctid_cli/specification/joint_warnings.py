@@ -26,7 +26,7 @@ ON_TIME = 1e-6
 
 
 def joint_warnings(spec: Spec) -> list[Complaint]:
-    """What is allowed but unwise."""
+    """Say what is allowed but unwise."""
     if spec.signal is not None:
         return _signal_warnings(spec)
     warnings = [] if spec.system is None else _simulation_warnings(spec)
@@ -50,7 +50,7 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 
 
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
-    """What is unwise where the truth is known."""
+    """Say what is unwise where the truth is known."""
     warnings: list[Complaint] = []
     if spec.noise is not None and not spec.noise.custom:
         for name, section in spec.estimators.items():
@@ -159,7 +159,7 @@ def _of_structure(at: KeyPath, system: Any, options: Any) -> Iterator[Complaint]
 
 
 def _degrees(model: Any) -> tuple[int, int] | None:
-    """Degrees of denominator and numerator of a system or of the model of an estimator, as one fraction."""
+    """Return the degrees of denominator and numerator of a system or of the model of an estimator, as one fraction."""
     if hasattr(model, "relative_degree"):
         return model.order, model.order - model.relative_degree
     if hasattr(model, "terms"):
@@ -179,7 +179,7 @@ def _fraction_degrees(terms: Sequence[Term]) -> tuple[int, int]:
 
 
 def _signal_warnings(spec: Spec) -> list[Complaint]:
-    """What is allowed but unwise in an experiment on a signal."""
+    """Say what is allowed but unwise in an experiment on a signal."""
     signal = variants(spec.signal)[0].options
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():

@@ -93,7 +93,7 @@ def load_loop(path: Path) -> LoopOptions:
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of specifications, for editors."""
+    """Return the JSON Schema of specifications, for editors."""
     schema = Spec.model_json_schema()
     ways = ("data", "system excitation sampling", "system loop sampling", "signal sampling")
     schema["anyOf"] = [{"required": way.split()} for way in ways]
@@ -109,7 +109,7 @@ def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
 
 
 def _code_in(tree: Any) -> Iterator[KeyPath]:
-    """Where kinds name code, anywhere in a tree, however deep."""
+    """Return where kinds name code, anywhere in a tree, however deep."""
     waiting: list[tuple[KeyPath, Any]] = [((), tree)]
     while waiting:
         path, node = waiting.pop()
@@ -155,7 +155,7 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
 
 
 def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What is looked at by itself: every section, and every estimator."""
+    """Return what is looked at by itself: every section, and every estimator."""
     for name in tree.keys() & Spec.model_fields.keys():
         value = tree[name]
         if name == "estimators" and isinstance(value, dict) and value:
@@ -176,7 +176,7 @@ def _about(key: str, error: str, value: Any) -> ErrorDetails:
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """The specification with the content hash of its file filled in, and what is wrong with the file.
+    """Return the specification with the content hash of its file filled in, and what is wrong with the file.
 
     Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
     """

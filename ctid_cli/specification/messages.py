@@ -49,12 +49,12 @@ SENTENCES = {
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """An error whose text reaches the user as it is."""
+    """Return an error whose text reaches the user as it is."""
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
 def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
-    """One validation error that holds several problems."""
+    """Return one validation error that holds several problems."""
     details = [
         InitErrorDetails(
             type=PydanticCustomError("said", "{message}", {"message": message, "at_key": at_key}), loc=path, input=None
@@ -65,7 +65,7 @@ def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
 
 
 def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
-    """Place and sentence of an error in a section whose fields have the given descriptions."""
+    """Return the place and the sentence of an error in a section whose fields have the given descriptions."""
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
@@ -81,7 +81,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
 
 
 def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tuple[KeyPath, str, Any, dict[str, Any]]:
-    """What is to be told of an error, where pydantic's own type, or place, says too little."""
+    """Return what is to be told of an error, where pydantic's own type, or place, says too little."""
     if kind == "no_kind" and not isinstance(value, Mapping):
         text = f"a mapping with a 'kind' (one of {context['allowed']})"
         each = "; several kinds are several experiments, each with a file" if isinstance(value, list) else ""
@@ -95,7 +95,7 @@ def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tupl
 
 
 def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
-    """What a sentence may say about a field, and about the others of its section."""
+    """Return what a sentence may say about a field, and about the others of its section."""
     field = str(path[0]) if path else ""
     description = descriptions.get(field, "")
     unit = re.search(r" \[[^\]-][^\]]*\]", description)
@@ -108,7 +108,7 @@ def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
-    """What to write in the place of a value, where that can be guessed."""
+    """Return what to write in the place of a value, where that can be guessed."""
     if kind in ("float_type", "int_type") and isinstance(value, (list, tuple)):
         return "; this key cannot be swept"
     if kind == "float_type" and isinstance(value, str) and re.match(r"\s*[-+]?\.?[0-9]", value):
@@ -124,7 +124,7 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
 
 @cache
 def option_docs(target: type) -> dict[str, str]:
-    """The text about every option of a class and its bases, by name: the section Parameters of their docstrings."""
+    """Return the text about every option of a class and its bases: the section Parameters of their docstrings."""
     docs: dict[str, str] = {}
     for base in reversed(target.__mro__):
         text = inspect.cleandoc(base.__dict__.get("__doc__") or "")
@@ -137,7 +137,7 @@ def option_docs(target: type) -> dict[str, str]:
 
 
 def shown(value: Any) -> str:
-    """A value from a YAML file in the words of a message."""
+    """Return a value from a YAML file in the words of a message."""
     if value is None:
         return "nothing (null)"
     if isinstance(value, bool):

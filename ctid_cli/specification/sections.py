@@ -135,7 +135,7 @@ def _different(values: list[Any]) -> list[Any]:
 
 
 def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item: "this start") -> list[Any]:
-    """The values, if none is there twice."""
+    """Return the values, if none is there twice."""
     seen: set[str] = set()
     for k, item in enumerate(values):
         # Lists and sections have no hash; what is equal reads alike.
@@ -166,7 +166,7 @@ class Section(BaseModel):
 
     @classmethod
     def descriptions(cls) -> dict[str, str]:
-        """What is said about each key: by the docstring of the section, or of the option dataclass it was made from."""
+        """Return what the docstring of the section, or of the option dataclass it was made from, says of each key."""
         docs = {"kind": "Which one it is"} | option_docs(cls.target or cls) | option_docs(cls)
         return {name: docs.get(name, "") for name in cls.model_fields}
 
@@ -200,22 +200,22 @@ class Section(BaseModel):
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-        """What is wrong with the presence of keys, whatever their values."""
+        """Say what is wrong with the presence of keys, whatever their values."""
         yield from ()
 
     def complaints(self) -> Iterator[Complaint]:
-        """What is wrong with the section although every value, and the option dataclass if any, is right by itself."""
+        """Say what is wrong with the section although every value, and the options if any, are right by themselves."""
         if self.if_empty and all(getattr(self, name) is None for name in type(self).model_fields):
             yield (), self.if_empty
 
     def build(self) -> Any:
-        """The options that the section describes, where nothing is swept."""
+        """Return the options that the section describes, where nothing is swept."""
         assert self.target is not None
         options = {option.name for option in dataclasses.fields(self.target) if option.init}
         return self.target(**{name: self.part(name) for name in type(self).model_fields if name in options})
 
     def part(self, name: str) -> Any:
-        """What an option dataclass is given for a field."""
+        """Return what an option dataclass is given for a field."""
         return _part(getattr(self, name))
 
     def options(self) -> Any:
@@ -233,7 +233,7 @@ class Section(BaseModel):
 
 
 def place_of(error: Exception, options: Container[str]) -> tuple[str, ...]:
-    """The option that an error is about, if it is about one of them."""
+    """Return the option that an error is about, if it is about one of them."""
     field = getattr(error, "field", "")
     return (field,) if field in options else ()
 
@@ -266,7 +266,7 @@ class Geometric(Section):
             yield ("geometric",), str(error)
 
     def values(self) -> list[int]:
-        """The numbers."""
+        """Return the numbers."""
         first, last, count = self.geometric
         return geometric_sizes(first, last, count)
 
@@ -274,7 +274,7 @@ class Geometric(Section):
 def section_for(
     target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
 ) -> type[Section]:
-    """Section of an option dataclass."""
+    """Return the section of an option dataclass."""
     hints = get_type_hints(target)
     fields: dict[str, Any] = {}
     if kind:
@@ -329,7 +329,7 @@ class WithKey(OneOf):
 
 
 def _form(hint: Any, name: str) -> tuple[Any, bool]:
-    """Annotation of an option of a given type, and whether it can be swept."""
+    """Return the annotation of an option of a given type, and whether it can be swept."""
     simple = {float: Number, int: Whole, bool: bool, str: Text, Array: Coefficients}
     origin, arguments = get_origin(hint), get_args(hint)
     if hint in simple:
@@ -354,7 +354,7 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
 
 
 def _list_form(items: tuple[Any, ...]) -> Any:
-    """Annotation of an option that is a tuple of numbers, words or option dataclasses; None for any other tuple."""
+    """Return the annotation of a tuple of numbers, words or option dataclasses; None for any other tuple."""
     if dataclasses.is_dataclass(items[0]):
         # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
         item = section_for(items[0], sweeping=False)  # type: ignore[arg-type]
@@ -365,7 +365,7 @@ def _list_form(items: tuple[Any, ...]) -> Any:
 
 
 def _default(option: dataclasses.Field[Any]) -> Any:
-    """The default as a file would give it."""
+    """Return the default as a file would give it."""
     default: Any = option.default
     if option.default_factory is not dataclasses.MISSING:
         default = option.default_factory()
@@ -391,12 +391,12 @@ CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
 
 
 def names_code(kind: str) -> bool:
-    """Whether a kind names a file or a module."""
+    """Return whether a kind names a file or a module."""
     return ":" in kind
 
 
 def custom_form(part: str) -> Any:
-    """Annotation of the section of a custom component."""
+    """Return the annotation of the section of a custom component."""
 
     def validated(value: Any, info: ValidationInfo) -> Section:
         if isinstance(value, Section):
@@ -418,7 +418,7 @@ def custom_form(part: str) -> Any:
 
 
 def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
-    """Section of a custom class, if it is what this part of a specification needs."""
+    """Return the section of a custom class, if it is what this part of a specification needs."""
     name, (base, methods) = target.__name__, CONTRACTS[part]
     wanted = " or ".join(f"{method}(self, {', '.join(given)})" for method, given in methods.items())
     if part != "estimator" and not issubclass(target, base):
@@ -501,14 +501,14 @@ class Variant:
 
 
 def variants(section: Section | None) -> list[Variant]:
-    """All combinations of a section's swept values, the last swept field changing fastest; none of no section."""
+    """Return all combinations of a section's swept values, the last one changing fastest; none of no section."""
     if section is None:
         return []
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
 
 
 def case_count(section: Any) -> int:
-    """Number of combinations of a section's swept values, before any of them is made."""
+    """Return the number of combinations of a section's swept values, before any of them is made."""
     return math.prod(len(values) for _, values in _axes(section)) if isinstance(section, Section) else 1
 
 
@@ -532,7 +532,7 @@ def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], Sectio
 
 
 def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
-    """A section with another value at a place in it."""
+    """Return a section with another value at a place in it."""
     name = str(path[0])
     inner = value if len(path) == 1 else replaced(getattr(section, name), path[1:], value)
     return section.model_copy(update={name: inner})

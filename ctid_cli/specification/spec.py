@@ -79,7 +79,7 @@ class RegularDurationSection(Section):
     duration: Annotated[float | list[float], Swept(Positive)]
 
     def build(self) -> RegularSampling:
-        """The sampling scheme."""
+        """Return the sampling scheme."""
         interval, duration = self.part("interval"), self.part("duration")
         if not duration >= 2.0 * interval:
             message = f"duration must be at least two sampling intervals of {interval:g} s, not {duration:g} s."
@@ -326,7 +326,7 @@ class Spec(Section):
         return self._warnings
 
     def problem(self, path: KeyPath, message: str) -> Problem:
-        """Something wrong at a key path, with its place in the file."""
+        """Return something wrong at a key path, with its place in the file."""
         return self._source.problem(path, message)
 
     @property
@@ -340,5 +340,5 @@ class Spec(Section):
         return self._folder
 
     def canonical(self) -> dict[str, Any]:
-        """The specification with all defaults, as plain data."""
+        """Return the specification with all defaults, as plain data."""
         return self.model_dump(mode="json")

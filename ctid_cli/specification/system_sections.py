@@ -118,7 +118,7 @@ class AdditiveSection(Section):
     additive: Annotated[list[SubmodelSection], Field(min_length=1)]
 
     def build(self) -> AdditiveModel:
-        """The sum."""
+        """Return the sum."""
         try:
             return AdditiveModel(self.part("additive"), getattr(self, "delay", 0.0))
         except DataError as error:
@@ -174,7 +174,7 @@ _CONTROLLERS = ("pid", "continuous_pid", "relay", "numerator", "denominator")
 
 
 def _other_forms(form: str) -> dict[str, str]:
-    """Sentences for the keys of the other forms of a controller."""
+    """Return the sentences for the keys of the other forms of a controller."""
     twice = f"gives the controller a second time, '{form}' has it already; keep one of the forms"
     return {key: twice for key in _CONTROLLERS if key != form}
 
@@ -197,7 +197,7 @@ class PidSection(Section):
     kd: _Gain = 0.0
 
     def build(self) -> DiscreteController:
-        """The controller."""
+        """Return the controller."""
         return DiscreteController.from_pid(**self.model_dump())
 
 
@@ -205,7 +205,7 @@ class ControllerSection(Section):
     """A controller in the form of its one key."""
 
     def build(self) -> Any:
-        """The controller."""
+        """Return the controller."""
         return self.part(*type(self).model_fields)
 
 
@@ -336,7 +336,7 @@ def _form(value: Any) -> str | None:
 
 
 def _several(one: OneOf) -> ByShape:
-    """A start or a list of different ones."""
+    """Return a start or a list of different ones."""
     item = Annotated[Any, one]
     return ByShape(item, list=Annotated[list[item], Field(min_length=1), AfterValidator(without_copies)])
 
@@ -366,7 +366,7 @@ class StartsSection(Section):
 
 
 def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
-    """The starts that a specification names."""
+    """Return the starts that a specification names."""
     if section is None:
         return ()
     points: list[StartPoint] = []
@@ -387,10 +387,10 @@ def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
 
 
 def _short(value: float) -> str:
-    """The shortest text that is the number again, without a trailing ``.0``."""
+    """Return the shortest text that is the number again, without a trailing ``.0``."""
     return repr(value).removesuffix(".0")
 
 
 def _percent(value: float) -> str:
-    """A fraction in percent, as exactly as the fraction was written."""
+    """Return a fraction in percent, as exactly as the fraction was written."""
     return f"{(100 * Decimal(repr(value))).normalize():f}"

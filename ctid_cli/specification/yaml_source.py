@@ -72,11 +72,11 @@ class Place:
 
     @classmethod
     def of(cls, mark: Any) -> Self:
-        """The place of a mark of PyYAML, which knows its file."""
+        """Return the place of a mark of PyYAML, which knows its file."""
         return cls(mark.name, mark.line + 1, mark.column + 1)
 
     def problem(self, path: KeyPath, message: str) -> Problem:
-        """A problem here."""
+        """Return a problem here."""
         return Problem(self.file, self.line, self.column, path_text(path), message)
 
 
@@ -93,7 +93,7 @@ class YamlSource:
     problems: list[Problem] = field(default_factory=list)
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
-        """Where a problem with a key path is to be reported."""
+        """Return where a problem with a key path is to be reported."""
         while path and path not in self.values:
             path, key = path[:-1], True
         if path in self.keys and (key or isinstance(self.value(path), dict)):
@@ -101,18 +101,18 @@ class YamlSource:
         return self.values.get(path, Place(self.file, 1, 1))
 
     def value(self, path: KeyPath) -> Any:
-        """The value at a key path, or None where there is none."""
+        """Return the value at a key path, or None where there is none."""
         try:
             return reduce(operator.getitem, path, self.tree)
         except (KeyError, IndexError, TypeError):
             return None
 
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
-        """A problem at a key path."""
+        """Return a problem at a key path."""
         return self.place(path, key=key).problem(path, message)
 
     def build(self, node: Any, path: KeyPath = (), parents: tuple[Any, ...] = ()) -> Any:
-        """The value of a node; what is wrong with it goes to the problems."""
+        """Return the value of a node; what is wrong with it goes to the problems."""
         place = self.values[path] = Place.of(node.start_mark)
         if len(self.values) > MAX_VALUES:
             raise SpecError(
@@ -174,7 +174,7 @@ class YamlSource:
 
 
 def path_text(path: KeyPath) -> str:
-    """A key path as users write it."""
+    """Return a key path as users write it."""
     text = ""
     for part in path:
         word = part if isinstance(part, int) or len(part) <= MAX_KEY else part[: MAX_KEY - 1] + "…"
@@ -206,7 +206,7 @@ def read_yaml(path: Path, overrides: Iterable[str] = ()) -> YamlSource:
 
 
 def written(tree: Mapping[str, Any]) -> str:
-    """A mapping as YAML text."""
+    """Return a mapping as YAML text."""
     try:
         return str(yaml.safe_dump(plain(tree), sort_keys=False, allow_unicode=True))
     except yaml.YAMLError as error:
@@ -215,7 +215,7 @@ def written(tree: Mapping[str, Any]) -> str:
 
 
 def parse_yaml(text: str, file: str, overrides: Iterable[str] = ()) -> YamlSource:
-    """Values and places of a YAML text, in which ``key.path=value`` may set others."""
+    """Return the values and places of a YAML text, in which ``key.path=value`` may set others."""
     source, root = YamlSource(file, text), _composed(text, file)
     for number, override in enumerate(overrides, start=1):
         try:
@@ -230,7 +230,7 @@ def parse_yaml(text: str, file: str, overrides: Iterable[str] = ()) -> YamlSourc
 
 
 def _composed(text: str, file: str) -> Any:
-    """The tree of nodes of a YAML text, whose marks know the file; None of an empty text."""
+    """Return the tree of nodes of a YAML text, whose marks know the file; None of an empty text."""
     try:
         loader = _Loader(text)
         loader.name = file
@@ -250,7 +250,7 @@ def _composed(text: str, file: str) -> Any:
 
 
 def _overridden(root: Any, override: str, number: int) -> Any:
-    """The tree of nodes in which a value is set as ``--set a.b=value`` asks; its places are in that option."""
+    """Return the tree of nodes in which a value is set as ``--set a.b=value`` asks; its places are in that option."""
     key, equals, text = override.partition("=")
     path = tuple(part.strip() for part in key.split("."))
     here = yaml.Mark(OVERRIDE_FILE, 0, number - 1, 0, None, 0)
@@ -266,7 +266,7 @@ def _overridden(root: Any, override: str, number: int) -> Any:
     value = _composed(before + text, OVERRIDE_FILE) or yaml.ScalarNode(_TAG + "null", "", here)
 
     def with_value(node: Any, depth: int) -> Any:
-        """The same mapping with the value somewhere in it; nodes that aliases share are left as they are."""
+        """Return the same mapping with the value somewhere in it; nodes that aliases share are left as they are."""
         if depth == len(path):
             return value
         if node is None or node.tag == _TAG + "null":
@@ -291,7 +291,7 @@ def _overridden(root: Any, override: str, number: int) -> Any:
 
 
 def _syntax_message(error: yaml.MarkedYAMLError) -> str:
-    """PyYAML's complaint as a sentence, with the usual cause where it is known."""
+    """Return PyYAML's complaint as a sentence, with the usual cause where it is known."""
     problem = (error.problem or "the text is not valid YAML").strip()
     if "'\\t'" in problem:
         return "a tab is not allowed here; indent with spaces"
