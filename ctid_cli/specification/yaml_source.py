@@ -15,11 +15,9 @@ alias (``b: *a``) says the same openly.
 
 from __future__ import annotations
 
-import operator
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any, Self
 
@@ -88,67 +86,57 @@ class YamlSource:
     #: The text itself, where it came from a file.
     text: str = ""
     tree: Any = None
-    keys: dict[KeyPath, Place] = field(default_factory=dict)
-    values: dict[KeyPath, Place] = field(default_factory=dict)
+    #: The node of each value, and that of its key in a mapping.
+    nodes: dict[KeyPath, tuple[Any, Any]] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
-        """Return where a problem with a key path is to be reported."""
-        while path and path not in self.values:
+        """Return where a problem with a key path is to be reported: of a mapping, and where a key is amiss, its key."""
+        while path and path not in self.nodes:
             path, key = path[:-1], True
-        if path in self.keys and (key or isinstance(self.value(path), dict)):
-            return self.keys[path]
-        return self.values.get(path, Place(self.file, 1, 1))
-
-    def value(self, path: KeyPath) -> Any:
-        """Return the value at a key path, or None where there is none."""
-        try:
-            return reduce(operator.getitem, path, self.tree)
-        except (KeyError, IndexError, TypeError):
-            return None
+        value, name = self.nodes.get(path, (None, None))
+        node = name if name is not None and (key or isinstance(value, yaml.MappingNode)) else value
+        return Place(self.file, 1, 1) if node is None else Place.of(node.start_mark)
 
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
         """Return a problem at a key path."""
         return self.place(path, key=key).problem(path, message)
 
-    def build(self, node: Any, path: KeyPath = (), parents: tuple[Any, ...] = ()) -> Any:
+    def build(self, node: Any, path: KeyPath = (), name: Any = None, parents: tuple[Any, ...] = ()) -> Any:
         """Return the value of a node; what is wrong with it goes to the problems."""
-        place = self.values[path] = Place.of(node.start_mark)
-        if len(self.values) > MAX_VALUES:
-            raise SpecError(
-                [*self.problems, place.problem(path, f"more than {MAX_VALUES} values, those of aliases too")]
-            )
-        if any(node is parent for parent in parents):
-            raise SpecError([*self.problems, place.problem(path, "an alias refers to its own parent")])
+        self.nodes[path] = node, name
+        place, fatal = Place.of(node.start_mark), ""
+        if len(self.nodes) > MAX_VALUES:
+            fatal = f"more than {MAX_VALUES} values, those of aliases too"
+        elif any(node is parent for parent in parents):
+            fatal = "an alias refers to its own parent"
+        if fatal:
+            raise SpecError([*self.problems, place.problem(path, fatal)])
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node, path)
-        collection = "seq" if isinstance(node, yaml.SequenceNode) else "map"
-        if node.tag != _TAG + collection:
+        if node.tag != _TAG + ("seq" if isinstance(node, yaml.SequenceNode) else "map"):
             self._refuse_tag(node, path, "a plain list or mapping")
-        if collection == "seq":
-            return [self.build(item, (*path, k), (*parents, node)) for k, item in enumerate(node.value)]
+        if isinstance(node, yaml.SequenceNode):
+            return [self.build(item, (*path, k), None, (*parents, node)) for k, item in enumerate(node.value)]
         return self._mapping(node, path, (*parents, node))
 
     def _mapping(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> dict[str, Any]:
         mapping: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            place = Place.of(key_node.start_mark)
-            if not isinstance(key_node, yaml.ScalarNode):
-                self.problems.append(place.problem(path, "a key must be a plain word"))
-                continue
-            key = key_node.value
-            here = (*path, key)
-            if key == "<<":
-                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
-                self.problems.append(place.problem(here, message))
-            elif key in mapping:
-                message = (
-                    f"the key {path_text((key,))!r} is given twice, first on line {self.keys[here].line}; keep one"
-                )
-                self.problems.append(place.problem(here, message))
+        for name, value in node.value:
+            here, wrong = path, ""
+            if not isinstance(name, yaml.ScalarNode):
+                wrong = "a key must be a plain word"
             else:
-                self.keys[here] = place
-                mapping[key] = self.build(value_node, here, parents)
+                here = (*path, name.value)
+                if name.value == "<<":
+                    wrong = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
+                elif name.value in mapping:
+                    first = self.place(here, key=True).line
+                    wrong = f"the key {path_text((name.value,))!r} is given twice, first on line {first}; keep one"
+            if wrong:
+                self.problems.append(Place.of(name.start_mark).problem(here, wrong))
+            else:
+                mapping[name.value] = self.build(value, here, name, parents)
         return mapping
 
     def _scalar(self, node: Any, path: KeyPath) -> Any:

@@ -146,7 +146,7 @@ def test_overrides_replace_values_and_their_places():
     assert source.place(("a", "b", 1)) == Place("--set", 1, 9)
     assert source.place(("a", "c", "d")) == Place("--set", 4, 7)
     assert source.place(("new", "deep")) == Place("--set", 3, 1)
-    assert ("a", "b", 2) not in source.values, "places of what was replaced are gone"
+    assert ("a", "b", 2) not in source.nodes, "places of what was replaced are gone"
     assert parse_yaml("a: {b: 1}", "f", ["a.b="]).tree == {"a": {"b": None}}
     assert parse_yaml("a: {b: 1}", "f", ["a=c: 1\nd: 2"]).tree == {"a": {"c": 1, "d": 2}}
 
