@@ -1,6 +1,6 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +18,6 @@ from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
 from ctid_cli.specification.sections import case_count, names_code, replaced, variants
 from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.system_sections import LoopSection
 from ctid_cli.specification.yaml_source import (
     OVERRIDE_FILE,
     KeyPath,
@@ -78,16 +77,13 @@ def load_loop(path: Path) -> LoopOptions:
     tree = source.tree.get("loop") if isinstance(source.tree, dict) else None
     if tree is None:
         raise SpecError([source.problem((), "there is no section loop; write loop: {controller: {...}}")])
-    problems: list[Located] = []
-    try:
-        section = LoopSection.model_validate(tree)
-        if section.reference is not None:
-            problems = [(("reference",), "belongs to simulated data; that of a record is a column, --reference", True)]
-        elif case_count(section) > 1:
-            problems = [((), "has lists of values; a record was taken in one loop: keep one of each", False)]
-    except ValidationError as error:
-        problems = [explained(detail, {}) for detail in error.errors(include_url=False)]
-    _require_none(source, [(("loop", *where), message, at_key) for where, message, at_key in problems])
+    section, problems = _piece("loop", tree, path.parent)
+    if section is not None and section.reference is not None:
+        message = "belongs to simulated data; that of a record is a column, --reference"
+        problems = [(("loop", "reference"), message, True)]
+    elif case_count(section) > 1:
+        problems = [(("loop",), "has lists of values; a record was taken in one loop: keep one of each", False)]
+    _require_none(source, problems)
     options: LoopOptions = section.options()
     return options
 
@@ -129,16 +125,11 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     found: dict[str, Any] = {"experiment": "", "estimators": {}}
     complaints: list[Located] = []
-    wanted = KINDS["frequency_estimator" if "signal" in tree else "estimator"]
     for name, value in _pieces(tree):
-        try:
-            right = _adapter(name).validate_python(value, strict=True, context={"folder": folder})
+        right, wrong = _piece(name, value, folder, tree.keys())
+        complaints += wrong
+        if not wrong:
             found[name] = found[name] | right if name == "estimators" else right
-        except ValidationError as error:
-            for detail in error.errors(include_url=False):
-                if name == "estimators" and detail["type"] == "no_kind" and {"signal", "system", "data"} & tree.keys():
-                    detail["ctx"] = {"allowed": ", ".join(wanted)}
-                complaints.append(explained({**detail, "loc": (name, *detail["loc"])}, Spec.descriptions()))
     for key in tree.keys() - Spec.model_fields.keys():
         complaints.append(explained(_about(key, "extra_forbidden", tree[key]), Spec.descriptions()))
     for key in ("experiment", "estimators"):
@@ -162,6 +153,19 @@ def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from ((name, {key: part}) for key, part in value.items())
         else:
             yield name, value
+
+
+def _piece(name: str, value: Any, folder: Path, given: Set[str] = frozenset()) -> tuple[Any, list[Located]]:
+    """Return a section, or some estimators, of a specification that has some sections, and what is wrong with it."""
+    try:
+        return _adapter(name).validate_python(value, strict=True, context={"folder": folder}), []
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+    for detail in details:
+        if name == "estimators" and detail["type"] == "no_kind" and {"signal", "system", "data"} & given:
+            kinds = KINDS["frequency_estimator" if "signal" in given else "estimator"]
+            detail["ctx"] = {"allowed": ", ".join(kinds)}
+    return None, [explained({**detail, "loc": (name, *detail["loc"])}, Spec.descriptions()) for detail in details]
 
 
 @cache
