@@ -183,7 +183,7 @@ def _of_long_records(source: Any, estimated: EstimatedForm) -> ExpectedAccuracy:
 
 
 def _of_records(source: Any, estimated: EstimatedForm, why_no_limit: str) -> ExpectedAccuracy:
-    sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.samples))
+    sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.length))
     records = [source.dataset(replicate).record for replicate in range(sets)]
     return accuracy_of_records(estimated, source.system, records, source.noise, why_no_limit)
 

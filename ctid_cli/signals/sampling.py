@@ -35,6 +35,12 @@ class Sampling(ABC):
     input_record: InputRecord = "exact"
 
     @property
+    def length(self) -> int:
+        """Number of samples of a record; that of one record where it is not known."""
+        samples = getattr(self, "samples", None)
+        return samples if isinstance(samples, int) else len(self.times(np.random.default_rng(0)))
+
+    @property
     def mean_interval(self) -> float:
         """Expected interval between samples [s]; that of one record where it is not known."""
         times = np.asarray(self.times(np.random.default_rng(0)), dtype=float)

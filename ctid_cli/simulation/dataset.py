@@ -424,7 +424,9 @@ def joined(folder: Path, file: str) -> str:
 
 def located(options: Any, folder: Path) -> Any:
     """Return the options with the name of the file that they read, if any, as seen from the working directory."""
-    return dataclasses.replace(options, file=joined(folder, options.file)) if hasattr(options, "file") else options
+    if is_custom(options) or not hasattr(options, "file"):
+        return options
+    return dataclasses.replace(options, file=joined(folder, options.file))
 
 
 def file_sha256(path: str) -> str:

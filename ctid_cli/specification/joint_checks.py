@@ -22,7 +22,6 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
-from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.dataset import SimulatedSource, additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
@@ -33,6 +32,7 @@ from ctid_cli.specification.sections import (
     Variant,
     case_count,
     grouped,
+    known_variants,
     over,
     place_of,
     replaced,
@@ -164,7 +164,7 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     yield from _precision_complaints(spec, broken)
     yield from _same_estimators(spec)
     yield from _world_complaints(spec, broken)
-    samplings = variants(spec.sampling)
+    samplings = known_variants(spec.sampling)
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
     too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
     yield from too_long
@@ -268,12 +268,12 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
     # Random intervals stand for themselves at their mean.
-    plans = [(case, case.options) for case in samplings if not is_custom(case.options)]
+    plans = [(case, case.options) for case in samplings]
     return [Variant({}, case.swept, Extent(options.mean_interval, options.samples)) for case, options in plans]
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
-    if getattr(sampling, "samples", 0) > MAX_SAMPLES:
+    if sampling.samples > MAX_SAMPLES:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
@@ -420,10 +420,10 @@ def has_relay(spec: Spec) -> bool:
 
 def _data_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[Complaint]:
     """Say what the sections that data are made from have against each other."""
-    yield from over({("system",): variants(spec.system), ("sampling",): records}, _of_delay)
+    yield from over({("system",): known_variants(spec.system), ("sampling",): records}, _of_delay)
     if spec.generator is not None and spec.data is None:
         place, section = spec.generator
-        yield from over({place: variants(section), ("sampling",): records}, partial(_of_clock_periods, place))
+        yield from over({place: known_variants(section), ("sampling",): records}, partial(_of_clock_periods, place))
     if spec.loop is None:
         return
     if spec.data is not None:
@@ -432,13 +432,13 @@ def _data_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[Complai
         return
     if spec.system is not None and spec.system.custom:
         yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
-    yield from over({(): variants(spec.noise)}, _of_ratio)
+    yield from over({(): known_variants(spec.noise)}, _of_ratio)
     if any(not isinstance(variant.options, RegularSampling) for variant in variants(spec.sampling)):
         yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
 
 
 def _of_delay(system: Any, extent: Extent) -> Iterator[Complaint]:
-    if getattr(system, "delay", 0.0) >= extent.duration:
+    if system.delay >= extent.duration:
         yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"
 
 
@@ -450,7 +450,7 @@ def _of_clock_periods(at: KeyPath, excitation: Any, extent: Extent) -> Iterator[
 
 
 def _of_ratio(noise: Any) -> Iterator[Complaint]:
-    if getattr(noise, "snr_db", None) is not None:
+    if noise.snr_db is not None:
         other = ", or its innovation_variance" if hasattr(noise, "innovation_variance") else ""
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 

@@ -14,7 +14,7 @@ from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Variant, over, variants
+from ctid_cli.specification.sections import Variant, known_variants, over, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -34,7 +34,8 @@ def joint_warnings(spec: Spec) -> list[Complaint]:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
     if spec.loop is not None and not has_relay(spec):
         for name, section in spec.estimators.items():
-            warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
+            cases = known_variants(section) or [Variant({}, {}, None)]
+            warnings += over({(): cases}, partial(_of_open_loop, ("estimators", name)))
     if spec.starts is not None:
         taken = {getattr(variants(section)[0].options, "start_from", None) for section in spec.estimators.values()}
         for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
@@ -52,17 +53,14 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
     """Say what is unwise where the truth is known."""
     warnings: list[Complaint] = []
-    if spec.noise is not None and not spec.noise.custom:
-        for name, section in spec.estimators.items():
-            at = ("estimators", name)
-            warnings += over({("noise",): variants(spec.noise), at: variants(section)}, partial(_of_white_formula, at))
-    # Custom components are tried in a process of their own only.
-    samplings = [] if spec.sampling is None or spec.sampling.custom else variants(spec.sampling)
-    if spec.excitation is not None and not spec.excitation.custom:
-        told: dict[KeyPath, list[Variant]] = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
-        warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
-    # A custom system need not have poles.
-    systems = [case for case in variants(spec.system) if hasattr(case.options, "poles")]
+    noises, estimators = known_variants(spec.noise), {("estimators", n): s for n, s in spec.estimators.items()}
+    for at, section in estimators.items():
+        warnings += over({("noise",): noises, at: known_variants(section)}, partial(_of_white_formula, at))
+    samplings = known_variants(spec.sampling)
+    told: dict[KeyPath, list[Variant]]
+    told = {("excitation",): known_variants(spec.excitation), ("sampling",): samplings}
+    warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
+    systems = known_variants(spec.system)
     if not systems:
         return warnings
     fastest = float(np.abs(systems[0].options.poles).max(initial=0.0))
@@ -71,8 +69,8 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     warnings += over(
         lengths, partial(_of_short_record, "duration" if hasattr(spec.sampling, "duration") else "samples")
     )
-    for name, section in spec.estimators.items():
-        at, cases = ("estimators", name), variants(section)
+    for at, section in estimators.items():
+        cases = known_variants(section)
         warnings += over({("system",): systems, at: cases}, partial(_of_delay, at, in_loop=spec.loop is not None))
         warnings += over({("system",): systems[:1], at: cases}, partial(_of_structure, at))
     return warnings

@@ -507,6 +507,11 @@ def variants(section: Section | None) -> list[Variant]:
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
 
 
+def known_variants(section: Section | None) -> list[Variant]:
+    """Return the same, but none of a custom component: what its options mean is not known."""
+    return [] if section is None or section.custom else variants(section)
+
+
 def case_count(section: Any) -> int:
     """Return the number of combinations of a section's swept values, before any of them is made."""
     return math.prod(len(values) for _, values in _axes(section)) if isinstance(section, Section) else 1

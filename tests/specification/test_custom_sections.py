@@ -88,6 +88,22 @@ def test_a_class_with_a_fitting_fit_alone_is_an_estimator(folder):
     assert build_plan(load(folder)).estimators[0].content == {"kind": "./parts.py:Plain"}
 
 
+def test_what_custom_options_are_called_means_nothing(folder):
+    edited(
+        folder, "parts.py", "    area: float = 2.0", "    area: float = 2.0\n    delay: str = 'd'\n    poles: str = 'p'"
+    )
+    edited(folder, "parts.py", "    deviation: float", "    deviation: float\n    snr_db: str = 's'")
+    edited(folder, "parts.py", "    interval: float = 0.1", "    interval: float = 0.1\n    samples: str = 'many'")
+    edited(
+        folder,
+        "parts.py",
+        "    deterministic = True",
+        "    deterministic = True\n    file: int = 3\n    clock_period: str = 'c'",
+    )
+    edited(folder, "parts.py", "    order: int\n", "    order: int\n    delay_bounds: str = 'b'\n    zeros: int = 1\n")
+    assert load(folder).warnings == ()
+
+
 def test_every_folder_has_neighbours_of_its_own(folder, tmp_path_factory):
     other = tmp_path_factory.mktemp("other")
     (other / "gains.py").write_text("GAIN = 3.0\n", encoding="utf-8")
