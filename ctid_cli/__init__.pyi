@@ -59,9 +59,15 @@ from .estimators.model_comparison import ModelOnRecord as ModelOnRecord, compare
 from .storage.fit_file import load_fit as load_fit
 from .reporting.saved_fit import save_fit as save_fit
 
+# Custom components: the classes that they derive from
+from .signals.excitation import Excitation as Excitation
+from .signals.sampling import Sampling as Sampling
+from .simulation.components import Estimator as Estimator, Noise as Noise, System as System
+
 # Experiments: what ctid run, table and export do
 from .reporting.experiment import ExperimentResults as ExperimentResults
 from .reporting.experiment import read_results as read_results, run_experiment as run_experiment
+from .running.plan import simulate_dataset as simulate_dataset
 
 # Useful redundancy for a cost of one's own
 from .filtering.lowpass import Lowpass as Lowpass

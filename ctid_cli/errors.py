@@ -33,6 +33,8 @@ class DataError(UsageError):
     def __init__(self, message: str, field: str = "") -> None:
         super().__init__(message)
         self.field = field
+        #: Place in a specification of what is at fault, where that came up in a simulation.
+        self.section = ""
 
 
 class BiasedError(DataError):

@@ -66,12 +66,12 @@ ONLINE = tuple(kind for kind in KINDS["frequency_estimator"] if kind not in ("es
 
 
 def resolve(section: str, kind: str) -> type[Any]:
-    """The class that a kind names."""
+    """Return the class that a kind names."""
     module, _, name = KINDS[section][kind].partition(":")
     found: type[Any] = getattr(importlib.import_module(module), name)
     return found
 
 
 def classes(section: str) -> dict[str, type[Any]]:
-    """Every class of a section by its kind."""
+    """Return every class of a section by its kind."""
     return {kind: resolve(section, kind) for kind in KINDS[section]}

@@ -10,13 +10,13 @@ WIDTH = 100
 
 
 def listed(words: Iterable[object]) -> str:
-    """Words as a sentence lists them: ``a, b and c``, each once."""
+    """Return words as a sentence lists them: ``a, b and c``, each once."""
     *first, end = dict.fromkeys(map(str, words))
     return f"{', '.join(first)} and {end}" if first else end
 
 
 def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
-    """A paragraph, with another indent for all lines but the first if one is given."""
+    """Return a paragraph, with another indent for all lines but the first if one is given."""
     return textwrap.fill(
         text,
         WIDTH,
@@ -28,20 +28,20 @@ def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
 
 
 def warning_lines(warnings: Iterable[str]) -> list[str]:
-    """Warnings as the end of a text; nothing where there are none."""
+    """Return the warnings as the end of a text; nothing where there are none."""
     lines = [wrapped(f"- {warning}", hanging="  ") for warning in warnings]
     return ["", "Warnings:", *lines] if lines else []
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """The known name that was probably meant, whatever its capitals."""
+    """Return the known name that was probably meant, whatever its capitals."""
     names = {name.lower(): name for name in reversed(list(known))}
     near = difflib.get_close_matches(word.lower(), list(names), n=1)
     return names[near[0]] if near else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The same as the end of a sentence; empty where no name is near."""
+    """Return the end of a sentence that asks for the known name that was probably meant; empty where none is near."""
     near = closest(word, known)
     return f"; did you mean {near!r}?" if near else ""
 

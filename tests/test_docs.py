@@ -11,7 +11,7 @@ import pytest
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.signals.recorder import Recorder
-from ctid_cli.specification.option_docs import option_docs
+from ctid_cli.specification.messages import option_docs
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLE = re.compile(r"^```python\n(.*?)^```$.*?^```text\n(.*?)^```$", re.DOTALL | re.MULTILINE)

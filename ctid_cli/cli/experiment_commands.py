@@ -287,7 +287,7 @@ def validate(
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    from ctid_cli.running.own_check import check_components
+    from ctid_cli.running.custom_check import check_components
 
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
         check_components(plan, warn=lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))

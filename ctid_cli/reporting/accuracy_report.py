@@ -47,7 +47,7 @@ def _shown(cells: list[tuple[DataCell, SimulatedSource]]) -> list[tuple[DataCell
     """Data cells of the first settings, each at a few numbers of samples from the least to the greatest."""
     by_settings: dict[str, dict[int, int]] = {}
     for k, (cell, source) in enumerate(cells):
-        by_settings.setdefault(repr(_own(cell)), {})[source.sampling.samples] = k
+        by_settings.setdefault(repr(_own(cell)), {})[source.sampling.length] = k
     shown: list[int] = []
     for places in list(by_settings.values())[:SETTINGS]:
         some = np.unique(np.linspace(0, len(places) - 1, SIZES).round().astype(int))
@@ -58,7 +58,7 @@ def _shown(cells: list[tuple[DataCell, SimulatedSource]]) -> list[tuple[DataCell
 def _entry(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, plan: Plan) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "settings": _own(cell),
-        "samples": source.sampling.samples,
+        "samples": source.sampling.length,
         "estimator": estimator.name,
         "options": dict(estimator.swept),
         "kind": estimator.kind,

@@ -115,7 +115,7 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
 def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.simulation.frequency_runs import FrequencyFit, SignalDataSet
+    from ctid_cli.simulation.frequency_measures import FrequencyFit, SignalDataSet
     from ctid_cli.specification.load import spec_from_canonical
 
     row = found.row

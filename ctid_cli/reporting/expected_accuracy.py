@@ -26,8 +26,8 @@ from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
+from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
-from ctid_cli.simulation.own_components import OwnEstimation, OwnNoise, OwnSystem
 
 #: From so many samples on the limit for long records is taken.
 LONG = 5000
@@ -76,8 +76,12 @@ def why_biased(source: SimulatedSource, estimator: Any) -> str:
 def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     """The system as the estimator has it, or why it is biased."""
     system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
-    if isinstance(system, OwnSystem) or isinstance(estimator, OwnEstimation) or isinstance(noise, OwnNoise):
-        raise DataError("there is no theory here of systems, noises and estimators of one's own")
+    if (
+        not isinstance(system, TransferFunction | AdditiveModel)
+        or isinstance(estimator, CustomEstimation)
+        or is_custom(noise)
+    ):
+        raise DataError("there is no theory here of custom systems, noises and estimators")
     estimated = _estimated(system, estimator)
     if loop is None or estimated.instruments != "open_loop" or not isinstance(loop.controller, DiscreteController):
         return estimated
@@ -179,7 +183,7 @@ def _of_long_records(source: Any, estimated: EstimatedForm) -> ExpectedAccuracy:
 
 
 def _of_records(source: Any, estimated: EstimatedForm, why_no_limit: str) -> ExpectedAccuracy:
-    sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.samples))
+    sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.length))
     records = [source.dataset(replicate).record for replicate in range(sets)]
     return accuracy_of_records(estimated, source.system, records, source.noise, why_no_limit)
 

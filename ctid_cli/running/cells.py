@@ -11,10 +11,9 @@ from ctid_cli.storage.manifest import Key, Manifest, Shard
 
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
-    from ctid_cli.simulation.dataset import Source
-    from ctid_cli.simulation.frequency_runs import SignalSource
+    from ctid_cli.simulation.dataset import Source, StartPoint
+    from ctid_cli.simulation.frequency_measures import SignalSource
     from ctid_cli.specification.spec import Spec
-    from ctid_cli.specification.start_points import StartPoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +199,6 @@ class Plan:
 
 def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPoint, ...]:
     """The starts that an estimator which takes one of a kind begins from."""
-    from ctid_cli.specification.start_points import NO_START
+    from ctid_cli.simulation.dataset import NO_START
 
     return tuple(start for start in starts if start.of == kind) or (NO_START,)

@@ -22,6 +22,7 @@ from ctid_cli.errors import DataError, MachineError, StorageError, UsageError
 from ctid_cli.processors import usable_processors
 from ctid_cli.running import events
 from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
+from ctid_cli.running.custom_check import check_components
 from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
 from ctid_cli.running.executor import Computed, Executor
 from ctid_cli.running.hindrances import advice
@@ -29,7 +30,6 @@ from ctid_cli.running.job import Job
 from ctid_cli.running.key_set import KeySet
 from ctid_cli.running.limits import WATCHES_PROCESSES, Limits
 from ctid_cli.running.origins import current_origin
-from ctid_cli.running.own_check import check_components
 from ctid_cli.running.pool import LokyPool
 from ctid_cli.running.retry import Stock, take_stock
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
@@ -412,12 +412,12 @@ def _check_first_records(todo: Todo) -> None:
 def _compile_kernels(plan: Plan) -> float:
     from ctid_cli.estimation.compilation import compile_kernels
     from ctid_cli.signals.sampling import RegularSampling
-    from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
-    from ctid_cli.simulation.own_components import OwnEstimation
+    from ctid_cli.simulation.components import CustomEstimation
+    from ctid_cli.simulation.frequency_measures import FrequencyEstimation, SignalSource
 
     source = plan.data_cells[0].source
     if not isinstance(source, SignalSource):
-        ours = [cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, OwnEstimation)]
+        ours = [cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, CustomEstimation)]
         clocks = [
             (getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells
         ]

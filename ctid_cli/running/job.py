@@ -28,7 +28,7 @@ from ctid_cli.storage.manifest import Key, Outcome
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.running.cells import DataCell, EstimatorCell
-    from ctid_cli.specification.start_points import StartPoint
+    from ctid_cli.simulation.dataset import StartPoint
 
 #: Frames of a traceback that are kept, the innermost ones, and characters of a message.
 TRACEBACK_FRAMES = 6

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,13 @@ from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
 from ctid_cli.running.cells import DataCell, DataCells, EstimatorCell, Plan, starts_of
-from ctid_cli.signals.recorder import Recorder
-from ctid_cli.simulation.dataset import SimulatedSource, Source, located
-from ctid_cli.simulation.frequency_measures import Measuring
-from ctid_cli.simulation.frequency_runs import FrequencyEstimation, SignalSource
-from ctid_cli.simulation.own_components import OwnSystem
+from ctid_cli.simulation.components import CustomEstimation, is_custom
+from ctid_cli.simulation.dataset import NO_START, DataSet, Source, located
+from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
+from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
-from ctid_cli.specification.start_points import NO_START, start_points
+from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
 
@@ -50,6 +50,79 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     return Plan(spec, _data_cells(spec, parts, names), estimators, starts, (first,) * cells, spec_hash)
 
 
+def simulate_dataset(
+    experiment: str | os.PathLike[str] | Mapping[str, Any] | Spec,
+    key: tuple[int, int],
+    *,
+    overrides: Sequence[str] = (),
+    allow_code: bool = False,
+) -> DataSet | SignalDataSet:
+    """Make one data set of an experiment: the very one that its estimators are given.
+
+    Parameters
+    ----------
+    experiment : path or mapping
+        A specification: the path of a YAML file, or its content.
+    key : tuple of int
+        Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
+        fastest, in the order of the sections system, excitation, loop, sampling, noise, recorder, signal, disturbance.
+    overrides : sequence of str, default ()
+        Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
+    allow_code : bool, default False
+        Run the code that the specification names as a kind.
+
+    Returns
+    -------
+    DataSet or SignalDataSet
+        Its ``record`` is what estimators are given, its ``true_model`` the simulated system, if that is one of ctid's.
+
+    Raises
+    ------
+    SpecError
+        If the specification has mistakes; all of them are named.
+    RefusedError
+        If it names code that may not be run.
+    UsageError
+        If there is no such case or replicate.
+    DataError
+        If the data set cannot be made.
+
+    Notes
+    -----
+    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input, the
+    noise and the recorder come from streams of their own, so that cases which differ in the noise have the same input.
+
+    Examples
+    --------
+    >>> from ctid_cli import DelayProfile, simulate_dataset
+    >>> experiment = {
+    ...     "experiment": "first-order",
+    ...     "system": {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.3},
+    ...     "excitation": {"kind": "prbs", "stages": 7, "clock_period": 0.5},
+    ...     "sampling": {"kind": "regular", "interval": 0.1, "samples": 400},
+    ...     "noise": {"kind": "white", "snr_db": [10, 30]},
+    ...     "estimators": {"search": {"kind": "delay_profile", "poles": 1, "zeros": 0, "delay_bounds": [0, 1]}},
+    ...     "monte_carlo": {"runs": 100, "seed": 1},
+    ... }
+    >>> data = simulate_dataset(experiment, (1, 0))  # the second noise level, the first replicate
+    >>> fit = DelayProfile(poles=1, zeros=0, delay_bounds=(0, 1)).fit(data.record)
+    >>> abs(fit.model.delay - data.true_model.delay) < 0.02
+    True
+    """
+    if isinstance(experiment, Spec):
+        spec = experiment
+    else:
+        given = experiment if isinstance(experiment, Mapping) else Path(experiment)
+        spec = load_spec(given, overrides, allow_code=allow_code)
+    cells, (case, replicate) = build_plan(spec).data_cells, key
+    most = 1 if spec.data is not None else MAX_DATA_SETS
+    for name, number, count in (("case", case, len(cells)), ("replicate", replicate, most)):
+        if not 0 <= number < count:
+            raise UsageError(f"{spec.experiment}: there is no {name} {number}; they are numbered from 0 to {count - 1}")
+    found: DataSet | SignalDataSet = cells[case].dataset(replicate)
+    return found
+
+
 def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> DataCells:
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     # Absolute, because worker processes may have been started in another working directory.
@@ -79,28 +152,19 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            if isinstance(options["system"], OwnSystem):
-                truth, own = content["system"]["truth"], content["system"]
+            if is_custom(options["system"]):
+                truth, system = content["system"]["truth"], content["system"]
                 # The name of an option stands for its value.
-                own["truth"] = {name: own[value] if isinstance(value, str) else value for name, value in truth.items()}
-            fresh = "fresh_fit" in (spec.measures or ())
+                system["truth"] = {
+                    name: system[value] if isinstance(value, str) else value for name, value in truth.items()
+                }
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
-            content |= {"fresh_fit": True} if fresh else {}
-            # Any seed will do where nothing is random.
-            source = _simulated_source(options, seed or 0, folder, fresh=fresh)
+            content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
+            source = spec.simulated_source(options, folder)
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         return DataCell(content, content_hash(content), swept, source)
 
     return DataCells(math.prod(map(len, ways)), make)
-
-
-def _simulated_source(options: Mapping[str, Any], seed: int, folder: Path, *, fresh: bool) -> SimulatedSource:
-    """What simulates the data sets of a cell, from the options of its sections."""
-    sampling, loop = options["sampling"], options.get("loop")
-    if loop is not None:
-        loop = dataclasses.replace(loop, reference=located(loop.reference, folder)).at(sampling.interval)
-    excitation, recorder = located(options.get("excitation"), folder), options.get("recorder", Recorder())
-    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, recorder, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -114,8 +178,11 @@ def _measuring(spec: Spec) -> Measuring:
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
-    of_frequencies = content["kind"] in KINDS["frequency_estimator"]
-    estimator = FrequencyEstimation(variant.options) if of_frequencies else variant.options
+    estimator = variant.options
+    if is_custom(estimator):
+        estimator = CustomEstimation(estimator)
+    elif content["kind"] in KINDS["frequency_estimator"]:
+        estimator = FrequencyEstimation(estimator)
     return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 
 

@@ -20,7 +20,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import suppress
 from typing import Any
 
-from ctid_cli import own_code
+from ctid_cli import custom_code
 from ctid_cli.running.executor import Begun, Cause, Computed, Done, Hindered, Lost, Message
 from ctid_cli.running.job import Job, Short, shortage
 from ctid_cli.running.limits import Limits, Usage, usage
@@ -396,7 +396,7 @@ def packed(*content: Any) -> bytes:
     """Content for a worker, after the code of one's own that it needs to read it."""
     from joblib.externals.loky.backend.reduction import dumps
 
-    return bytes(dumps((own_code.served(), *content)))
+    return bytes(dumps((custom_code.served(), *content)))
 
 
 def _in_one_line(error: BaseException) -> str:

@@ -1,7 +1,7 @@
 """Sums of sinusoids as inputs."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
@@ -17,8 +17,6 @@ from ctid_cli.signals.held import COINCIDENCE, HeldSignal
 
 Spacing = Literal["linear", "logarithmic", "odd"]
 Phases = Literal["random", "schroeder", "low_crest"]
-#: Of options that the identity of older results does not hold.
-_LATER = {"added_later": True}
 #: Number of the highest harmonic: with phases that are searched for, of a band that is filled, and otherwise.
 MAX_SEARCHED, MAX_FILLED, MAX_HARMONIC = 4_000, 10_000, 1_000_000
 
@@ -84,10 +82,10 @@ class Multisine(Excitation):
     tones: int | None = None
     amplitude: float = 1.0
     clock_period: float | None = None
-    frequencies: tuple[float, ...] | None = field(default=None, metadata=_LATER)
-    spacing: Spacing = field(default="linear", metadata=_LATER)
-    period: float | None = field(default=None, metadata=_LATER)
-    phases: Phases = field(default="random", metadata=_LATER)
+    frequencies: tuple[float, ...] | None = None
+    spacing: Spacing = "linear"
+    period: float | None = None
+    phases: Phases = "random"
 
     def __post_init__(self) -> None:
         checks.require_positive("amplitude", self.amplitude, "input unit")

@@ -1,6 +1,6 @@
 """What is added to the output: white noise, also with outliers, and white innovations through a rational filter."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -238,7 +238,7 @@ class WhiteNoise(Noise):
 
     snr_db: float | None = None
     standard_deviation: float | None = None
-    variance: float | None = field(default=None, metadata={"added_later": True})
+    variance: float | None = None
 
     def __post_init__(self) -> None:
         require_one_level(self)

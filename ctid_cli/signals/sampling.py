@@ -32,12 +32,19 @@ class Sampling(ABC):
     kind: ClassVar[str]
 
     samples: int
-    input_record: InputRecord
+    input_record: InputRecord = "exact"
 
     @property
-    @abstractmethod
+    def length(self) -> int:
+        """Number of samples of a record; that of one record where it is not known."""
+        samples = getattr(self, "samples", None)
+        return samples if isinstance(samples, int) else len(self.times(np.random.default_rng(0)))
+
+    @property
     def mean_interval(self) -> float:
-        """Expected interval between samples [s]."""
+        """Expected interval between samples [s]; that of one record where it is not known."""
+        times = np.asarray(self.times(np.random.default_rng(0)), dtype=float)
+        return float(np.ptp(times) / max(times.size - 1, 1))
 
     @abstractmethod
     def times(self, rng: np.random.Generator) -> Array:

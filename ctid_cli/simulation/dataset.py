@@ -1,36 +1,41 @@
-"""Data sets: the record that estimators are given, and what is known besides."""
+"""Data sets: the record that estimators are given, and what is known of where it comes from."""
 
 import dataclasses
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import Start
+from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.controller import ContinuousPid, Relay
+from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
+from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
-from ctid_cli.signals.drifts import ContinuousNoise, noise_at
 from ctid_cli.signals.excitation import Excitation, InputFile
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.noise import Noise
+from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
-from ctid_cli.simulation.additive_parameters import additive_parameters
-from ctid_cli.simulation.own_components import OwnSystem
+from ctid_cli.signals.table import split_header
+from ctid_cli.simulation.components import ComponentError, Noise, System, is_custom
 
 #: Data sets to try models on are numbered from here: no experiment has so many.
 FRESH = 2**31
@@ -46,10 +51,52 @@ class LoopOptions:
     enters: Enters = "controller"
 
     def at(self, interval: float) -> Self:
-        """The loop with the controller that acts at a sampling interval."""
+        """Return the loop with the controller that acts at a sampling interval."""
         if not isinstance(self.controller, ContinuousPid):
             return self
         return dataclasses.replace(self, controller=self.controller.discrete(interval))
+
+
+class InSubmodels(NamedTuple):
+    """Parameters of submodels by name; None where an estimate has none."""
+
+    parameters: dict[str, float] | None = None
+    standard_errors: Mapping[str, float] = MappingProxyType({})
+    #: Standard errors to each side of the 95 % intervals.
+    quantiles: Mapping[str, float] = MappingProxyType({})
+
+
+def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
+    """Return the submodels' parameters of an estimate, with errors and quantiles where it has them in another form.
+
+    The covariance of a fraction's coefficients goes with the Jacobian of its partial fractions. A fraction has none in
+    the given terms if its poles are repeated, not as many, or more of them complex than the terms have room for.
+    """
+    additive = getattr(fit, "additive", None)
+    if additive is not None:
+        return InSubmodels(additive.parameters)
+    if terms is None or fit.model is None:
+        return InSubmodels()
+    try:
+        with np.errstate(all="ignore"):  # what overflows is refused
+            model = factored(fit.model, terms)
+            jacobian = factored_jacobian(fit.model, model)
+    except (DataError, np.linalg.LinAlgError):
+        return InSubmodels()
+    coefficients, names = list(fit.model.parameters), list(fit.parameter_names)
+    errors, quantiles = np.full((2, len(model.names)), np.nan)
+    # A leading zero is no coefficient of the model, though it is a parameter: the powers would not match.
+    if set(names) - {"delay"} == set(coefficients):
+        places = [names.index(name) for name in coefficients]
+        with np.errstate(invalid="ignore"):
+            covariance = jacobian @ fit.covariance[np.ix_(places, places)] @ jacobian.T
+            errors = np.sqrt(np.diag(covariance))
+        if fit.law is None:
+            quantiles[:] = normal_quantile()
+        else:
+            quantiles = fit.law.transformed(jacobian @ np.eye(len(names))[places]).quantiles()
+    stated = (dict(zip(model.names, each.tolist(), strict=True)) for each in (errors, quantiles))
+    return InSubmodels(model.parameters, *stated)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +110,11 @@ class DataSet:
     fresh: Callable[[], Record] | None = None
 
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
-        """What is stored of a fit to the record."""
+        """Return what is stored of a fit to the record."""
         parameters, errors, quantiles = additive_parameters(fit, terms)
         errors, quantiles = {**fit.standard_errors, **errors}, {**fit.quantiles, **quantiles}
         law = fit.law
-        # Of estimators of one's own, which may give parameters of any name, and no model.
+        # Custom estimators may give parameters of any name, and no model.
         named, model = getattr(fit, "named", {}), fit.model
         # Of useful redundancy alone.
         search = getattr(fit, "search", None)
@@ -102,10 +149,10 @@ class DataSet:
 class SimulatedSource:
     """Data sets from a simulated system."""
 
-    system: TransferFunction | AdditiveModel | OwnSystem
+    system: TransferFunction | AdditiveModel | System
     excitation: Excitation | None
     sampling: Sampling
-    noise: Noise | ContinuousNoise | None
+    noise: Noise | None
     seed: int
     loop: LoopOptions | None = None
     recorder: Recorder = field(default_factory=Recorder)
@@ -113,55 +160,150 @@ class SimulatedSource:
     fresh: bool = False
 
     def dataset(self, replicate: int) -> DataSet:
-        """One realisation."""
+        """Make one realisation."""
         data = self._realised(replicate)
         return replace(data, fresh=lambda: self._realised(FRESH + replicate).record) if self.fresh else data
 
+    def require_stable(self) -> None:
+        """Refuse a loop whose signals would grow without end; a relay bounds them, and oscillates on purpose."""
+        from ctid_cli.filtering.loop import loop_radius
+
+        if self.loop is None or isinstance(self.loop.controller, Relay):
+            return
+        interval = self.sampling.mean_interval
+        with at("loop.controller"):
+            try:
+                with np.errstate(all="ignore"):
+                    radius = loop_radius(self.system, self.loop.at(interval).controller, interval)  # type: ignore[arg-type]
+            except np.linalg.LinAlgError:
+                overflow = f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
+                raise DataError(overflow) from None
+            if not radius < 1.0:
+                largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
+                raise DataError(f"the loop with the true system is unstable: {largest}; lower the gain")
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What makes the data, by its place in a specification and in the order of its work."""
+        reference = None if self.loop is None else self.loop.reference
+        parts = {"sampling": self.sampling, "excitation": self.excitation, "loop.reference": reference}
+        return parts | {"system": self.system, "noise": self.noise}
+
     def _realised(self, replicate: int) -> DataSet:
-        generator = self.excitation if self.loop is None else self.loop.reference
-        if isinstance(generator, InputFile) and generator.sha256 is not None:
-            require_content(generator.file, generator.sha256)
-        times = self.sampling.times(stream(self.seed, "sampling", replicate))
-        applied = HeldSignal(times[:1], np.zeros(1))  # a relay needs no reference
-        if generator is not None:
-            applied = generator.generate(times, stream(self.seed, "input", replicate))
+        with at("sampling"):
+            times = samples_of(self.sampling, "times", stream(self.seed, "sampling", replicate))
+            if times.size < 2 or not (np.diff(times) > 0).all():
+                wanted = "must return two or more instants that increase"
+                raise ComponentError(f"{_called(self.sampling, 'times')} {wanted}")
+        with at("excitation" if self.loop is None else "loop.reference"):
+            applied = self._applied(times, replicate)
+        true_model = self.system if isinstance(self.system, TransferFunction | AdditiveModel) else None
         if self.loop is not None:
-            assert not isinstance(self.system, OwnSystem)
-            return DataSet(self._record_in(self.loop, times, applied.at(times), replicate), true_model=self.system)
-        output = _simulated(self.system, applied, times)
+            assert true_model is not None
+            record = self._record_in(self.loop, true_model, times, applied.at(times), replicate)
+            return DataSet(record, true_model=true_model)
+        with at("system"):
+            if true_model is None:
+                output = samples_of(self.system, "simulate", applied, times, size=times.size)
+            else:
+                output = _simulated(true_model, applied, times)
         y = self.recorder.rounded(output + self._drawn(times, output, replicate))
         if isinstance(self.sampling, SendOnDelta):
-            sent = self.sampling.sent(y)
+            with at("sampling"):
+                sent = self.sampling.sent(y)
             times, output, y = times[sent], output[sent], y[sent]
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
         record = Record(times, self._with_losses(y, replicate), known, noise_free=output)
-        return DataSet(record, true_model=None if isinstance(self.system, OwnSystem) else self.system)
+        return DataSet(record, true_model=true_model)
 
-    def _record_in(self, loop: LoopOptions, times: Array, reference: Array, replicate: int) -> Record:
+    def _applied(self, times: Array, replicate: int) -> HeldSignal:
+        """Return what drives the simulation: the input, or the reference of the loop."""
+        generator = self.excitation if self.loop is None else self.loop.reference
+        if generator is None:  # a relay needs no reference
+            return HeldSignal(times[:1], np.zeros(1))
+        if isinstance(generator, InputFile) and generator.sha256 is not None:
+            require_content(generator.file, generator.sha256)
+        found = made(generator, "generate", times, stream(self.seed, "input", replicate))
+        if not isinstance(found, HeldSignal):
+            text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
+            raise ComponentError(f"{text}, and a ctid_cli.HeldSignal(t, values) is expected")
+        return found
+
+    def _record_in(
+        self, loop: LoopOptions, system: TransferFunction | AdditiveModel, times: Array, r: Array, replicate: int
+    ) -> Record:
         from ctid_cli.filtering.loop import simulate_loop
 
-        assert not isinstance(self.system, OwnSystem)
         interval = regular_interval(times)
         if interval is None:
             raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
-        # The noise comes before the output, because the output answers to it.
+        # The noise comes before the output, because the output depends on it.
         noise = self._drawn(times, np.zeros(times.size), replicate)
         controller = loop.at(interval).controller
-        u, x = simulate_loop(self.system, controller, reference, noise, interval, loop.enters)
+        with at("loop.controller"):
+            u, x = simulate_loop(system, controller, r, noise, interval, loop.enters)
         # Estimators know the loops of linear controllers only.
-        closed = None if isinstance(controller, Relay) else Loop(reference, controller, loop.enters)
+        closed = None if isinstance(controller, Relay) else Loop(r, controller, loop.enters)
         y = self._with_losses(self.recorder.rounded(x + noise), replicate)
         return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
 
     def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:
             return np.zeros(output.size)
-        return noise_at(self.noise, times, output, stream(self.seed, "noise", replicate))
+        rng = stream(self.seed, "noise", replicate)
+        with at("noise"):
+            if getattr(type(self.noise), "generate_at", Noise.generate_at) is not Noise.generate_at:
+                return samples_of(self.noise, "generate_at", times, output, rng, size=output.size, missing=True)
+            return samples_of(self.noise, "generate", output, rng, size=output.size, missing=True)
 
     def _with_losses(self, y: Array, replicate: int) -> Array:
         return self.recorder.with_losses(y, stream(self.seed, "recorder", replicate))
+
+
+@contextmanager
+def at(place: str) -> Iterator[None]:
+    """Note the place in a specification of what makes no data."""
+    try:
+        yield
+    except DataError as error:
+        error.section = error.section or place
+        raise
+
+
+def made(component: Any, method: str, *given: Any) -> Any:
+    """Return what a component makes; arrays that it is given cannot be changed."""
+    for array in given:
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    try:
+        return getattr(component, method)(*given)
+    except Exception as error:
+        if is_custom(component):
+            raise ComponentError(f"{_called(component, method)} failed: {reason(error)}") from error
+        raise
+
+
+def samples_of(component: Any, method: str, *given: Any, size: int | None = None, missing: bool = False) -> Array:
+    """Return the numbers that a component makes, one for each sample."""
+    found = made(component, method, *given)
+    wanted = f"and an array of {'' if size is None else f'{size} '}finite numbers is expected"
+    try:
+        values = np.array(found, dtype=float)
+    except (TypeError, ValueError):
+        raise ComponentError(f"{_called(component, method)} returned {type(found).__name__}, {wanted}") from None
+    if values.ndim != 1 or size not in (None, values.size):
+        raise ComponentError(f"{_called(component, method)} returned an array of shape {values.shape}, {wanted}")
+    bad = ~np.isfinite(values) & ~(missing & np.isnan(values))
+    if bad.any():
+        raise ComponentError(f"{_called(component, method)} returned {values[bad][0]}, {wanted}")
+    return values
+
+
+def _called(component: Any, method: str) -> str:
+    """Return how a message names a method of a component."""
+    return f"{type(component).__name__}.{method}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +342,7 @@ class MeasuredSource:
     hold: Hold = "zoh"
     offset: Offset = "none"
     estimation_samples: int | None = None
-    reference: str | None = field(default=None, metadata={"added_later": True})
+    reference: str | None = None
     loop: LoopOptions | None = None
 
     def __post_init__(self) -> None:
@@ -210,7 +352,7 @@ class MeasuredSource:
             raise OptionError("hold", "must be zoh in a loop: a discrete controller holds the input")
 
     def dataset(self, replicate: int) -> DataSet:
-        """The record."""
+        """Read the record."""
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         if self.sha256 is not None:
@@ -251,12 +393,10 @@ class MeasuredSource:
 Source = SimulatedSource | MeasuredSource
 
 
-def _simulated(system: TransferFunction | AdditiveModel | OwnSystem, applied: HeldSignal, times: Array) -> Array:
-    """Output of a model."""
+def _simulated(system: TransferFunction | AdditiveModel, applied: HeldSignal, times: Array) -> Array:
+    """Return the output of a model."""
     from ctid_cli.filtering.simulate import simulate, simulate_additive
 
-    if isinstance(system, OwnSystem):
-        return system.simulate(applied, times)
     if isinstance(system, AdditiveModel):
         return simulate_additive(system, applied, times)
     return simulate(system, applied, times)
@@ -274,17 +414,19 @@ def _fit_percent(model: Any, record: Record | None, output: str) -> float | None
 
 
 def joined(folder: Path, file: str) -> str:
-    """Name of a file as seen from the working directory."""
+    """Return the name of a file as seen from the working directory."""
     return Path(os.path.normpath(folder / file)).as_posix()
 
 
 def located(options: Any, folder: Path) -> Any:
-    """Options with the name of the file that they read, if any, as seen from the working directory."""
-    return dataclasses.replace(options, file=joined(folder, options.file)) if hasattr(options, "file") else options
+    """Return the options with the name of the file that they read, if any, as seen from the working directory."""
+    if is_custom(options) or not hasattr(options, "file"):
+        return options
+    return dataclasses.replace(options, file=joined(folder, options.file))
 
 
 def file_sha256(path: str) -> str:
-    """Content hash of a file."""
+    """Return the content hash of a file."""
     if not Path(path).exists():
         raise DataError(f"{path}: there is no such file; names start at the folder of the specification")
     require_file(path)
@@ -302,3 +444,116 @@ def require_content(path: str, sha256: str) -> None:
         planned = f"is not that which the experiment was planned with ({sha256[:12]}…)"
         restore = "restore the file, or run the changed one as an experiment of its own"
         raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# A measured record with the loop that it was taken in
+
+#: Share of the moves of the input [-] that the controller may leave unexplained: what rounding in a file does.
+UNEXPLAINED = 0.05
+
+
+def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
+    """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
+    record, r = measured.record, measured.reference_values
+    assert r is not None
+    if isinstance(loop.controller, Relay):
+        raise DataError(
+            f"{record.name}: {_IGNORE.format('closed-loop instruments need a linear controller, no relay')}"
+        )
+    _check_units(measured, loop)
+    if record.interval is None:
+        why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
+        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
+    controller = loop.at(record.interval).controller
+    left = unexplained(record, r, controller, loop.enters)
+    if not left <= UNEXPLAINED:
+        made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
+        why = (
+            f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
+            "controller in continuous time, another sampling interval, sign or reference, or limits of the actuator "
+            "do that, and estimates with it would be wrong"
+        )
+        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
+    closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
+    return replace(measured, record=closed)
+
+
+_IGNORE = "{}; correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
+
+
+def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:
+    """Return the root mean square of ``A u - B e`` relative to that of its terms; ``C = B/A``, any initial state."""
+    a, b = controller.denominator, controller.numerator
+    b = np.concatenate((np.zeros(a.size - b.size), b))
+    at_controller = enters == "controller"
+    u, driven = record.input.values, (r if at_controller else 0.0) - record.y
+    own = u if at_controller else u - r
+    # From the first instant on at which all samples of the polynomials are there.
+    moves, made = np.convolve(own, a, "valid"), np.convolve(driven, b, "valid")
+    left = moves - made
+    present = np.isfinite(left)
+    scale = float(np.mean(moves[present] ** 2)) if present.any() else 0.0
+    return float(np.sqrt(np.mean(left[present] ** 2) / scale)) if scale > 0 else float("inf")
+
+
+def _check_units(measured: Measurement, loop: LoopOptions) -> None:
+    """Refuse a reference in another unit than the signal that it is compared with."""
+    assert measured.reference is not None
+    unit = split_header(measured.reference)[1]
+    what = "output" if loop.enters == "controller" else "input"
+    other = measured.output_unit if loop.enters == "controller" else measured.input_unit
+    if unit is not None and other is not None and unit != other:
+        column = f"the reference {measured.reference!r} is in {unit}, and the {what} that it enters with in {other}"
+        raise DataError(f"{measured.record.name}: {column}; name another column, or say where it enters (loop.enters)")
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Where estimates start: what a start is called, and what it is on a data set
+
+
+@dataclass(frozen=True)
+class StartPoint:
+    """A start: an initial delay, initial parameters, or none."""
+
+    label: str
+    #: What of an estimate it is a start of.
+    of: Literal["delay", "parameters"] | None = None
+    #: Initial delay [s], or the word random; None leaves it to the estimator.
+    initial_delay: float | str | None = None
+    #: Range of a random delay [s].
+    bounds: tuple[float, float] | None = None
+    #: Largest relative deviation of random parameters from those of the simulated system [-].
+    spread: float | None = None
+    model: AdditiveModel | None = field(default=None, compare=False)
+
+    def draw(
+        self, seed: int | None, replicate: int, true_model: TransferFunction | AdditiveModel | None = None
+    ) -> Start | None:
+        """Return the start on one data set.
+
+        Every random start stretches the same numbers of the replicate's stream over its own range, so that no start
+        depends on which others there are.
+        """
+        if seed is None and (self.bounds is not None or self.spread is not None):
+            raise ValueError("a random start needs the seed of the experiment")
+        if self.bounds is not None:
+            low, high = self.bounds
+            return Start(delay=low + (high - low) * float(stream(cast(int, seed), "start", replicate).random()))
+        if self.spread is not None:
+            centre = additive_form(cast(AdditiveModel, true_model))
+            numbers = stream(cast(int, seed), "parameters", replicate).uniform(-1.0, 1.0, centre.theta.size)
+            theta = centre.theta * (1 + self.spread * numbers)
+            return Start(model=AdditiveModel.from_theta(theta, centre.terms, centre.delay))
+        if self.of is None:
+            return None
+        return Start(delay=cast(float | None, self.initial_delay), model=self.model)
+
+
+#: The start of estimators that need none, and of every estimator where the specification names none.
+NO_START = StartPoint("none")
+
+
+def additive_form(model: TransferFunction | AdditiveModel) -> AdditiveModel:
+    """Return a model as a sum of submodels."""
+    return model if isinstance(model, AdditiveModel) else factored(model)

@@ -1,4 +1,4 @@
-"""What is measured of frequencies over time against the true ones.
+"""Data sets of signals, estimates of their frequencies, and what is measured of these against the true ones.
 
 Names of the measures, each with the number of the tone behind it where it is one number per tone, by rising frequency:
 
@@ -19,16 +19,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids
-
-if TYPE_CHECKING:
-    from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
-
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
+from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb
+from ctid_cli.signals.streams import stream
 
 #: Units of the measures, in the order of columns.
 MEASURE_UNITS = {
@@ -60,7 +60,7 @@ class Measuring:
 
 
 def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
-    """The frequencies that an estimator of so many tones should find."""
+    """Return the frequencies that an estimator of so many tones should find."""
     true = signal.frequencies_at(times)
     if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
         true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)
@@ -104,7 +104,7 @@ def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[flo
 
 
 def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
-    """Names of the measures that any estimate has, in the order of columns."""
+    """Return the names of the measures that any estimate has, in the order of columns."""
     order = list(MEASURE_UNITS)
 
     def place(name: str) -> tuple[int, int]:
@@ -115,13 +115,13 @@ def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
 
 
 def base_name(name: str) -> tuple[str, int]:
-    """A measure without the number of its tone, and that number."""
+    """Return a measure without the number of its tone, and that number."""
     base, _, tone = name.rpartition("_")
     return (base, int(tone)) if tone.isdigit() else (name, 0)
 
 
 def is_settled(measures: Mapping[str, float | None] | None, band: float, by: float | None) -> bool:
-    """Whether all frequencies came into the band in time and stayed there."""
+    """Return whether all frequencies came into the band in time and stayed there."""
     if not measures:
         return False
     times = [value for name, value in measures.items() if name.startswith("settling_")]
@@ -148,10 +148,109 @@ def _in_window(t: Array, window: tuple[float, float] | None) -> BoolArray:
 
 
 def _false_alarms(track: FrequencyTrack, signal: SumOfSinusoids) -> int:
-    from ctid_cli.frequency.flags import Flag
-
     alarm = (track.flags & int(Flag.CHANGED)) != 0
     begins = track.t[np.flatnonzero(alarm & ~np.concatenate(([False], alarm[:-1])))]
     steps = np.array(signal.steps)
     graces = ALARM_PERIODS * 2.0 * np.pi / signal.frequencies_at(steps)[:, 0]
     return sum(not ((steps <= begin + 1e-9) & (begin <= steps + graces)).any() for begin in begins)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Data sets and estimates
+
+
+@dataclass(frozen=True, eq=False)
+class SignalRecord:
+    """What estimators of frequencies are given."""
+
+    #: Disturbed signal [signal unit], shape (N,).
+    samples: Array
+    #: Sampling interval [s].
+    interval: float
+
+
+@dataclass(frozen=True, eq=False)
+class SignalDataSet:
+    """A record, and what is known of its origin."""
+
+    record: SignalRecord
+    source: SignalSource
+    replicate: int
+    true_model: ClassVar[None] = None
+
+    def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
+        """Return what is stored of a fit to the record."""
+        source, measuring = self.source, self.source.measuring
+        times = self.record.interval * np.arange(self.record.samples.size, dtype=float)
+        true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
+        last = fit.last
+        result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
+        if not last.valid:
+            result = {"status": "INVALID", "message": " ".join(last.reasons)}
+        if not isinstance(fit.found, FrequencyTrack):
+            return result | {"measures": measure_estimate(last, true, measuring.window, times)}
+        return result | {"measures": measure_track(fit.found, true, source.signal, measuring, fit.options)}
+
+
+@dataclass(frozen=True, eq=False)
+class SignalSource:
+    """Data sets of a signal."""
+
+    signal: SumOfSinusoids
+    disturbance: Disturbance | None
+    sampling: RegularSampling
+    seed: int
+    measuring: Measuring
+
+    def dataset(self, replicate: int) -> SignalDataSet:
+        """Make one realisation."""
+        times = self.sampling.times(stream(self.seed, "sampling", replicate))
+        signal = self.signal.generate(times)
+        samples = disturb(signal, times, self.disturbance, stream(self.seed, "noise", replicate))
+        return SignalDataSet(SignalRecord(samples, self.sampling.interval), self, replicate)
+
+
+@dataclass(frozen=True)
+class FrequencyEstimation:
+    """An estimator of frequencies in the place of an estimator of models."""
+
+    options: Any
+    start_from: ClassVar[None] = None
+
+    def prepare(self, record: SignalRecord) -> PreparedFrequencies:
+        """Get ready for a record."""
+        tracker = self.options.start(record.interval) if self.options.online else None
+        return PreparedFrequencies(self.options, record, tracker)
+
+    def compile(self, interval: float) -> None:
+        """Compile the kernels of the estimator."""
+        if self.options.online:
+            self.options.start(interval).update(0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFrequencies:
+    """An estimator of frequencies before the first sample of a record."""
+
+    options: Any
+    record: SignalRecord
+    tracker: Any
+
+    def fit(self, start: None = None) -> FrequencyFit:
+        """Estimate the frequencies."""
+        if self.tracker is None:
+            return FrequencyFit(self.options, self.options.estimate(self.record.samples, self.record.interval))
+        return FrequencyFit(self.options, self.tracker.run(self.record.samples))
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyFit:
+    """Estimated frequencies."""
+
+    options: Any
+    found: FrequencyTrack | FrequencyEstimate
+
+    @property
+    def last(self) -> FrequencyEstimate:
+        """The estimate at the end of the record."""
+        return self.found.final if isinstance(self.found, FrequencyTrack) else self.found

@@ -1,62 +1,154 @@
 """What is wrong with a specification although every section is right by itself."""
 
+import itertools
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import DataError
-from ctid_cli.kinds import KINDS
+from ctid_cli.canonical import canonical_json
+from ctid_cli.errors import DataError, UsageError
+from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.controller import Relay
 from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
-from ctid_cli.signals.streams import stream
-from ctid_cli.simulation.dataset import LoopOptions, located
+from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
+from ctid_cli.simulation.dataset import SimulatedSource, additive_form
+from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import MAX_COMBINATIONS, Section, Variant, case_count, over, variants
-from ctid_cli.specification.signal_checks import signal_complaints, world_complaints
+from ctid_cli.specification.sections import (
+    MAX_COMBINATIONS,
+    Failure,
+    Section,
+    Variant,
+    case_count,
+    grouped,
+    known_variants,
+    over,
+    place_of,
+    replaced,
+    swept_in,
+    variants,
+)
 from ctid_cli.specification.spec import OF_DATA, Spec
-from ctid_cli.specification.start_points import additive_form
-from ctid_cli.specification.start_sections import RelativeStart, StartsSection, UniformStart
+from ctid_cli.specification.system_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
 MAX_SAMPLES = 10_000_000
 #: Data cells times estimators with each of their settings that an experiment may have.
 MAX_SETTINGS = 1_000_000
-#: Combinations that are tried when a specification is checked, of sections whose faults show only together.
+#: Data sets that are simulated when a specification is checked, and samples of all of them.
 MAX_TRIALS = 64
+MAX_TRIAL_SAMPLES = 20_000_000
+
+_SIMULATED = ("system", "excitation", "sampling")
+#: Sections that belong to the identification of systems.
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
+#: Success rules of systems and of signals.
+_RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
+_RULES_OF_SIGNALS = ("band", "by", "window")
 
 
-@dataclass(frozen=True, eq=False)
-class Extent:
-    """How long a record is, and how many of its samples are left after a delay."""
+# --------------------------------------------------------------------------------------------------------------------
+# Which sections there are
 
-    interval: float
-    samples: int
-    #: Instants of the samples of a measured record [s].
-    times: Array | None = None
-    sampling: Any = None
 
-    @property
-    def duration(self) -> float:
-        """Time from the first sample to the last [s]."""
-        return self.interval * (self.samples - 1)
+def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
+    """Say which sections are missing or too many, whatever they hold."""
+    present = {name for name in Spec.model_fields if raw.get(name) is not None}
+    of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
+    for name in of_other:
+        if name in present:
+            other = "; what is added to a signal is its disturbance" if name == "noise" else ""
+            yield (name,), f"belongs to a {about}, and there is none here; leave it out{other}"
+    if "signal" not in present:
+        yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
+    elif "sampling" not in present:
+        yield ("sampling",), "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
+    random = _random_section(spec, raw, present)
+    if random and "monte_carlo" not in present:
+        yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
 
-    def samples_after(self, delay: float) -> int:
-        """How many samples a delay [s] leaves."""
-        if self.times is not None:
-            return int(np.count_nonzero(self.times >= delay))
-        return max(self.samples - math.ceil(delay / self.interval), 0)
+
+def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
+    for name in (*_SIMULATED, "noise", "recorder"):
+        if name in present:
+            yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
+    if _reference(raw, "loop") is not None:
+        yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
+    column = _reference(raw, "data") is not None
+    if column and "loop" not in present:
+        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
+    elif not column and "loop" in present and isinstance(raw["data"], Mapping):
+        yield ("data", "reference"), "is missing; a loop has a reference: name its column"
+
+
+def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
+    if {"loop", "excitation"} <= present:
+        yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
+    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None and not _has_relay(raw["loop"]):
+        yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
+    missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
+    if len(missing) == len(_SIMULATED):
+        yield (), "there are no data: give system, excitation and sampling; or data; or signal and sampling"
+        return
+    for name in missing:
+        yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
+
+
+def _has_relay(loop: Mapping[str, Any]) -> bool:
+    controller = loop.get("controller")
+    return isinstance(controller, Mapping) and "relay" in controller
+
+
+def _reference(raw: Mapping[str, Any], section: str) -> Any:
+    """Return the reference in a section, whatever the section is."""
+    content = raw.get(section)
+    return content.get("reference") if isinstance(content, Mapping) else None
+
+
+def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> str:
+    """Return a section of simulated data that draws random numbers; empty if none does."""
+    if "data" in present:
+        return ""
+    parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
+    parts["excitation of the loop"] = _reference(raw, "loop"), getattr(spec.loop, "reference", None)
+    for name, (content, section) in parts.items():
+        if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
+            return name
+    recorder = raw.get("recorder")
+    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""
+
+
+def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
+    """Return whether the class that a section, which may be broken, names draws no random number with its options."""
+    target = None if section is None else section.target
+    options = content if isinstance(content, Mapping) else {}
+    kind = options.get("kind")
+    if target is None and isinstance(kind, str) and kind in KINDS[part]:
+        target = resolve(part, kind)
+    without = getattr(target, "deterministic_with", {})
+    if getattr(target, "deterministic", False) is True:
+        return True
+    return any(options.get(name) in without[name] for name in without)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Everything else
 
 
 def too_many_cases(spec: Spec) -> str:
-    """Why not even the combinations of a specification can be looked at; empty if they can."""
+    """Return why not even the combinations of a specification can be looked at; empty if they can."""
     cells = math.prod(case_count(getattr(spec, name)) for name in OF_DATA)
     estimators = sum(map(case_count, spec.estimators.values()))
     if cells > MAX_COMBINATIONS:
@@ -68,14 +160,16 @@ def too_many_cases(spec: Spec) -> str:
 
 
 def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
-    """What the sections of a specification have against each other."""
-    yield from world_complaints(spec, broken)
-    samplings = variants(spec.sampling)
+    """Say what the sections of a specification have against each other."""
+    yield from _precision_complaints(spec, broken)
+    yield from _same_estimators(spec)
+    yield from _world_complaints(spec, broken)
+    samplings = known_variants(spec.sampling)
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
-    of_ours = [] if getattr(spec.sampling, "own", False) else samplings
-    too_long = over({(): of_ours}, partial(_too_long, ("sampling", key)))
+    too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
+    yield from too_long
     if spec.signal is not None:
-        yield from too_long or signal_complaints(spec)
+        yield from () if too_long else _signal_complaints(spec)
         return
     records = extents(spec, samplings) if files_are_good else []
     open_loop = (spec.loop is None or has_relay(spec)) and not broken & {"loop", "data", "excitation"}
@@ -83,30 +177,99 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
-    if spec.loop is not None and spec.data is None:
-        yield from _loop_complaints(spec, spec.loop)
-    elif has_relay(spec):
-        yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
-    if files_are_good:
-        yield from too_long or _simulation_complaints(spec, records)
+    of_data = list(_data_complaints(spec, [] if too_long else records))
+    yield from of_data
+    # A wrong level of the noise leaves the rest to be tried.
+    if not (too_long or spec.data) and files_are_good and {path[0] for path, _ in of_data} <= {"noise"}:
+        yield from _trial_complaints(replaced(spec, ("noise",), None) if of_data else spec)
+
+
+def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+    """Say which measures there are not, and which precision cannot be had."""
+    for k, name in enumerate(spec.measures or ()):
+        try:
+            requested(name)
+        except UsageError as error:
+            yield ("measures", k), str(error)
+    until = None if spec.monte_carlo is None else spec.monte_carlo.until
+    place = ("monte_carlo", "until")
+    if until is None:
+        return
+    if spec.data is not None:
+        yield place, "a measured record is one data set; give runs: 1 in place of until and at_most"
+        return
+    if until.percent_half_width is not None and spec.success is None and "success" not in broken:
+        yield (*place, "percent_half_width"), "is of the estimates that meet the success rule; add success"
+    if until.rmse_relative is None or broken & {"system", "data"}:
+        return
+    if spec.system is None:
+        yield (*place, "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
+    elif spec.system.custom and not spec.system.truth:
+        yield (*place, "rmse_relative"), "needs true values: system.truth: {gain: 1.0}"
+
+
+def _same_estimators(spec: Spec) -> Iterator[Complaint]:
+    """Say which estimators are the same."""
+    seen: dict[str, str] = {}
+    for name, section in spec.estimators.items():
+        others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]
+        for other in [other for other in others if other != name][:1]:
+            yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
+
+
+def _world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
+    """Say which estimators and success rules belong to the other kind of experiment."""
+    on_signal = spec.signal is not None
+    if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
+        return
+    wanted = "frequency_estimator" if on_signal else "estimator"
+    here, does = "a signal; allowed:", "identifies a system from its input and output"
+    if not on_signal:
+        here, does = "a system; give signal, or one of", "estimates the frequencies of a signal"
+    for name, section in spec.estimators.items():
+        if section.kind not in KINDS[wanted] and (on_signal or not section.custom):
+            message = f"{section.kind} {does}, and this experiment has {here} {', '.join(KINDS[wanted])}"
+            yield ("estimators", name, "kind"), message
+    for name in _RULES_OF_SYSTEMS if on_signal else _RULES_OF_SIGNALS:
+        if getattr(spec.success, name, None) is not None:
+            other = "a signal has none of it; use band and by" if on_signal else "is about the frequencies of a signal"
+            yield ("success", name), f"{other}, or leave it out"
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Length of the records
+# Records, estimators, starts and success
+
+
+@dataclass(frozen=True, eq=False)
+class Extent:
+    """How long a record is, and how many of its samples are left after a delay."""
+
+    interval: float
+    samples: int
+    #: Instants of the samples of a measured record [s].
+    times: Array | None = None
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return self.interval * (self.samples - 1)
+
+    def samples_after(self, delay: float) -> int:
+        """Return how many samples a delay [s] leaves."""
+        if self.times is not None:
+            return int(np.count_nonzero(self.times >= delay))
+        return max(self.samples - math.ceil(delay / self.interval), 0)
 
 
 def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
-    """How long the records are: the measured one, or one for each sampling."""
+    """Return how long the records are: the measured one, or one for each sampling."""
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
-    # What is one's own is asked in a worker process only, before the run.
-    if getattr(spec.sampling, "own", False):
-        return []
     # Random intervals stand for themselves at their mean.
-    plans = [(case, Extent(case.options.mean_interval, case.options.samples, None, case.options)) for case in samplings]
-    return [Variant({}, case.swept, extent) for case, extent in plans]
+    plans = [(case, case.options) for case in samplings]
+    return [Variant({}, case.swept, Extent(options.mean_interval, options.samples)) for case, options in plans]
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -130,14 +293,10 @@ def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]
         yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or fewer poles or zeros"
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# Estimators, starts and success
-
-
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
-    """What each estimator of a system has against the record, the loop and the initial delays."""
+    """Say what each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"] or section.own:
+        if section.kind in KINDS["frequency_estimator"] or section.custom:
             continue
         at, cases = ("estimators", name), variants(section)
         yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
@@ -154,7 +313,7 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
 
 
 def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
-    if options.start_from != "delay" or not hasattr(options, "delay_bounds"):
+    if getattr(options, "start_from", None) != "delay" or not hasattr(options, "delay_bounds"):
         return
     low, high = options.delay_bounds
     for k, point in enumerate(delays):
@@ -181,11 +340,11 @@ def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str])
 
 
 def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
-    """What a start around the true parameters has against the system."""
+    """Say what a start around the true parameters has against the system."""
     if spec.data is not None:
         yield path, "the parameters of a measured record are not known; give values: {additive: [submodels]}"
-    elif spec.system is not None and spec.system.own:
-        yield path, "a system of one's own has no known structure; give values: {additive: [submodels]}"
+    elif spec.system is not None and spec.system.custom:
+        yield path, "a custom system has no known structure; give values: {additive: [submodels]}"
     elif spec.system is not None:
         try:
             model = additive_form(variants(spec.system)[0].options)
@@ -198,12 +357,12 @@ def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
 def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
     """Say which estimators cannot start from a model."""
     for name, section in spec.estimators.items():
-        if not section.own:
+        if not section.custom:
             yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
 
 
 def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
-    if options.start_from != "parameters":
+    if getattr(options, "start_from", None) != "parameters":
         return
     if hasattr(options, "terms"):
         if model.terms != tuple(options.terms):
@@ -232,7 +391,7 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
             yield path, f"the {unknown} of a measured record are not known; {other}"
         elif spec.system is None:
             continue
-        elif spec.system.own:
+        elif spec.system.custom:
             yield from _truth_complaints(path, spec.system.truth, name)
         elif name == "delay_relative_error":
             if 0.0 in np.atleast_1d(spec.system.delay):
@@ -242,7 +401,7 @@ def _success_complaints(spec: Spec) -> Iterator[Complaint]:
 
 
 def _truth_complaints(path: KeyPath, truth: Mapping[str, Any], rule: str) -> Iterator[Complaint]:
-    """Say that a system of one's own does not say what is true of it."""
+    """Say that a custom system does not say what is true of it."""
     names = ["delay"] if rule == "delay_relative_error" else [name for name in truth if name != "delay"]
     if not names or not truth.keys() >= set(names):
         yield path, f"needs true values: system.truth: {{{names[0] if names else 'gain'}: 1.0}}"
@@ -255,27 +414,39 @@ def _truth_complaints(path: KeyPath, truth: Mapping[str, Any], rule: str) -> Ite
 
 
 def has_relay(spec: Spec) -> bool:
-    """Whether a relay closes the loop: estimators know nothing of it, and take the record for one in open loop."""
+    """Return whether a relay closes the loop: to estimators the record is one in open loop."""
     return spec.loop is not None and hasattr(spec.loop.controller, "relay")
 
 
-def _loop_complaints(spec: Spec, section: Section) -> Iterator[Complaint]:
-    """What noise, sampling and system have against a loop."""
-    if spec.system is not None and spec.system.own:
+def _data_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[Complaint]:
+    """Say what the sections that data are made from have against each other."""
+    yield from over({("system",): known_variants(spec.system), ("sampling",): records}, _of_delay)
+    if spec.generator is not None and spec.data is None:
+        place, section = spec.generator
+        yield from over({place: known_variants(section), ("sampling",): records}, partial(_of_clock_periods, place))
+    if spec.loop is None:
+        return
+    if spec.data is not None:
+        if has_relay(spec):
+            yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
+        return
+    if spec.system is not None and spec.system.custom:
         yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
-        return
-    yield from over({(): variants(spec.noise)}, _of_ratio)
-    samplings = variants(spec.sampling)
-    if any(not isinstance(variant.options, RegularSampling) for variant in samplings):
+    yield from over({(): known_variants(spec.noise)}, _of_ratio)
+    if any(not isinstance(variant.options, RegularSampling) for variant in variants(spec.sampling)):
         yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
-        return
-    # How many samples there are makes no difference.
-    clocks = {
-        case.options.interval: replace(case, swept={path: v for path, v in case.swept.items() if path == ("interval",)})
-        for case in samplings
-    }
-    parts: dict[KeyPath, list[Variant]] = {("system",): variants(spec.system), ("loop",): variants(section)}
-    yield from over(parts | {("sampling",): list(clocks.values())}, _of_stability, MAX_TRIALS)
+
+
+def _of_delay(system: Any, extent: Extent) -> Iterator[Complaint]:
+    if system.delay >= extent.duration:
+        yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"
+
+
+def _of_clock_periods(at: KeyPath, excitation: Any, extent: Extent) -> Iterator[Complaint]:
+    clock = getattr(excitation, "clock_period", None)
+    if clock is not None and extent.duration / clock > MAX_SAMPLES:
+        message = f"a record of {extent.duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
+        yield (*at, "clock_period"), message
 
 
 def _of_ratio(noise: Any) -> Iterator[Complaint]:
@@ -284,53 +455,134 @@ def _of_ratio(noise: Any) -> Iterator[Complaint]:
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
-def _of_stability(system: Any, loop: LoopOptions, sampling: Any) -> Iterator[Complaint]:
-    """Say why a loop cannot be simulated."""
-    from ctid_cli.filtering.loop import loop_radius
+def _trial_complaints(spec: Spec) -> Iterator[Complaint]:
+    """Say what only a simulation shows: the first data set of each distinct setting is made.
 
-    path, interval, radius = ("loop", "controller"), sampling.interval, 0.0
-    if isinstance(loop.controller, Relay):
-        return  # it bounds the input, and oscillates on purpose
+    Sections that are missing because they are wrong by themselves have a stand-in, so that the others are tried. Custom
+    components are tried in a process of their own, before a run.
+    """
+    driven = spec.loop is not None if spec.generator is None else not spec.generator[1].custom
+    if spec.sampling is None or spec.sampling.custom or not driven:
+        return
+    sections = {name: section for name in OF_DATA if (section := getattr(spec, name)) is not None}
+    parts: dict[KeyPath, Sequence[Variant]]
+    parts = {(name,): variants(section) for name, section in sections.items() if not section.custom}
+    parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
+    # Levels of noise, and losses, decide on nothing else: they take turns.
+    turns = {at: parts.pop(at) for at in (("noise",), ("recorder",)) if at in parts}
+    failures: list[Failure] = []
+    tried: list[Mapping[KeyPath, Any]] = []
+    samples = 0
+    for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
+        case = dict(zip(parts, point, strict=True))
+        others = {at: found[k % len(found)] for at, found in turns.items()}
+        options = {str(at[0]): variant.options for at, variant in (case | others).items()}
+        samples += options["sampling"].samples
+        if samples > MAX_TRIAL_SAMPLES and tried:
+            break
+        tried.append(swept_in(case))
+        for place, message in trial(spec.simulated_source(options, spec.folder)):
+            failures.append((place, message, tried[-1]))
+    yield from grouped(failures, tried)
+
+
+def trial(source: SimulatedSource) -> Iterator[Complaint]:
+    """Say why the first data set of a source cannot be made, if its sections are to blame."""
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            source.require_stable()
+            source.dataset(0)
+    except DataError as error:
+        yield tuple(error.section.split(".")) if error.section else (), str(error)
+    except Exception:  # of which a run says more: it is stored with every estimate
+        return
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Frequencies of a signal
+
+
+def _signal_complaints(spec: Spec) -> Iterator[Complaint]:
+    """Say what the sections of an experiment on a signal have against each other."""
+    clocks = variants(spec.sampling)
+    if any(not isinstance(clock.options, RegularSampling) for clock in clocks):
+        yield ("sampling", "kind"), "must be regular: estimators of frequencies compare samples at fixed delays"
+        return
+    signals = variants(spec.signal)
+    yield from over({("signal",): signals, ("sampling",): clocks}, partial(_of_tone_clock, spec))
+    disturbances = [case.options for case in variants(spec.disturbance)] or [None]
+    for name, section in spec.estimators.items():
+        if section.kind in KINDS["frequency_estimator"]:
+            at, cases = ("estimators", name), variants(section)
+            yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
+            yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
+
+
+def _of_tones(at: KeyPath, disturbances: list[Any], options: Any, signal: SumOfSinusoids) -> Iterator[Complaint]:
+    try:
+        for disturbance in disturbances:
+            true_frequencies(signal, disturbance, options.tones, np.zeros(1))
+    except ValueError:
+        sine = any(isinstance(item, SineDisturbance) for item in disturbances)
+        more = ", or one more for the sinusoid that disturbs it" if sine else ""
+        yield (*at, "tones"), f"must be {len(signal.tones)}, as many as the signal has{more}, not {options.tones}"
+
+
+def _of_tone_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -> Iterator[Complaint]:
+    interval = float(clock.interval)
+    duration = interval * clock.samples
+    highest, limit = signal.highest_frequency, math.pi / interval
+    if highest >= limit:
+        yield ("sampling", "interval"), f"shows frequencies below {limit:.4g} rad/s only, the signal has {highest:g}"
+    for step in signal.steps:
+        if step >= duration - interval:
+            yield ("signal", "tones"), f"a step at {step:g} s comes after the last sample, {duration - interval:g} s"
+    low, high = getattr(spec.success, "window", None) or (0.0, duration)
+    if high > duration * (1 + 1e-9) or high - low < interval:
+        yield ("success", "window"), f"must hold samples of the record, which ends at {duration:g} s"
+    by = getattr(spec.success, "by", None) or 0.0
+    if by > duration:
+        yield ("success", "by"), f"{by:g} s come after the end of the record, {duration:g} s"
+
+
+def _of_estimator(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    for path, message in (_of_online if options.online else _of_batch)(options, clock):
+        yield (*at, *path), message
+
+
+def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    duration = clock.interval * clock.samples
+    # First of all, since the estimator would keep all the samples of such a time.
+    for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
+        value = getattr(options, name, 0.0)
+        if value > duration:
+            yield (name,), f"{name} = {value:g} s is longer than the record, {duration:g} s"
+            return
+    rows = options.first_row + options.tones - 1 if hasattr(options, "d") else 0
+    filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
+    filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
+    if filled >= duration:
+        yield ("h",), f"its delays are filled after {filled:g} s, the record ends at {duration:g} s; take a smaller h"
+        return
     try:
         with np.errstate(all="ignore"):
-            radius = loop_radius(system, loop.at(interval).controller, interval)
-    except DataError as error:
-        yield path, str(error)
-    except np.linalg.LinAlgError:
-        yield path, f"the loop: its numbers overflow at intervals of {interval:g} s; scale the coefficients"
-    if not radius < 1.0:
-        largest = f"at intervals of {interval:g} s its largest pole has the magnitude {radius:.6g}"
-        yield path, f"the loop with the true system is unstable: {largest}; lower the gain"
+            options.start(clock.interval)
+    except ArithmeticError:
+        yield (), "these values are too large or too small to compute with"
+    except ValueError as error:
+        yield place_of(error, vars(options)), str(error)
 
 
-def _simulation_complaints(spec: Spec, records: Sequence[Variant]) -> Iterator[Complaint]:
-    """What the sections that data are simulated from have against each other."""
-    yield from over({("system",): variants(spec.system), ("sampling",): records}, _of_delay)
-    if spec.generator is None:
+def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    initial = getattr(options, "initial_frequencies", None)
+    if initial is not None:
+        highest = math.pi / clock.interval
+        if max(initial) >= highest:
+            yield ("initial_frequencies",), f"must be below {highest:.4g} rad/s, pi over the sampling interval"
         return
-    place, section = spec.generator
-    if section.own:
-        return
-    seed = spec.monte_carlo.seed if spec.monte_carlo is not None else 0
-
-    # Some faults show only where an excitation meets a sampling scheme: a step after the end, a tone that the clock
-    # cannot carry. One data set of each pair tells; pairs beyond the first ones repeat what these say.
-    def tried(excitation: Any, extent: Extent) -> Iterator[Complaint]:
-        clock = getattr(excitation, "clock_period", None)
-        if clock is not None and extent.duration / clock > MAX_SAMPLES:
-            message = f"a record of {extent.duration:g} s has more than {MAX_SAMPLES} clock periods of {clock:g} s"
-            yield (*place, "clock_period"), message
-            return
-        try:
-            times = extent.sampling.times(stream(seed, "sampling", 0))
-            located(excitation, spec.folder).generate(times, stream(seed, "input", 0))
-        except DataError as error:
-            yield place, str(error)
-
-    if spec.data is None:
-        yield from over({place: variants(section), ("sampling",): records}, tried, MAX_TRIALS)
-
-
-def _of_delay(system: Any, extent: Extent) -> Iterator[Complaint]:
-    if getattr(system, "delay", 0.0) >= extent.duration:
-        yield ("system", "delay"), f"{system.delay:g} s is not shorter than the record ({extent.duration:g} s)"
+    start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
+    try:
+        start.blocks(clock.samples, clock.interval)
+    except (ValueError, DataError) as error:
+        yield place_of(error, vars(options)), str(error)

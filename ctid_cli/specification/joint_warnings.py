@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.models.additive import Term
+from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Variant, over, variants
-from ctid_cli.specification.signal_checks import signal_warnings
+from ctid_cli.specification.sections import Variant, known_variants, over, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -26,17 +26,18 @@ ON_TIME = 1e-6
 
 
 def joint_warnings(spec: Spec) -> list[Complaint]:
-    """What is allowed but unwise."""
+    """Say what is allowed but unwise."""
     if spec.signal is not None:
-        return signal_warnings(spec)
+        return _signal_warnings(spec)
     warnings = [] if spec.system is None else _simulation_warnings(spec)
     if spec.data is not None and spec.monte_carlo is not None and spec.monte_carlo.most > 1:
         warnings.append((("monte_carlo", "runs"), "a measured record is one data set; it is run once"))
     if spec.loop is not None and not has_relay(spec):
         for name, section in spec.estimators.items():
-            warnings += over({(): variants(section)}, partial(_of_open_loop, ("estimators", name)))
+            cases = known_variants(section) or [Variant({}, {}, None)]
+            warnings += over({(): cases}, partial(_of_open_loop, ("estimators", name)))
     if spec.starts is not None:
-        taken = {variants(section)[0].options.start_from for section in spec.estimators.values()}
+        taken = {getattr(variants(section)[0].options, "start_from", None) for section in spec.estimators.values()}
         for name, kind in (("initial_delay", "delay"), ("parameters", "parameters")):
             if getattr(spec.starts, name) and kind not in taken:
                 warnings.append((("starts", name), "no estimator here uses a start of this kind; each is run once"))
@@ -50,19 +51,16 @@ def _of_open_loop(at: KeyPath, options: Any) -> Iterator[Complaint]:
 
 
 def _simulation_warnings(spec: Spec) -> list[Complaint]:
-    """What is unwise where the truth is known."""
+    """Say what is unwise where the truth is known."""
     warnings: list[Complaint] = []
-    if spec.noise is not None and not getattr(spec.noise, "own", False):
-        for name, section in spec.estimators.items():
-            at = ("estimators", name)
-            warnings += over({("noise",): variants(spec.noise), at: variants(section)}, partial(_of_white_formula, at))
-    # What is one's own is asked in a worker process only.
-    samplings = [] if getattr(spec.sampling, "own", False) else variants(spec.sampling)
-    if spec.excitation is not None and not getattr(spec.excitation, "own", False):
-        told: dict[KeyPath, list[Variant]] = {("excitation",): variants(spec.excitation), ("sampling",): samplings}
-        warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
-    # A system of one's own need not have poles.
-    systems = [case for case in variants(spec.system) if hasattr(case.options, "poles")]
+    noises, estimators = known_variants(spec.noise), {("estimators", n): s for n, s in spec.estimators.items()}
+    for at, section in estimators.items():
+        warnings += over({("noise",): noises, at: known_variants(section)}, partial(_of_white_formula, at))
+    samplings = known_variants(spec.sampling)
+    told: dict[KeyPath, list[Variant]]
+    told = {("excitation",): known_variants(spec.excitation), ("sampling",): samplings}
+    warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
+    systems = known_variants(spec.system)
     if not systems:
         return warnings
     fastest = float(np.abs(systems[0].options.poles).max(initial=0.0))
@@ -71,8 +69,8 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     warnings += over(
         lengths, partial(_of_short_record, "duration" if hasattr(spec.sampling, "duration") else "samples")
     )
-    for name, section in spec.estimators.items():
-        at, cases = ("estimators", name), variants(section)
+    for at, section in estimators.items():
+        cases = known_variants(section)
         warnings += over({("system",): systems, at: cases}, partial(_of_delay, at, in_loop=spec.loop is not None))
         warnings += over({("system",): systems[:1], at: cases}, partial(_of_structure, at))
     return warnings
@@ -159,7 +157,7 @@ def _of_structure(at: KeyPath, system: Any, options: Any) -> Iterator[Complaint]
 
 
 def _degrees(model: Any) -> tuple[int, int] | None:
-    """Degrees of denominator and numerator of a system or of the model of an estimator, as one fraction."""
+    """Return the degrees of denominator and numerator of a system or of the model of an estimator, as one fraction."""
     if hasattr(model, "relative_degree"):
         return model.order, model.order - model.relative_degree
     if hasattr(model, "terms"):
@@ -172,3 +170,31 @@ def _degrees(model: Any) -> tuple[int, int] | None:
 def _fraction_degrees(terms: Sequence[Term]) -> tuple[int, int]:
     order = sum(term.order for term in terms)
     return order, max(order - term.order + term.zeros for term in terms)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Frequencies of a signal
+
+
+def _signal_warnings(spec: Spec) -> list[Complaint]:
+    """Say what is allowed but unwise in an experiment on a signal."""
+    signal = variants(spec.signal)[0].options
+    warnings: list[Complaint] = []
+    for name, section in spec.estimators.items():
+        at, cases = ("estimators", name), variants(section)
+        warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
+        warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
+        if not cases[0].options.online and signal.frequency_steps:
+            warnings.append(((*at, "kind"), "gives one estimate of the whole record, in which a frequency steps"))
+    return warnings
+
+
+def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
+    if hasattr(options, "h") and highest > math.pi / options.h:
+        limit = f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s"
+        yield (*at, "h"), f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+
+
+def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
+    for note in options.start(clock.interval).notes if options.online else ():
+        yield (*at, "h"), note

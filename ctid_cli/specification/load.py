@@ -1,45 +1,30 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import ValidationError, create_model
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
-from ctid_cli.errors import DataError, Problem, RefusedError, SpecError
+from ctid_cli.errors import DataError, RefusedError, SpecError
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.files import is_inside
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
-from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
+from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
-from ctid_cli.specification.loop_section import LoopSection
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
-from ctid_cli.specification.option_sections import EstimatorSection
-from ctid_cli.specification.own_sections import names_code, own_places, with_own_kinds
-from ctid_cli.specification.sections import case_count, replaced, variants
+from ctid_cli.specification.sections import case_count, names_code, replaced, variants
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.yaml_source import (
     OVERRIDE_FILE,
     KeyPath,
-    apply_overrides,
+    YamlSource,
     parse_yaml,
-    path_text,
     read_yaml,
     written,
-)
-
-
-class _PartialSpec(Spec):
-    """What is left of a specification when the broken sections are taken out."""
-
-    @classmethod
-    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-        yield from ()
-
-
-# Same fields, none of them required.
-_Remainder = create_model(
-    "_Remainder", __base__=_PartialSpec, experiment=(str | None, None), estimators=(dict[str, EstimatorSection], {})
 )
 
 
@@ -59,127 +44,150 @@ def load_spec(
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
     """
     if isinstance(given, Mapping):
-        folder, text = Path(), written(given)
-        source = parse_yaml(text, "(specification)")
+        folder, source = Path(), parse_yaml(written(given), "(specification)", overrides)
     else:
-        folder, source = given.parent, read_yaml(given)
-        text = source.text
-    apply_overrides(source, overrides)
+        folder, source = given.parent, read_yaml(given, overrides)
     tree = source.tree
     if not isinstance(tree, dict):
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
-        raise SpecError([Problem(source.file, 1, 1, "", "the file is empty" if tree is None else message)])
-    _require_allowed(tree, source.problem, allow_code)
-    spec, complaints = _validated(with_own_kinds(tree, folder))
-    spec._folder, spec._source = folder, source
+        raise SpecError([source.problem((), "the file is empty" if tree is None else message)])
+    spec, complaints = _validated(source, folder, allow_code)
+    broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
-    broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
     joint = joint_complaints(spec, broken, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
-    if complaints:
-        problems = {source.problem(where, message, key=at_key) for where, message, at_key in complaints}
-        in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
-        raise SpecError(in_order)
+    _require_none(source, complaints)
     spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
-    spec._text = text
+    return spec
+
+
+def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None, *, allow_code: bool = False) -> Spec:
+    """Return a specification from its canonical form."""
+    source = YamlSource("(stored specification)", tree=dict(canonical))
+    spec, complaints = _validated(source, folder or Path(), allow_code)
+    _require_none(source, complaints)
     return spec
 
 
 def load_loop(path: Path) -> LoopOptions:
-    """The section ``loop`` of a file, for a record whose reference is a column of it."""
+    """Return the section ``loop`` of a file, for a record whose reference is a column of it."""
     source = read_yaml(path)
     tree = source.tree.get("loop") if isinstance(source.tree, dict) else None
     if tree is None:
         raise SpecError([source.problem((), "there is no section loop; write loop: {controller: {...}}")])
-    problems: list[Located] = []
-    try:
-        section = LoopSection.model_validate(tree)
-        if section.reference is not None:
-            problems = [(("reference",), "belongs to simulated data; that of a record is a column, --reference", True)]
-        elif case_count(section) > 1:
-            problems = [((), "has lists of values; a record was taken in one loop: keep one of each", False)]
-    except ValidationError as error:
-        problems = [explained(detail, {}) for detail in error.errors(include_url=False)]
-    if problems:
-        raise SpecError([source.problem(("loop", *where), message, key=key) for where, message, key in problems])
+    section, problems = _piece("loop", tree, path.parent)
+    if section is not None and section.reference is not None:
+        message = "belongs to simulated data; that of a record is a column, --reference"
+        problems = [(("loop", "reference"), message, True)]
+    elif case_count(section) > 1:
+        problems = [(("loop",), "has lists of values; a record was taken in one loop: keep one of each", False)]
+    _require_none(source, problems)
     options: LoopOptions = section.options()
     return options
 
 
-def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None, *, allow_code: bool = False) -> Spec:
-    """A specification from its canonical form."""
-
-    def problem(path: KeyPath, message: str) -> Problem:
-        return Problem("(canonical specification)", 1, 1, path_text(path), message)
-
-    _require_allowed(canonical, problem, allow_code)
-    spec, complaints = _validated(with_own_kinds(canonical, folder or Path()))
-    if complaints:
-        raise SpecError([problem(path, message) for path, message, _ in complaints])
-    spec._folder = folder or Path()
-    return spec
-
-
-def _require_allowed(tree: Mapping[str, Any], problem: Callable[[KeyPath, str], Problem], allow_code: bool) -> None:
-    """Refuse to run code that a specification names, as a specification may come from anywhere."""
-    ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
-    places = [(*path, "kind") for path, _, kind in own_places(tree) if names_code(kind)]
-    if places and not allow_code:
-        raise RefusedError("\n".join(str(problem(path, ask)) for path in places))
-
-
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of specifications, for editors."""
+    """Return the JSON Schema of specifications, for editors."""
     schema = Spec.model_json_schema()
     ways = ("data", "system excitation sampling", "system loop sampling", "signal sampling")
     schema["anyOf"] = [{"required": way.split()} for way in ways]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 
 
-def _validated(tree: dict[str, Any]) -> tuple[Spec, list[Located]]:
-    """A specification and what is wrong with it; if anything is, the specification is what remains without it."""
+def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
+    """Raise what is wrong, each problem once and in the order of the file."""
+    problems = {source.problem(where, message, key=at_key) for where, message, at_key in complaints}
+    if problems:
+        in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
+        raise SpecError(in_order)
+
+
+def _code_in(tree: Any) -> Iterator[KeyPath]:
+    """Return where kinds name code, anywhere in a tree, however deep."""
+    waiting: list[tuple[KeyPath, Any]] = [((), tree)]
+    while waiting:
+        path, node = waiting.pop()
+        items = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
+        waiting += (((*path, key), value) for key, value in items)
+        if path and path[-1] == "kind" and isinstance(node, str) and names_code(node):
+            yield path
+
+
+def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Located]]:
+    """Return what is right of a specification, and all that is wrong with its sections by themselves."""
+    tree = source.tree
+    # A specification may come from anywhere.
+    ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
+    code = [source.problem(path, ask) for path in _code_in(tree)]
+    if code and not allow_code:
+        raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
+    found: dict[str, Any] = {"experiment": "", "estimators": {}}
+    complaints: list[Located] = []
+    for name, value in _pieces(tree):
+        right, wrong = _piece(name, value, folder, tree.keys())
+        complaints += wrong
+        if not wrong:
+            found[name] = found[name] | right if name == "estimators" else right
+    for key in tree.keys() - Spec.model_fields.keys():
+        complaints.append(explained(_about(key, "extra_forbidden", tree[key]), Spec.descriptions()))
+    for key in ("experiment", "estimators"):
+        if key not in tree:
+            complaints.append(explained(_about(key, "missing", None), Spec.descriptions()))
+    complaints += [
+        (where, message, True) for where, message in presence_complaints(Spec.model_construct(**found), tree)
+    ]
+    # What is wrong is left out of what is looked at next.
+    found |= {str(where[0]): None for where, _, _ in complaints if where and where[0] != "estimators"}
+    spec = Spec.model_construct(**{name: value for name, value in found.items() if name in Spec.model_fields})
+    spec._folder, spec._source = folder, source
+    return spec, complaints
+
+
+def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Return what is looked at by itself: every section, and every estimator."""
+    for name in tree.keys() & Spec.model_fields.keys():
+        value = tree[name]
+        if name == "estimators" and isinstance(value, dict) and value:
+            yield from ((name, {key: part}) for key, part in value.items())
+        else:
+            yield name, value
+
+
+def _piece(name: str, value: Any, folder: Path, given: Set[str] = frozenset()) -> tuple[Any, list[Located]]:
+    """Return a section, or some estimators, of a specification that has some sections, and what is wrong with it."""
     try:
-        return Spec.model_validate(tree), []
+        return _adapter(name).validate_python(value, strict=True, context={"folder": folder}), []
     except ValidationError as error:
-        complaints = _complaints(error)
-    good = _without({key: value for key, value in tree.items() if key in Spec.model_fields}, complaints)
-    while True:
-        try:
-            return _Remainder.model_validate(good), complaints
-        except ValidationError as error:
-            # What is left may be wrong for want of what is not: two estimators the same without the loop, say.
-            less = _without(good, _complaints(error))
-            good = less if less != good else {}
+        details = error.errors(include_url=False)
+    for detail in details:
+        if name == "estimators" and detail["type"] == "no_kind" and {"signal", "system", "data"} & given:
+            kinds = KINDS["frequency_estimator" if "signal" in given else "estimator"]
+            detail["ctx"] = {"allowed": ", ".join(kinds)}
+    return None, [explained({**detail, "loc": (name, *detail["loc"])}, Spec.descriptions()) for detail in details]
 
 
-def _complaints(error: ValidationError) -> list[Located]:
-    return [explained(detail, {}) for detail in error.errors(include_url=False)]
+@cache
+def _adapter(name: str) -> TypeAdapter[Any]:
+    info = Spec.model_fields[name]
+    form: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
+    return TypeAdapter(form)
 
 
-def _without(tree: dict[str, Any], complaints: Iterable[Located]) -> dict[str, Any]:
-    """A specification without the sections and estimators that are complained of."""
-    good = dict(tree)
-    for path, _, _ in complaints:
-        if path[:1] == ("estimators",) and len(path) > 1 and isinstance(good.get("estimators"), dict):
-            good["estimators"] = {name: item for name, item in good["estimators"].items() if name != path[1]}
-        elif path:
-            good.pop(str(path[0]), None)
-    if not good.get("estimators"):
-        good.pop("estimators", None)
-    return good
+def _about(key: str, error: str, value: Any) -> ErrorDetails:
+    return {"type": error, "loc": (key,), "msg": "", "input": value}
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """The specification with the content hash of its file filled in, and what is wrong with the file.
+    """Return the specification with the content hash of its file filled in, and what is wrong with the file.
 
     Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
     """
     place: tuple[str, ...]
     section: Any
     place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
-    if not hasattr(section, "sha256") or section.own:
+    if not hasattr(section, "sha256") or section.custom:
         return spec, []
     file = joined(spec.folder, section.file)
     open_to_all = own or is_inside(file, spec.folder)

@@ -1,7 +1,9 @@
-"""What is wrong with a value, in sentences: the one table from pydantic's errors to our own."""
+"""What is wrong with a value, in sentences, and what docstrings say about options: the words of all messages."""
 
+import inspect
 import re
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 from pydantic import ValidationError
@@ -39,7 +41,6 @@ SENTENCES = {
     "too_long": "must be a list of at most {max_length}, not {shown}{meaning}",
     "model_type": "must be a mapping with the keys {keys}, not {shown}",
     "extra_forbidden": "there is no such key here{near} allowed: {keys}",
-    "search_retired": "is no longer needed: there is one search now; delete this line",
     "missing": "is missing; add it{meaning}",
     "no_kind": "must be one of {allowed}, not {shown}",
     "kind_missing": "is missing; allowed: {allowed}",
@@ -48,12 +49,12 @@ SENTENCES = {
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """An error whose text reaches the user as it is."""
+    """Return an error whose text reaches the user as it is."""
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
 def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
-    """One validation error that holds several problems."""
+    """Return one validation error that holds several problems."""
     details = [
         InitErrorDetails(
             type=PydanticCustomError("said", "{message}", {"message": message, "at_key": at_key}), loc=path, input=None
@@ -64,12 +65,12 @@ def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
 
 
 def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
-    """Place and sentence of an error in a section whose fields have the given descriptions."""
+    """Return the place and the sentence of an error in a section whose fields have the given descriptions."""
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
     at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in parts
-    path, kind, value, context = _told(path, kind, value, context, descriptions)
+    path, kind, value, context = _told(path, kind, value, context)
     if kind not in SENTENCES:
         return path, error["msg"], at_key
     words = _words(path, descriptions) | {"shown": shown(value)} | context
@@ -79,10 +80,8 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
 
 
-def _told(
-    path: KeyPath, kind: str, value: Any, context: dict[str, Any], descriptions: Mapping[str, str]
-) -> tuple[KeyPath, str, Any, dict[str, Any]]:
-    """What is to be told of an error, where pydantic's own type, or place, says too little."""
+def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tuple[KeyPath, str, Any, dict[str, Any]]:
+    """Return what is to be told of an error, where pydantic's own type, or place, says too little."""
     if kind == "no_kind" and not isinstance(value, Mapping):
         text = f"a mapping with a 'kind' (one of {context['allowed']})"
         each = "; several kinds are several experiments, each with a file" if isinstance(value, list) else ""
@@ -92,13 +91,11 @@ def _told(
     if kind == "float_type" and type(value) is int:
         # An integer beyond all floating-point numbers.
         return path, "finite_number", float("inf"), context
-    if kind == "extra_forbidden" and path == ("search",) and "delay_bounds" in descriptions:
-        return path, "search_retired", value, context
     return path, kind, value, context
 
 
 def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
-    """What a sentence may say about a field, and about the others of its section."""
+    """Return what a sentence may say about a field, and about the others of its section."""
     field = str(path[0]) if path else ""
     description = descriptions.get(field, "")
     unit = re.search(r" \[[^\]-][^\]]*\]", description)
@@ -111,7 +108,7 @@ def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
-    """What to write in the place of a value, where that can be guessed."""
+    """Return what to write in the place of a value, where that can be guessed."""
     if kind in ("float_type", "int_type") and isinstance(value, (list, tuple)):
         return "; this key cannot be swept"
     if kind == "float_type" and isinstance(value, str) and re.match(r"\s*[-+]?\.?[0-9]", value):
@@ -125,8 +122,22 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
     return ""
 
 
+@cache
+def option_docs(target: type) -> dict[str, str]:
+    """Return the text about every option of a class and its bases: the section Parameters of their docstrings."""
+    docs: dict[str, str] = {}
+    for base in reversed(target.__mro__):
+        text = inspect.cleandoc(base.__dict__.get("__doc__") or "")
+        section = re.search(r"^Parameters\n-+\n(.*?)(?=\n\n\S[^\n]*\n-{3,}|\Z)", text, re.DOTALL | re.MULTILINE)
+        for entry in re.split(r"\n(?=\S)", section[1]) if section else ():
+            head, _, body = entry.partition("\n")
+            plain = re.sub(r":[a-z]+:`~?(?:[\w.]+\.)?(\w+)`", r"\1", body).replace("``", "")
+            docs |= dict.fromkeys(head.partition(" : ")[0].split(", "), " ".join(plain.split()))
+    return docs
+
+
 def shown(value: Any) -> str:
-    """A value from a YAML file in the words of a message."""
+    """Return a value from a YAML file in the words of a message."""
     if value is None:
         return "nothing (null)"
     if isinstance(value, bool):

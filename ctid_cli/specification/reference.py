@@ -26,7 +26,7 @@ _LEGEND = (
 
 
 def reference_text(word: str | None = None) -> str:
-    """The reference of all keys, or of those of a section or kind."""
+    """Return the reference of all keys, or of those of a section or kind."""
     schema = json_schema()
     sections: Mapping[str, Node] = schema["properties"]
     if word is None:
@@ -55,7 +55,7 @@ def _kind(form: Node) -> str | None:
 
 
 def _keys(form: Node, defs: Node, indent: str, only: str | None = None) -> Iterator[str]:
-    """Lines about the keys of a mapping, of which one kind alone may be wanted."""
+    """Yield lines about the keys of a mapping, of which one kind alone may be wanted."""
     for key, node in form["properties"].items():
         if key == "kind" and "const" in node:
             continue
@@ -78,7 +78,7 @@ def _keys(form: Node, defs: Node, indent: str, only: str | None = None) -> Itera
 
 
 def _plain(node: Node) -> str:
-    """What is said about a value or mapping, in the words of YAML."""
+    """Return what is said about a value or mapping, in the words of YAML."""
     text = node.get("description", "").replace("``", "")
     return re.sub(r"\b(None|True|False)\b", lambda word: _IN_YAML[word[0]], text)
 
@@ -93,7 +93,7 @@ def _presence(key: str, node: Node, form: Node) -> str:
 
 
 def _alternatives(node: Node, defs: Node) -> list[Node]:
-    """The forms of a value, without null."""
+    """Return the forms of a value, without null."""
     if "$ref" in node:
         return [defs[node["$ref"].rpartition("/")[2]]]
     among = node.get("oneOf") or node.get("anyOf")
@@ -103,7 +103,7 @@ def _alternatives(node: Node, defs: Node) -> list[Node]:
 
 
 def _mappings(node: Node, defs: Node) -> list[Node]:
-    """The mappings that a value, the items of a list, or the values of a mapping by names may be."""
+    """Return the mappings that a value, the items of a list, or the values of a mapping by names may be."""
     found: list[Node] = []
     for form in _alternatives(node, defs):
         inner = form.get("items") or form.get("additionalProperties")
@@ -113,7 +113,7 @@ def _mappings(node: Node, defs: Node) -> list[Node]:
 
 
 def _list_form(node: Node, defs: Node) -> Node | None:
-    """The list of such values that may stand in the place of one."""
+    """Return the list of such values that may stand in the place of one."""
     forms = _alternatives(node, defs)
     lists = [form for form in forms if form.get("type") == "array"]
     same = [form for form in lists if _alternatives(form.get("items", {}), defs)[0] in forms]
@@ -121,7 +121,7 @@ def _list_form(node: Node, defs: Node) -> Node | None:
 
 
 def _type(node: Node, defs: Node) -> str:
-    """The types of a value in words."""
+    """Return the types of a value in words."""
     listed = _list_form(node, defs)
     return " or ".join(dict.fromkeys(_one_type(form, defs) for form in _alternatives(node, defs) if form is not listed))
 

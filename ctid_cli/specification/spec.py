@@ -7,39 +7,43 @@ identity of data and estimators.
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, PrivateAttr
-from pydantic_core import ErrorDetails
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import Problem, UsageError
-from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends, requested
-from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.errors import OptionError, Problem
+from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
 from ctid_cli.signals.recorder import Recorder
-from ctid_cli.simulation.dataset import MeasuredSource, located
-from ctid_cli.specification.fields import LATER, MAX_WHOLE, NotNegative, Positive, Text, matching
-from ctid_cli.specification.loop_section import LoopSection
+from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sinusoids import SumOfSinusoids
+from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
 from ctid_cli.specification.messages import Complaint, wrong
-from ctid_cli.specification.option_sections import EstimatorSection, ExcitationSection, NoiseSection
-from ctid_cli.specification.sections import Options, Section, variants
-from ctid_cli.specification.signal_sections import AnySamplingSection, DisturbanceOrNone, SignalSection
-from ctid_cli.specification.start_sections import StartsSection
-from ctid_cli.specification.system_sections import AnySystemSection
-from ctid_cli.specification.yaml_source import KeyPath, YamlSource, path_text
+from ctid_cli.specification.sections import (
+    MAX_WHOLE,
+    Kinds,
+    NotNegative,
+    Options,
+    Positive,
+    Section,
+    Swept,
+    Text,
+    WithKey,
+    matching,
+    variants,
+)
+from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
+from ctid_cli.specification.yaml_source import KeyPath, YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 
 _EXPERIMENT = matching(
     EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
-_NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
-
-_SIMULATED = ("system", "excitation", "sampling")
+#: Name of an estimator.
+NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
 #: Sections that data are simulated from; their lists combine to data cells.
 OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "recorder", "signal", "disturbance")
-#: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
 
 
 def _usable(name: str) -> str:
@@ -50,9 +54,56 @@ def _usable(name: str) -> str:
     return name
 
 
+# --------------------------------------------------------------------------------------------------------------------
+# Data
+
+
+class RegularDurationSection(Section):
+    """Samples at equal intervals, from 0 s, as many as fit into a time.
+
+    Parameters
+    ----------
+    kind : {"regular"}
+        Which one it is
+    interval : float
+        Sampling interval [s]
+    duration : float
+        Length of the record, in place of the number of samples [s]
+    """
+
+    target: ClassVar[type | None] = RegularSampling
+    elsewhere = {"samples": "gives the length a second time, 'duration' has it already; keep one of the two"}  # noqa: RUF012
+
+    kind: Literal["regular"]
+    interval: Annotated[float | list[float], Swept(Positive)]
+    duration: Annotated[float | list[float], Swept(Positive)]
+
+    def build(self) -> RegularSampling:
+        """Return the sampling scheme."""
+        interval, duration = self.part("interval"), self.part("duration")
+        if not duration >= 2.0 * interval:
+            message = f"duration must be at least two sampling intervals of {interval:g} s, not {duration:g} s."
+            raise OptionError("duration", message)
+        # Beyond the largest whole number of samples any number of them is refused as too many.
+        return RegularSampling(interval, int(min(round(duration / interval), 2**62)))
+
+
+SamplingSection = Annotated[Section, Kinds("sampling", custom="sampling")]
+AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, SamplingSection, kind="regular")]
+NoiseSection = Annotated[Section, Kinds("noise", custom="noise")]
+RecorderSection = Annotated[Section, Options(Recorder)]
 #: A measured record in place of a simulated one.
 MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweeping=False)]
-RecorderSection = Annotated[Section, Options(Recorder)]
+SignalSection = Annotated[Section, Options(SumOfSinusoids)]
+DisturbanceOrNone = Annotated[
+    Annotated[Section, Kinds("disturbance")] | None,
+    BeforeValidator(lambda value: None if value == "none" else value),
+]
+EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Number of data sets, and what counts
 
 
 class UntilSection(Section):
@@ -87,10 +138,10 @@ class MonteCarloSection(Section):
         With until, most data sets of a data cell; 200 is the fewest
     """
 
-    runs: Annotated[int | None, Field(ge=1, le=1_000_000), LATER] = None
+    runs: Annotated[int | None, Field(ge=1, le=1_000_000)] = None
     seed: int = Field(ge=0, le=MAX_WHOLE)
-    until: Annotated[UntilSection | None, LATER] = None
-    at_most: Annotated[int | None, Field(ge=AT_LEAST, le=1_000_000), LATER] = None
+    until: UntilSection | None = None
+    at_most: Annotated[int | None, Field(ge=AT_LEAST, le=1_000_000)] = None
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
@@ -142,10 +193,10 @@ class SuccessSection(Section):
 
     delay_relative_error: Positive | None = None
     fit_percent: Annotated[float, Field(le=100.0, allow_inf_nan=False)] | None = None
-    parameter_relative_error: Annotated[Positive | None, LATER] = None
-    band: Annotated[Positive | None, LATER] = None
-    by: Annotated[Positive | None, LATER] = None
-    window: Annotated[Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None, LATER] = None
+    parameter_relative_error: Positive | None = None
+    band: Positive | None = None
+    by: Positive | None = None
+    window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
 
     def complaints(self) -> Iterator[Complaint]:
         """Say that nothing is asked for, or by when but not what, or that the window is empty."""
@@ -220,79 +271,23 @@ class Spec(Section):
     experiment: Annotated[Text, _EXPERIMENT, AfterValidator(_usable)]
     system: AnySystemSection | None = None
     excitation: ExcitationSection | None = None
-    loop: Annotated[LoopSection | None, LATER] = None
-    signal: Annotated[SignalSection | None, LATER] = None
-    disturbance: Annotated[DisturbanceOrNone | None, LATER] = None
+    loop: LoopSection | None = None
+    signal: SignalSection | None = None
+    disturbance: DisturbanceOrNone | None = None
     sampling: AnySamplingSection | None = None
     noise: NoiseSection | None = None
-    recorder: Annotated[RecorderSection | None, LATER] = None
+    recorder: RecorderSection | None = None
     data: MeasuredSection | None = None
-    estimators: Annotated[dict[Annotated[str, _NAME], EstimatorSection], Field(min_length=1)]
+    estimators: Annotated[dict[Annotated[str, NAME], EstimatorSection], Field(min_length=1)]
     starts: StartsSection | None = None
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
-    measures: Annotated[list[Text] | None, LATER] = None
-    limits: Annotated[LimitsSection | None, LATER] = None
+    measures: list[Text] | None = None
+    limits: LimitsSection | None = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
-    _text: str = PrivateAttr(default="")
     _folder: Path = PrivateAttr(default=Path())
-    _source: YamlSource | None = PrivateAttr(default=None)
-
-    @classmethod
-    def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-        """Say which sections are missing or too many."""
-        present = {name for name in cls.model_fields if raw.get(name) is not None}
-        of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
-        for name in of_other:
-            if name in present:
-                other = "; what is added to a signal is its disturbance" if name == "noise" else ""
-                yield (name,), f"belongs to a {about}, and there is none here; leave it out{other}"
-        if "signal" not in present:
-            yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
-        elif "sampling" not in present:
-            yield ("sampling",), "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
-        random = _random_section(raw, present)
-        if random and "monte_carlo" not in present:
-            yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
-
-    @classmethod
-    def narrowed(cls, error: ErrorDetails, raw: Any) -> ErrorDetails:
-        """Estimators of a system where there is one, and of a signal where there is one."""
-        if error["type"] == "no_kind" and error["loc"][0] == "estimators" and {"signal", "system", "data"} & raw.keys():
-            error["ctx"] = {"allowed": ", ".join(KINDS["frequency_estimator" if "signal" in raw else "estimator"])}
-        return error
-
-    def complaints(self) -> Iterator[Complaint]:
-        """Say which measures there are not, which precision cannot be had, and which estimators are the same."""
-        yield from self._precision_complaints()
-        for k, name in enumerate(self.measures or ()):
-            try:
-                requested(name)
-            except UsageError as error:
-                yield ("measures", k), str(error)
-        seen: dict[str, str] = {}
-        for name, section in self.estimators.items():
-            others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]
-            for other in [other for other in others if other != name][:1]:
-                yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
-
-    def _precision_complaints(self) -> Iterator[Complaint]:
-        until = None if self.monte_carlo is None else self.monte_carlo.until
-        if until is None:
-            return
-        place = ("monte_carlo", "until")
-        if self.data is not None:
-            yield place, "a measured record is one data set; give runs: 1 in place of until and at_most"
-            return
-        if until.percent_half_width is not None and self.success is None:
-            yield (*place, "percent_half_width"), "is of the estimates that meet the success rule; add success"
-        if until.rmse_relative is None:
-            return
-        if self.system is None:
-            yield (*place, "rmse_relative"), "needs the true values of a simulated system; use percent_half_width"
-        elif self.system.own and not self.system.truth:
-            yield (*place, "rmse_relative"), "needs true values: system.truth: {gain: 1.0}"
+    _source: YamlSource = PrivateAttr(default_factory=lambda: YamlSource("(stored specification)"))
 
     @property
     def measured(self) -> MeasuredSource | None:
@@ -312,21 +307,32 @@ class Spec(Section):
             return ("loop", "reference"), self.loop.reference
         return None
 
+    def simulated_source(self, options: Mapping[str, Any], folder: Path) -> SimulatedSource:
+        """Return what simulates the data sets of one combination of the options of the sections."""
+        sampling, loop = options["sampling"], options.get("loop")
+        if loop is not None:
+            loop = replace(loop, reference=located(loop.reference, folder))
+            loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
+        excitation, recorder = located(options.get("excitation"), folder), options.get("recorder", Recorder())
+        # Any seed will do where nothing is random.
+        seed = 0 if self.monte_carlo is None else self.monte_carlo.seed
+        fresh = "fresh_fit" in (self.measures or ())
+        noise = options.get("noise")
+        return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, recorder, fresh)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is unwise but allowed, each with its place in the file."""
         return self._warnings
 
     def problem(self, path: KeyPath, message: str) -> Problem:
-        """Something wrong at a key path, with its place in the file."""
-        if self._source is None:
-            return Problem("(stored specification)", 1, 1, path_text(path), message)
+        """Return something wrong at a key path, with its place in the file."""
         return self._source.problem(path, message)
 
     @property
     def text(self) -> str:
         """The specification as the user wrote it; the canonical form where there is no file."""
-        return self._text or canonical_json(self.canonical())
+        return self._source.text or canonical_json(self.canonical())
 
     @property
     def folder(self) -> Path:
@@ -334,65 +340,5 @@ class Spec(Section):
         return self._folder
 
     def canonical(self) -> dict[str, Any]:
-        """The specification with all defaults, as plain data."""
+        """Return the specification with all defaults, as plain data."""
         return self.model_dump(mode="json")
-
-
-def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise", "recorder"):
-        if name in present:
-            yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
-    if _reference(raw, "loop") is not None:
-        yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
-    column = _reference(raw, "data") is not None
-    if column and "loop" not in present:
-        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
-    elif not column and "loop" in present and isinstance(raw["data"], Mapping):
-        yield ("data", "reference"), "is missing; a loop has a reference: name its column"
-
-
-def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    if {"loop", "excitation"} <= present:
-        yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
-    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None and not _has_relay(raw["loop"]):
-        yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
-    missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
-    if len(missing) == len(_SIMULATED):
-        yield (), "there are no data: give system, excitation and sampling; or data; or signal and sampling"
-        return
-    for name in missing:
-        yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
-
-
-def _has_relay(loop: Mapping[str, Any]) -> bool:
-    controller = loop.get("controller")
-    return isinstance(controller, Mapping) and "relay" in controller
-
-
-def _reference(raw: Mapping[str, Any], section: str) -> Any:
-    """The reference in a section, whatever the section is."""
-    content = raw.get(section)
-    return content.get("reference") if isinstance(content, Mapping) else None
-
-
-def _draws_nothing(chosen: Any, options: Mapping[str, Any]) -> bool:
-    """Whether a class draws no random number with the options that are given."""
-    without = getattr(chosen, "deterministic_with", {})
-    return getattr(chosen, "deterministic", False) or any(options.get(name) in without[name] for name in without)
-
-
-def _random_section(raw: Mapping[str, Any], present: set[str]) -> str:
-    """A section of simulated data that draws random numbers; empty if none does."""
-    if "data" in present:
-        return ""
-    parts = {name: raw.get(name) for name in ("excitation", "sampling", "noise", "disturbance")}
-    for name, part in {**parts, "excitation of the loop": _reference(raw, "loop")}.items():
-        if part is None or part == "none":
-            continue
-        kinds = KINDS[name.split()[0]]
-        kind = part.get("kind") if isinstance(part, Mapping) else None
-        found = resolve(name.split()[0], kind) if isinstance(kind, str) and kind in kinds else kind
-        if not _draws_nothing(found, part):
-            return name
-    recorder = raw.get("recorder")
-    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""

@@ -1,22 +1,42 @@
-"""Sections for the system to simulate: one fraction, or a sum of submodels."""
+"""Sections for the system to simulate, for what closes a loop around it, and for where estimators start."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from ctid_cli.arrays import ComplexArray
+from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.specification.fields import Coefficients, NotNegative, OneOf, Swept
+from ctid_cli.signals.record import Enters
+from ctid_cli.simulation.dataset import LoopOptions, StartPoint
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.own_sections import OWN_FORM
-from ctid_cli.specification.sections import RefusedOptionsError, Section, WithKey, is_own
+from ctid_cli.specification.sections import (
+    ByShape,
+    Coefficients,
+    Kinds,
+    NotNegative,
+    Number,
+    OneOf,
+    Options,
+    Section,
+    Swept,
+    WithKey,
+    custom_form,
+    section_for,
+    variants,
+    without_copies,
+)
 
 #: Highest order that the simulation handles to its stated accuracy.
 MAX_ORDER = 12
+
+ExcitationSection = Annotated[Section, Kinds("excitation", custom="excitation")]
 
 
 class SystemSection(Section):
@@ -98,11 +118,11 @@ class AdditiveSection(Section):
     additive: Annotated[list[SubmodelSection], Field(min_length=1)]
 
     def build(self) -> AdditiveModel:
-        """The sum."""
+        """Return the sum."""
         try:
             return AdditiveModel(self.part("additive"), getattr(self, "delay", 0.0))
         except DataError as error:
-            raise RefusedOptionsError(("additive",), str(error)) from None
+            raise DataError(str(error), "additive") from None
 
 
 _TWICE = "gives the system a second time, 'additive' has it already; keep one of the two forms"
@@ -134,9 +154,7 @@ class AdditiveSystemSection(AdditiveSection):
 
 
 _LinearSystem = Annotated[Any, WithKey("additive", AdditiveSystemSection, SystemSection)]
-AnySystemSection = Annotated[
-    Any, OneOf(lambda value: "own" if is_own(value) else "linear", {"own": OWN_FORM, "linear": _LinearSystem})
-]
+AnySystemSection = Annotated[Any, WithKey("kind", custom_form("system"), _LinearSystem)]
 
 
 def _unstable(poles: ComplexArray) -> str:
@@ -145,3 +163,234 @@ def _unstable(poles: ComplexArray) -> str:
     ]
     noun = "pole" if len(offending) == 1 else "poles"
     return f"{noun} at {', '.join(offending)} rad/s; every pole needs a negative real part"
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Loops
+
+
+_Gain = Annotated[float | list[float], Swept(Number)]
+_CONTROLLERS = ("pid", "continuous_pid", "relay", "numerator", "denominator")
+
+
+def _other_forms(form: str) -> dict[str, str]:
+    """Return the sentences for the keys of the other forms of a controller."""
+    twice = f"gives the controller a second time, '{form}' has it already; keep one of the forms"
+    return {key: twice for key in _CONTROLLERS if key != form}
+
+
+class PidSection(Section):
+    """Gains per sample, ``C(q) = kp + ki q/(q - 1) + kd (q - 1)/q``; for gains in seconds use continuous_pid.
+
+    Parameters
+    ----------
+    kp : float, default 0.0
+        Proportional gain [input unit/output unit]
+    ki : float, default 0.0
+        Gain of the running sum of the error, per sample [input unit/output unit]
+    kd : float, default 0.0
+        Gain of the difference between two samples of the error, per sample [input unit/output unit]
+    """
+
+    kp: _Gain = 0.0
+    ki: _Gain = 0.0
+    kd: _Gain = 0.0
+
+    def build(self) -> DiscreteController:
+        """Return the controller."""
+        return DiscreteController.from_pid(**self.model_dump())
+
+
+class ControllerSection(Section):
+    """A controller in the form of its one key."""
+
+    def build(self) -> Any:
+        """Return the controller."""
+        return self.part(*type(self).model_fields)
+
+
+class PidControllerSection(ControllerSection):
+    """A discrete-time controller by its gains per sample.
+
+    Parameters
+    ----------
+    pid : mapping
+        Gains per sample: proportional, summing and differencing
+    """
+
+    target: ClassVar[type | None] = DiscreteController
+    elsewhere = _other_forms("pid")
+
+    pid: PidSection
+
+
+class ContinuousPidControllerSection(ControllerSection):
+    """A controller by its gains in continuous time, which do not depend on the sampling interval.
+
+    Parameters
+    ----------
+    continuous_pid : mapping
+        Gains in continuous time, and how the controller is made discrete
+    """
+
+    target: ClassVar[type | None] = ContinuousPid
+    elsewhere = _other_forms("continuous_pid")
+
+    continuous_pid: Annotated[Section, Options(ContinuousPid)]
+
+
+class RelayControllerSection(ControllerSection):
+    """A relay, which makes the loop oscillate by itself.
+
+    Parameters
+    ----------
+    relay : mapping
+        Its two values, and its hysteresis
+    """
+
+    target: ClassVar[type | None] = Relay
+    elsewhere = _other_forms("relay")
+
+    relay: Annotated[Section, Options(Relay)]
+
+
+_OfCoefficients = section_for(DiscreteController)
+_OfRelay = Annotated[Section, WithKey("relay", RelayControllerSection, _OfCoefficients)]
+_OfContinuousPid = Annotated[Section, WithKey("continuous_pid", ContinuousPidControllerSection, _OfRelay)]
+
+
+class LoopSection(Section):
+    """What makes the input: a controller that is fed the output, and a reference.
+
+    Parameters
+    ----------
+    controller : mapping
+        Controller that acts at every sample: pid, continuous_pid, relay, or numerator and denominator
+    reference : mapping, optional
+        The reference, none for a relay; for a measured record it is a column, data.reference
+    enters : {"controller", "input"}, default "controller"
+        u = C(q) (reference - y), or u = reference - C(q) y
+    """
+
+    target: ClassVar[type | None] = LoopOptions
+
+    controller: Annotated[Section, WithKey("pid", PidControllerSection, _OfContinuousPid)]
+    reference: ExcitationSection | None = None
+    enters: Annotated[Enters | list[Enters], Swept(Enters)] = "controller"
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say that the controller does nothing."""
+        if any(_does_nothing(variant.options.controller) for variant in variants(self)):
+            yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"
+
+
+def _does_nothing(controller: DiscreteController | ContinuousPid | Relay) -> bool:
+    if isinstance(controller, ContinuousPid):
+        return controller.does_nothing
+    return isinstance(controller, DiscreteController) and not controller.numerator.any()
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Starts
+
+
+class UniformStart(Section):
+    """An initial delay drawn anew for every data set.
+
+    Parameters
+    ----------
+    uniform : list of float
+        least and greatest value [s]
+    """
+
+    uniform: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say why the range is none."""
+        low, high = self.uniform
+        if not low < high:
+            yield ("uniform",), f"the first value, {low:g} s, must be below the second, {high:g} s"
+
+
+class RelativeStart(Section):
+    """Initial parameters drawn anew for every data set, around those of the simulated system.
+
+    Parameters
+    ----------
+    relative_uniform : float
+        Every parameter is multiplied by a random number from 1 - this to 1 + this [-]
+    """
+
+    # Below 1 parameters keep their sign.
+    relative_uniform: float = Field(gt=0.0, lt=1.0, allow_inf_nan=False)
+
+
+class GivenStart(AdditiveSection):
+    """Initial parameters as a sum of submodels."""
+
+
+def _form(value: Any) -> str | None:
+    given = value if isinstance(value, Mapping) else ()
+    found = [name for name, form in _FORMS.items() if isinstance(value, form) or name in given]
+    return found[0] if len(found) == 1 else None
+
+
+def _several(one: OneOf) -> ByShape:
+    """Return a start or a list of different ones."""
+    item = Annotated[Any, one]
+    return ByShape(item, list=Annotated[list[item], Field(min_length=1), AfterValidator(without_copies)])
+
+
+_DELAYS = _several(ByShape(NotNegative, "{uniform: [low, high]} is allowed too", mapping=UniformStart))
+_FORMS = {"relative_uniform": RelativeStart, "additive": GivenStart}
+_PARAMETERS = _several(OneOf(_form, _FORMS, "no_form", "{relative_uniform: fraction} or {additive: [submodels]}"))
+_LISTED = AfterValidator(lambda value: value if isinstance(value, list) else [value])
+
+
+class StartsSection(Section):
+    """Where estimators start that need, or take, an initial delay or initial parameters.
+
+    Parameters
+    ----------
+    initial_delay : float, mapping or list of these, optional
+        Initial delays [s]; {uniform: [low, high]} draws one for every data set
+    parameters : mapping or list of mappings, optional
+        Initial parameters, drawn around those of the simulated system or given; by default every estimator makes its
+        own
+    """
+
+    if_empty = "give initial_delay, parameters or both, or leave the section out"
+
+    initial_delay: Annotated[list[float | UniformStart], _DELAYS, _LISTED] | None = None
+    parameters: Annotated[list[RelativeStart | GivenStart], _PARAMETERS, _LISTED] | None = None
+
+
+def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
+    """Return the starts that a specification names."""
+    if section is None:
+        return ()
+    points: list[StartPoint] = []
+    for delay in section.initial_delay or []:
+        if isinstance(delay, UniformStart):
+            low, high = delay.uniform
+            points.append(StartPoint(f"uniform({_short(low)}, {_short(high)})", "delay", "random", (low, high)))
+        else:
+            points.append(StartPoint(_short(delay), "delay", delay))
+    for parameters in section.parameters or []:
+        values = parameters.model_dump(mode="json")
+        if isinstance(parameters, RelativeStart):
+            spread = parameters.relative_uniform
+            points.append(StartPoint(f"parameters({_percent(spread)}%)", "parameters", spread=spread))
+        else:
+            points.append(StartPoint(f"given {content_hash(values)[:8]}", "parameters", model=parameters.options()))
+    return tuple(points)
+
+
+def _short(value: float) -> str:
+    """Return the shortest text that is the number again, without a trailing ``.0``."""
+    return repr(value).removesuffix(".0")
+
+
+def _percent(value: float) -> str:
+    """Return a fraction in percent, as exactly as the fraction was written."""
+    return f"{(100 * Decimal(repr(value))).normalize():f}"

@@ -15,13 +15,11 @@ alias (``b: *a``) says the same openly.
 
 from __future__ import annotations
 
-import operator
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 
@@ -70,8 +68,13 @@ class Place:
     line: int
     column: int
 
+    @classmethod
+    def of(cls, mark: Any) -> Self:
+        """Return the place of a mark of PyYAML, which knows its file."""
+        return cls(mark.name, mark.line + 1, mark.column + 1)
+
     def problem(self, path: KeyPath, message: str) -> Problem:
-        """A problem here."""
+        """Return a problem here."""
         return Problem(self.file, self.line, self.column, path_text(path), message)
 
 
@@ -80,86 +83,60 @@ class YamlSource:
     """The values of a YAML text and where each of them stands."""
 
     file: str
-    #: Where the text begins in its file.
-    line: int = 1
-    column: int = 1
-    tree: Any = None
-    keys: dict[KeyPath, Place] = field(default_factory=dict)
-    values: dict[KeyPath, Place] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
     #: The text itself, where it came from a file.
     text: str = ""
+    tree: Any = None
+    #: The node of each value, and that of its key in a mapping.
+    nodes: dict[KeyPath, tuple[Any, Any]] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
 
     def place(self, path: KeyPath, *, key: bool = False) -> Place:
-        """Where a problem with a key path is to be reported."""
-        while path and path not in self.values:
+        """Return where a problem with a key path is to be reported: of a mapping, and where a key is amiss, its key."""
+        while path and path not in self.nodes:
             path, key = path[:-1], True
-        if path in self.keys and (key or isinstance(self.value(path), dict)):
-            return self.keys[path]
-        return self.values.get(path, Place(self.file, 1, 1))
-
-    def value(self, path: KeyPath) -> Any:
-        """The value at a key path, or None where there is none."""
-        try:
-            return reduce(operator.getitem, path, self.tree)
-        except (KeyError, IndexError, TypeError):
-            return None
+        value, name = self.nodes.get(path, (None, None))
+        node = name if name is not None and (key or isinstance(value, yaml.MappingNode)) else value
+        return Place(self.file, 1, 1) if node is None else Place.of(node.start_mark)
 
     def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
-        """A problem at a key path."""
+        """Return a problem at a key path."""
         return self.place(path, key=key).problem(path, message)
 
-    def graft(self, path: KeyPath, other: YamlSource, key: Place) -> None:
-        """Take over the places of another text, whose values now stand at a key path."""
-        for places, new in ((self.keys, other.keys | {(): key}), (self.values, other.values)):
-            for old in [p for p in places if p[: len(path)] == path]:
-                del places[old]
-            places.update({path + p: place for p, place in new.items()})
-
-    def build(self, node: Any, path: KeyPath = (), parents: tuple[Any, ...] = ()) -> Any:
-        """The value of a node; what is wrong with it goes to the problems."""
-        place = self.values[path] = self.at(node.start_mark)
-        if len(self.values) > MAX_VALUES:
-            raise SpecError(
-                [*self.problems, place.problem(path, f"more than {MAX_VALUES} values, those of aliases too")]
-            )
-        if any(node is parent for parent in parents):
-            raise SpecError([*self.problems, place.problem(path, "an alias refers to its own parent")])
+    def build(self, node: Any, path: KeyPath = (), name: Any = None, parents: tuple[Any, ...] = ()) -> Any:
+        """Return the value of a node; what is wrong with it goes to the problems."""
+        self.nodes[path] = node, name
+        place, fatal = Place.of(node.start_mark), ""
+        if len(self.nodes) > MAX_VALUES:
+            fatal = f"more than {MAX_VALUES} values, those of aliases too"
+        elif any(node is parent for parent in parents):
+            fatal = "an alias refers to its own parent"
+        if fatal:
+            raise SpecError([*self.problems, place.problem(path, fatal)])
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node, path)
-        collection = "seq" if isinstance(node, yaml.SequenceNode) else "map"
-        if node.tag != _TAG + collection:
+        if node.tag != _TAG + ("seq" if isinstance(node, yaml.SequenceNode) else "map"):
             self._refuse_tag(node, path, "a plain list or mapping")
-        if collection == "seq":
-            return [self.build(item, (*path, k), (*parents, node)) for k, item in enumerate(node.value)]
+        if isinstance(node, yaml.SequenceNode):
+            return [self.build(item, (*path, k), None, (*parents, node)) for k, item in enumerate(node.value)]
         return self._mapping(node, path, (*parents, node))
-
-    def at(self, mark: Any) -> Place:
-        """The place of a mark of PyYAML."""
-        if mark is None:
-            return Place(self.file, self.line, self.column)
-        return Place(self.file, mark.line + self.line, mark.column + (self.column if mark.line == 0 else 1))
 
     def _mapping(self, node: Any, path: KeyPath, parents: tuple[Any, ...]) -> dict[str, Any]:
         mapping: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            place = self.at(key_node.start_mark)
-            if not isinstance(key_node, yaml.ScalarNode):
-                self.problems.append(place.problem(path, "a key must be a plain word"))
-                continue
-            key = key_node.value
-            here = (*path, key)
-            if key == "<<":
-                message = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
-                self.problems.append(place.problem(here, message))
-            elif key in mapping:
-                message = (
-                    f"the key {path_text((key,))!r} is given twice, first on line {self.keys[here].line}; keep one"
-                )
-                self.problems.append(place.problem(here, message))
+        for name, value in node.value:
+            here, wrong = path, ""
+            if not isinstance(name, yaml.ScalarNode):
+                wrong = "a key must be a plain word"
             else:
-                self.keys[here] = place
-                mapping[key] = self.build(value_node, here, parents)
+                here = (*path, name.value)
+                if name.value == "<<":
+                    wrong = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
+                elif name.value in mapping:
+                    first = self.place(here, key=True).line
+                    wrong = f"the key {path_text((name.value,))!r} is given twice, first on line {first}; keep one"
+            if wrong:
+                self.problems.append(Place.of(name.start_mark).problem(here, wrong))
+            else:
+                mapping[name.value] = self.build(value, here, name, parents)
         return mapping
 
     def _scalar(self, node: Any, path: KeyPath) -> Any:
@@ -181,11 +158,11 @@ class YamlSource:
 
     def _refuse_tag(self, node: Any, path: KeyPath, instead: str) -> None:
         message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write {instead}"
-        self.problems.append(self.at(node.start_mark).problem(path, message))
+        self.problems.append(Place.of(node.start_mark).problem(path, message))
 
 
 def path_text(path: KeyPath) -> str:
-    """A key path as users write it."""
+    """Return a key path as users write it."""
     text = ""
     for part in path:
         word = part if isinstance(part, int) or len(part) <= MAX_KEY else part[: MAX_KEY - 1] + "…"
@@ -193,8 +170,8 @@ def path_text(path: KeyPath) -> str:
     return text
 
 
-def read_yaml(path: Path) -> YamlSource:
-    """Read a YAML file."""
+def read_yaml(path: Path, overrides: Iterable[str] = ()) -> YamlSource:
+    """Read a YAML file, in which some values may be others."""
     if path.is_dir():
         raise UsageError(f"{path}: this is a folder; name the YAML file in it")
     if path.is_file() and path.stat().st_size == 0:
@@ -213,11 +190,11 @@ def read_yaml(path: Path) -> YamlSource:
         before = data[: error.start]
         place = Place(str(path), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
         raise SpecError([place.problem((), "the file is not UTF-8 text; save it as UTF-8")]) from None
-    return replace(parse_yaml(text, str(path)), text=text)
+    return parse_yaml(text, str(path), overrides)
 
 
 def written(tree: Mapping[str, Any]) -> str:
-    """A mapping as YAML text."""
+    """Return a mapping as YAML text."""
     try:
         return str(yaml.safe_dump(plain(tree), sort_keys=False, allow_unicode=True))
     except yaml.YAMLError as error:
@@ -225,23 +202,14 @@ def written(tree: Mapping[str, Any]) -> str:
         raise UsageError(f"a specification holds texts, numbers, lists and mappings, and here is a {what}") from None
 
 
-def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlSource:
-    """Values and places of a YAML text."""
-    source = YamlSource(file, line, column)
-    try:
-        root = yaml.compose(text, Loader=_Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
-            mark = error.context_mark  # what was never closed is of more use than the end of the file
-        raise SpecError([source.at(mark).problem((), _syntax_message(error))]) from None
-    except yaml.reader.ReaderError as error:
-        before = text[: error.position]
-        place = Place(file, line + before.count("\n"), error.position - before.rfind("\n"))
-        code = ord(error.character) if isinstance(error.character, str) else error.character
-        raise SpecError([place.problem((), f"the character U+{code:04X} is not allowed in YAML")]) from None
-    except RecursionError:
-        raise SpecError([source.at(None).problem((), "lists or mappings are nested too deeply")]) from None
+def parse_yaml(text: str, file: str, overrides: Iterable[str] = ()) -> YamlSource:
+    """Return the values and places of a YAML text, in which ``key.path=value`` may set others."""
+    source, root = YamlSource(file, text), _composed(text, file)
+    for number, override in enumerate(overrides, start=1):
+        try:
+            root = _overridden(root, override, number)
+        except SpecError as error:
+            source.problems += error.problems
     if root is not None:
         source.tree = source.build(root)
     if source.problems:
@@ -249,49 +217,69 @@ def parse_yaml(text: str, file: str, *, line: int = 1, column: int = 1) -> YamlS
     return source
 
 
-def apply_overrides(source: YamlSource, overrides: Iterable[str]) -> None:
-    """Change values of a tree as ``--set a.b=value`` asks."""
-    problems: list[Problem] = []
-    for number, override in enumerate(overrides, start=1):
-        try:
-            _apply_override(source, override, number)
-        except SpecError as error:
-            problems += error.problems
-    if problems:
-        raise SpecError(problems)
+def _composed(text: str, file: str) -> Any:
+    """Return the tree of nodes of a YAML text, whose marks know the file; None of an empty text."""
+    try:
+        loader = _Loader(text)
+        loader.name = file
+        return loader.get_single_node()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
+            mark = error.context_mark  # what was never closed is of more use than the end of the file
+        raise SpecError([Place.of(mark).problem((), _syntax_message(error))]) from None
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        place = Place(file, before.count("\n") + 1, error.position - before.rfind("\n"))
+        code = ord(error.character) if isinstance(error.character, str) else error.character
+        raise SpecError([place.problem((), f"the character U+{code:04X} is not allowed in YAML")]) from None
+    except RecursionError:
+        raise SpecError([Place(file, 1, 1).problem((), "lists or mappings are nested too deeply")]) from None
 
 
-def _apply_override(source: YamlSource, override: str, number: int) -> None:
+def _overridden(root: Any, override: str, number: int) -> Any:
+    """Return the tree of nodes in which a value is set as ``--set a.b=value`` asks; its places are in that option."""
     key, equals, text = override.partition("=")
-    path: KeyPath = tuple(part.strip() for part in key.split("."))
-    here = Place(OVERRIDE_FILE, number, 1)
+    path = tuple(part.strip() for part in key.split("."))
+    here = yaml.Mark(OVERRIDE_FILE, 0, number - 1, 0, None, 0)
 
     def refuse(message: str) -> SpecError:
-        return SpecError([replace(here.problem((), f"{message} (in --set {override!r})"), key=key.strip())])
+        problem = Place.of(here).problem((), f"{message} (in --set {override!r})")
+        return SpecError([replace(problem, key=key.strip())])
 
     if not equals or not all(path):
         raise refuse("an override is written key.path=value, for example noise.snr_db=[5,15]")
-    value = parse_yaml(text, OVERRIDE_FILE, line=number, column=len(key) + 2)
-    node = source.tree
-    for depth, part in enumerate(path):
-        if not isinstance(node, dict):
-            raise refuse(f"{path_text(path[:depth]) or 'the file'} is not a mapping, so nothing can be set inside it")
-        if depth == len(path) - 1:
-            node[part] = value.tree
-            break
-        if part not in node and path[0] == "estimators" and depth == 1:
-            known = ", ".join(sorted(node)) or "none"
-            raise refuse(f"there is no estimator {part!r}{did_you_mean(str(part), node)} Estimators here: {known}")
-        if node.get(part) is None:
-            node[part] = {}
-        node = node[part]
-        for places in (source.keys, source.values):
-            places.setdefault(path[: depth + 1], here)
-    source.graft(path, value, here)
+    # Columns are those of the option.
+    before = "\n" * (number - 1) + ("" if "\n" in text else " " * (len(key) + 1))
+    value = _composed(before + text, OVERRIDE_FILE) or yaml.ScalarNode(_TAG + "null", "", here)
+
+    def with_value(node: Any, depth: int) -> Any:
+        """Return the same mapping with the value somewhere in it; nodes that aliases share are left as they are."""
+        if depth == len(path):
+            return value
+        if node is None or node.tag == _TAG + "null":
+            node = yaml.MappingNode(_TAG + "map", [], here)
+        if not isinstance(node, yaml.MappingNode):
+            place = path_text(path[:depth]) or "the file"
+            raise refuse(f"{place} is not a mapping, so nothing can be set inside it")
+        part, items = path[depth], list(node.value)
+        names = [name.value for name, _ in items]
+        if part not in names:
+            if path[0] == "estimators" and depth == 1 < len(path) - 1:
+                known = ", ".join(sorted(names)) or "none"
+                raise refuse(f"there is no estimator {part!r}{did_you_mean(part, names)} Estimators here: {known}")
+            names.append(part)
+            items.append((yaml.ScalarNode(_TAG + "str", part, here), None))
+        name, old = items[names.index(part)]
+        name = name if depth < len(path) - 1 else yaml.ScalarNode(_TAG + "str", part, here)
+        items[names.index(part)] = name, with_value(old, depth + 1)
+        return yaml.MappingNode(node.tag, items, node.start_mark)
+
+    return with_value(root, 0)
 
 
 def _syntax_message(error: yaml.MarkedYAMLError) -> str:
-    """PyYAML's complaint as a sentence, with the usual cause where it is known."""
+    """Return PyYAML's complaint as a sentence, with the usual cause where it is known."""
     problem = (error.problem or "the text is not valid YAML").strip()
     if "'\\t'" in problem:
         return "a tab is not allowed here; indent with spaces"

@@ -23,7 +23,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from ctid_cli import own_code
+from ctid_cli import custom_code
 from ctid_cli.canonical import content_hash
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,7 +97,7 @@ def _custom_modules(names: Iterable[str]) -> dict[str, str]:
         name = waiting.pop()
         if name in found or name.partition(".")[0] in sys.stdlib_module_names | {"ctid_cli"}:
             continue
-        source = own_code.source_of(name)
+        source = custom_code.source_of(name)
         if source is not None:
             try:
                 tree = _without_docstrings(source.content)
@@ -105,7 +105,7 @@ def _custom_modules(names: Iterable[str]) -> dict[str, str]:
                 tree = hashlib.sha256(source.content).hexdigest()
             # What a module contains matters, not what it is called.
             found[name] = content_hash([tree, source.data])
-            waiting += own_code.imports_of(source, name)
+            waiting += custom_code.imports_of(source, name)
     return found
 
 

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+from ctid_cli import Noise
+
 
 @dataclass(frozen=True)
-class Bursts:
+class Bursts(Noise):
     """White noise whose standard deviation is larger in bursts.
 
     Parameters

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ctid_cli import Estimator
+
 TOOL = [sys.executable, str(Path(__file__).with_name("external_tool.py"))]
 
 
 @dataclass(frozen=True)
-class ExternalFit:
+class ExternalFit(Estimator):
     """The fit of another program.
 
     Parameters

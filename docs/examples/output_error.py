@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from ctid_cli import TransferFunction, simulate
+from ctid_cli import Estimator, TransferFunction, simulate
 
 
 @dataclass(frozen=True)
-class OutputError:
+class OutputError(Estimator):
     """Least output error of a first-order model with a delay.
 
     Parameters

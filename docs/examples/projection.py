@@ -1,15 +1,15 @@
-"""A method and a disturbance of one's own: variable projection, and a hum of which only the phase is random."""
+"""A custom estimator and a custom noise: variable projection, and a hum of which only the phase is random."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from ctid_cli import TransferFunction, simulate
+from ctid_cli import Estimator, Noise, TransferFunction, simulate
 
 
 @dataclass(frozen=True)
-class Projection:
+class Projection(Estimator):
     """Least output error of b0 / (s^2 + a1 s + a2) with a delay; b0 is linear, and projected out.
 
     Parameters
@@ -42,12 +42,12 @@ class Projection:
 
 
 @dataclass(frozen=True)
-class Hum:
+class Hum(Noise):
     """A sinusoid that begins at a random phase."""
 
     snr_db: float
     frequency: float = 5.0
 
-    def generate(self, output, times, rng):
+    def generate_at(self, times, output, rng):
         amplitude = np.sqrt(2.0 * np.mean(output**2) / 10 ** (self.snr_db / 10))
         return amplitude * np.sin(self.frequency * times + rng.uniform(0.0, 2.0 * np.pi))

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctid_cli import System
+
 
 @dataclass(frozen=True)
-class Tank:
+class Tank(System):
     """Level of a tank: ``h' = (1 + u - sqrt(h)) / area``, at rest at ``h = 1``; the output is ``h - 1``.
 
     Parameters

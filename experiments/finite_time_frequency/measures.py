@@ -10,7 +10,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
-from ctid_cli.simulation.frequency_runs import SignalSource
+from ctid_cli.simulation.frequency_measures import SignalSource
 from ctid_cli.specification.load import spec_from_canonical
 
 from .figures import DERIVED, GROUPS, track_of

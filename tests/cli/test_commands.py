@@ -65,7 +65,7 @@ def test_workers_import_nothing_slow():
     # What a worker process is sent, and every estimator: half a second of imports each would be longer than the work.
     code = (
         "import importlib, pkgutil, sys, ctid_cli.estimators as package\n"
-        "import ctid_cli.running.job, ctid_cli.running.cells, ctid_cli.specification.start_points\n"
+        "import ctid_cli.running.job, ctid_cli.running.cells, ctid_cli.simulation.dataset\n"
         "for module in pkgutil.iter_modules(package.__path__, 'ctid_cli.estimators.'):\n"
         "    importlib.import_module(module.name)\n"
         "slow = {'scipy.' + name for name in ('signal', 'stats', 'optimize', 'special', 'fft', 'linalg', 'io')}\n"

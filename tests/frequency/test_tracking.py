@@ -12,7 +12,7 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.kinds import KINDS, classes, resolve
-from ctid_cli.specification.option_docs import option_docs
+from ctid_cli.specification.messages import option_docs
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
 ESTIMATORS = online_estimators()

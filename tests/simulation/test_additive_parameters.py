@@ -10,7 +10,7 @@ from ctid_cli.inference.uncertainty import BootstrapT, Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import factored, factored_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.simulation.additive_parameters import additive_parameters
+from ctid_cli.simulation.dataset import additive_parameters
 
 MODES = AdditiveModel([Submodel([0.1, 3.0], [0.25, 0.25, 1.0]), Submodel([0.02, 1.0], [0.025, 0.01, 1.0])])
 TERMS = (Term(2, 0), Term(2, 0))

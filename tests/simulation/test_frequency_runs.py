@@ -18,95 +18,11 @@ from ctid_cli.simulation.frequency_measures import (
     measure_track,
 )
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
+from ctid_cli.storage.store import load_estimates, read_stored
+from ctid_cli.storage.summary import export_rows
 from tests.running.fakes import outcomes_of
-from tests.specification.written import load, problems
-
-SPEC = """\
-experiment: frequencies
-signal:
-  tones: [{frequency: [{until: 15, value: 1.8}, {value: 2.0}]}, {frequency: 3.0, phase: 1.5}]
-  phase_at_steps: jump
-disturbance: {kind: uniform, half_width: 0.01}
-sampling: {kind: regular, interval: 0.01, duration: 30}
-estimators:
-  restarting: {kind: restarting_least_squares, tones: 2, h: 0.7, prefilter: 0.5}
-  esprit: {kind: esprit, tones: 2, averaging: 0.05}
-success: {band: 0.05, by: 8, window: [25, 30]}
-monte_carlo: {runs: 2, seed: 1}
-"""
-SYSTEM = "system: {numerator: [1], denominator: [1, 1]}\nexcitation: {kind: gaussian}\n"
-
-#: (what is replaced, by what, line, key, part of the message); the only problem of the specification.
-BROKEN = {
-    "both worlds": ("experiment: frequencies\n", "experiment: frequencies\nnoise: {kind: white, variance: 1}\n", 2,
-                    "noise", "disturbance"),
-    "estimator of systems": ("{kind: esprit, tones: 2, averaging: 0.05}", "{kind: svf, poles: 2, zeros: 0}", 9,
-                             "estimators.esprit.kind", "allowed: drem_gradient"),
-    "too many tones": ("esprit, tones: 2", "esprit, tones: 3", 9, "estimators.esprit.tones", "must be 2"),
-    "too slow a clock": ("{frequency: 3.0,", "{frequency: 400.0,", 6, "sampling.interval", "below 314.2 rad/s"),
-    "late step": ("until: 15", "until: 31", 3, "signal.tones", "a step at 31 s comes after the last sample"),
-    "no last piece": ("{value: 2.0}", "{value: 2.0, until: 20}", 3, "signal.tones[0].frequency", "the last has none"),
-    "text for pieces": ("3.0, phase", "fast, phase", 3, "signal.tones[1].frequency", "a list is allowed too"),
-    "length twice": ("duration: 30}", "duration: 30, samples: 7}", 6, "sampling.samples", "keep one of the two"),
-    "an endless hold": ("{kind: esprit, tones: 2, averaging: 0.05}",
-                              "{kind: filter_regression, tones: 2, pole: 4, hold: 1e307}", 9, "estimators.esprit.hold",
-                              "longer than the record"),
-    "too long averages": ("averaging: 0.05", "averaging: 29", 9, "estimators.esprit.averaging", "too few for 2 tones"),
-    "averages that alias": ("averaging: 0.05", "averaging: 1, highest_frequency: 10", 9, "estimators.esprit.averaging",
-                            "averages over 1 s show frequencies up to"),
-    "a start beyond the clock": ("{kind: esprit, tones: 2, averaging: 0.05}",
-                                 "{kind: nonlinear_least_squares, tones: 2, initial_frequencies: [2, 5000]}", 9,
-                                 "estimators.esprit.initial_frequencies", "below 314.2 rad/s"),
-    "a pole beyond the clock": ("{kind: esprit, tones: 2, averaging: 0.05}",
-                                "{kind: filter_regression, tones: 2, pole: 1e300}", 9, "estimators.esprit.pole",
-                                "beyond what samples every 0.01 s can show"),
-    "window": ("[25, 30]", "[25, 31]", 10, "success.window", "ends at 30 s"),
-    "rule of systems": ("{band: 0.05, by: 8, window: [25, 30]}",
-                        "{delay_relative_error: 1}", 10, "success.delay_relative_error", "band"),
-    "no band": ("{band: 0.05, by: 8, window: [25, 30]}", "{by: 8}", 10, "success.by", "add band"),
-    "window alone": ("{band: 0.05, by: 8, window: [25, 30]}", "{window: [25, 30]}", 10, "success.window", "add band"),
-    "h too long": ("h: 0.7", "h: 8", 8, "estimators.restarting.h", "delays are filled after 32.5 s"),
-    "prefilter too long": ("prefilter: 0.5", "prefilter: 1e9", 8, "estimators.restarting.prefilter", "longer than"),
-    "too many samples": ("interval: 0.01, d", "interval: 1e-300, d", 6, "sampling.duration", "samples in a record"),
-    "too long an interval": ("interval: 0.01, d", "interval: 50, d", 6, "sampling.duration", "two sampling intervals"),
-    "no such disturbance": ("{kind: uniform, half_width: 0.01}", "{kind: x}", 5, "disturbance.kind", "uniform, sine"),
-    "no such word": ("jump", "leap", 4, "signal.phase_at_steps", "'jump', 'continuous'"),
-    "no clock": ("sampling: {kind: regular, interval: 0.01, duration: 30}\n", "", 1, "sampling", "for example"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BROKEN.values(), ids=BROKEN)
-def test_mistakes_are_named_with_their_place(tmp_path, case):
-    old, new, line, key, message = case
-    assert SPEC.count(old) == 1
-    (problem,) = problems(tmp_path, SPEC.replace(old, new))
-    assert (problem.line, problem.key) == (line, key)
-    assert message in problem.message
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "key", "message"),
-    [
-        ("h: 0.7", "h: 1.2", "estimators.restarting.h", "above pi/h = 2.618 rad/s are seen as lower ones"),
-        ("interval: 0.01, d", "interval: 0.04, d", "estimators.restarting.h", "0.72 s"),
-    ],
-)
-def test_what_is_unwise_is_a_warning(tmp_path, old, new, key, message):
-    always = "estimators.esprit.kind: gives one estimate of the whole record, in which a frequency steps"
-    assert [warning.partition(": ")[2] for warning in load(tmp_path, SPEC).warnings] == [always]
-    text = SPEC.replace(old, new).replace("averaging: 0.05", "averaging: 0.04")
-    (first, second) = load(tmp_path, text).warnings
-    assert f": {key}: " in first
-    assert message in first
-    assert second.endswith(always)
-
-
-def test_a_system_has_no_estimator_of_frequencies(tmp_path):
-    text = SYSTEM + "\n".join(SPEC.splitlines()[5:7]) + "\n  one: {kind: esprit, tones: 2}\n"
-    (problem,) = problems(tmp_path, f"experiment: one\n{text}monte_carlo: {{runs: 1, seed: 1}}\n")
-    assert problem.key == "estimators.one.kind"
-    assert "give signal" in problem.message
+from tests.specification.written import SIGNAL as SPEC
+from tests.specification.written import load
 
 
 def test_a_duration_is_a_number_of_samples(tmp_path):
@@ -174,7 +90,7 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
         assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
-    flat = export_rows(read_estimates(folder))
+    flat = export_rows(load_estimates(folder))
     assert {"omega_1", "settling_after_step_2", "rms_2", "false_alarms", "converged"} <= set(flat)
     assert not {"numerator", "delay", "b0", "measures"} & set(flat)
     restarting = flat[flat["estimator"] == "restarting"]

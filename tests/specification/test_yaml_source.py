@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import SpecError, UsageError
-from ctid_cli.specification.yaml_source import Place, apply_overrides, parse_yaml, read_yaml
+from ctid_cli.specification.yaml_source import Place, parse_yaml, read_yaml
 
 
 def value(text):
@@ -140,16 +140,19 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
 
 
 def test_overrides_replace_values_and_their_places():
-    source = parse_yaml("a: {b: [1, 2], c: 3}\n", "f")
-    apply_overrides(source, ["a.b=[5, 1e1]", "a.c={d: no}", "new.deep.key=true", "a.c.d=4"])
+    overrides = ["a.b=[5, 1e1]", "a.c={d: no}", "new.deep.key=true", "a.c.d=4"]
+    source = parse_yaml("a: {b: [1, 2, 3], c: 3}\n", "f", overrides)
     assert source.tree == {"a": {"b": [5, 10.0], "c": {"d": 4}}, "new": {"deep": {"key": True}}}
     assert source.place(("a", "b", 1)) == Place("--set", 1, 9)
     assert source.place(("a", "c", "d")) == Place("--set", 4, 7)
     assert source.place(("new", "deep")) == Place("--set", 3, 1)
-    assert ("a", "b", 0) in source.values
-    apply_overrides(source, ["a.b="])
-    assert source.tree["a"]["b"] is None
-    assert ("a", "b", 0) not in source.values, "places of what was replaced are gone"
+    assert ("a", "b", 2) not in source.nodes, "places of what was replaced are gone"
+    assert parse_yaml("a: {b: 1}", "f", ["a.b="]).tree == {"a": {"b": None}}
+    assert parse_yaml("a: {b: 1}", "f", ["a=c: 1\nd: 2"]).tree == {"a": {"c": 1, "d": 2}}
+
+
+def test_an_override_changes_one_of_two_places_that_an_alias_shares():
+    assert parse_yaml("a: &x {b: 1}\nc: *x\n", "f", ["c.b=2"]).tree == {"a": {"b": 1}, "c": {"b": 2}}
 
 
 @pytest.mark.parametrize(
@@ -164,9 +167,8 @@ def test_overrides_replace_values_and_their_places():
     ],
 )
 def test_overrides_that_lead_nowhere(override, column, message):
-    source = parse_yaml("a: {b: 1}\nestimators: {one: {poles: 2}}", "f")
     with pytest.raises(SpecError) as error:
-        apply_overrides(source, ["a.b=2", override])
+        parse_yaml("a: {b: 1}\nestimators: {one: {poles: 2}}", "f", ["a.b=2", override])
     (problem,) = error.value.problems
     assert (problem.file, problem.line, problem.column) == ("--set", 2, column)
     assert message in problem.message

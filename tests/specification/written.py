@@ -1,15 +1,25 @@
 """Specifications that tests write to a file, and what is wrong with them."""
 
+from pathlib import Path
+
 import pytest
 
 from ctid_cli.errors import SpecError
 from ctid_cli.specification.load import load_spec
 
+SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP, CUSTOM, CUSTOM_PARTS, RECORD = (
+    Path(__file__).with_name(name).read_text(encoding="utf-8")
+    for name in (
+        *("simulated.yaml", "closed_loop.yaml", "signal.yaml", "open_loop.yaml", "measured.yaml", "measured_loop.yaml"),
+        *("custom.yaml", "custom_parts.txt", "record.csv"),
+    )
+)
 
-def load(folder, text, *overrides):
+
+def load(folder, text, *overrides, allow_code=False):
     file = folder / "spec.yaml"
     file.write_text(text, encoding="utf-8")
-    return load_spec(file, overrides)
+    return load_spec(file, overrides, allow_code=allow_code)
 
 
 def problems(folder, text, *overrides):

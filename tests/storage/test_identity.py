@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ctid_cli.own_code import find_class
-from ctid_cli.simulation.own_components import OwnNoise
+from ctid_cli.custom_code import find_class
 from ctid_cli.storage import identity
 from ctid_cli.storage.identity import (
     COMPUTING,
@@ -76,7 +75,7 @@ def custom(folder: Path, part: str = PART, levels: str = "LEVEL = 2.0\n", rates:
     folder.mkdir(exist_ok=True)
     for name, text in {"part.py": part, "levels.py": levels, "rates.csv": rates, "unused.py": rates}.items():
         (folder / name).write_text(text, encoding="utf-8")
-    return code_version(modules_of(OwnNoise(find_class("./part.py:Noise", folder)())))
+    return code_version(modules_of(find_class("./part.py:Noise", folder)()))
 
 
 def test_custom_components_count_with_all_that_they_import(tmp_path: Path) -> None:
@@ -98,7 +97,7 @@ def test_a_module_that_python_imports_itself_counts_if_it_is_not_installed(
     (package / "noise.py").write_text(PART.replace("from levels", "from .levels"))
     (package / "levels.py").write_text("LEVEL = 2.0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    options = OwnNoise(find_class("mine_for_test.noise:Noise", tmp_path)())
+    options = find_class("mine_for_test.noise:Noise", tmp_path)()
     versions = [code_version(modules_of(options))]
     # Without a readable source the bytes count.
     for content in (b"LEVEL = 2.5\n", b"\x00\x01"):

@@ -16,11 +16,9 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource
-from ctid_cli.specification.loop_section import LoopSection
-from ctid_cli.specification.option_docs import option_docs
-from ctid_cli.specification.signal_sections import RegularDurationSection
-from ctid_cli.specification.start_sections import StartsSection
-from ctid_cli.specification.system_sections import AdditiveSystemSection, SystemSection
+from ctid_cli.specification.messages import option_docs
+from ctid_cli.specification.spec import RegularDurationSection
+from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

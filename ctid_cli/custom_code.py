@@ -1,4 +1,4 @@
-"""Code of one's own: classes that a specification names by file or module, or that packages offer as entry points.
+"""Custom code: classes that a specification names by file or module.
 
 Files are read once and served to imports as they were read, in this process and in its workers: a run ends with the
 code that it began with, whatever happens to the files meanwhile.
@@ -14,7 +14,7 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -24,13 +24,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
-#: Part of a specification to the group of entry points that offers kinds for it.
-GROUPS = {name: f"ctid.{name}s" for name in ("estimator", "excitation", "noise", "sampling", "system")}
+#: What Python's parser may raise.
+_UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)
+#: Letters of the text that names a class.
+MAX_LENGTH = 200
 _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 
-class OwnCodeError(ValueError):
-    """Code of one's own that cannot be used, and why."""
+class CustomCodeError(ValueError):
+    """Custom code that cannot be used, and why."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ class Source:
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """A module's file, and what the data files that it names hold now."""
+        """Return a module's file, and what the data files that it names hold now."""
+        if file.exists() and not file.is_file():
+            raise CustomCodeError(f"{file.name} is no ordinary file")
         content = file.read_bytes()
         data = []
         for name in _data_files(content, file.name):
@@ -52,7 +56,7 @@ class Source:
                 data.append((name, hashlib.sha256((file.parent / name).read_bytes()).hexdigest()))
             except OSError as error:
                 text = f"{name}, which FILES in {file.name} names, cannot be read: {error.strerror}"
-                raise OwnCodeError(text) from None
+                raise CustomCodeError(text) from None
         return cls(str(file), content, tuple(data))
 
     @property
@@ -61,42 +65,29 @@ class Source:
         return Path(self.path).name == "__init__.py"
 
 
-def find_class(kind: str, folder: Path) -> Any:
-    """What ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
+def find_class(kind: str, folder: Path) -> type[Any]:
+    """Return the class that ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
     place, _, name = kind.rpartition(":")
-    if not place or not name.isidentifier():
-        raise OwnCodeError(f"{kind!r} names no code; write './file.py:Class' or 'package.module:Class'")
+    if not place or not name.isidentifier() or len(kind) > MAX_LENGTH:
+        raise CustomCodeError(f"must be './file.py:Class' or 'package.module:Class', not the text {kind[:40]!r}")
     of_file = "/" in place or place.endswith(".py")
     module = _serve_file(Path(os.path.abspath(folder / place)), place) if of_file else place
-    found = _tried(place, lambda: getattr(importlib.import_module(module), name, None))
-    if found is None:
-        raise OwnCodeError(f"{place} has no class {name}")
-    return found
-
-
-def find_entry_point(section: str, name: str) -> Any:
-    """What an installed package offers as a kind of a part of a specification; None where none does."""
-    from importlib.metadata import entry_points
-
-    for found in entry_points(group=GROUPS[section], name=name):
-        return _tried(f"the entry point {name} ({found.value})", found.load)
-    return None
-
-
-def _tried(place: str, load: Callable[[], Any]) -> Any:
     try:
-        # What it prints must not stand between the lines of an answer.
+        # What it prints must not stand between the lines of a command's output.
         with redirect_stdout(sys.stderr):
-            return load()
+            found = getattr(importlib.import_module(module), name, None)
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise OwnCodeError(f"{place} cannot be imported: {reason(error)}") from None
+        raise CustomCodeError(f"{place} cannot be imported: {reason(error)}") from None
+    if not isinstance(found, type):
+        raise CustomCodeError(f"{place} has no class {name}" if found is None else f"{kind} is no class")
+    return found
 
 
 def reason(error: BaseException) -> str:
-    """An exception in a clause: what it says, and the last line of one's own code that it came through."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
+    """Return an exception in a clause: what it says, and the last line of custom code that it came through."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_custom_file(frame.filename)]
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}{': ' if text else ''}{text[:200]}{where}"
@@ -112,7 +103,7 @@ _SERVED: dict[str, Source] = {}
 class _Loader(SourceLoader):
     """Loads a module from what was read of its file; it imports its neighbours as they were read with it.
 
-    These have names of their own in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
+    These have private names in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
     """
 
     def __init__(self, source: Source) -> None:
@@ -162,7 +153,7 @@ class Served:
 
 
 def served() -> Served:
-    """What a worker must be told before it reads the rest of a job."""
+    """Return what a worker must be told before it reads the rest of a job."""
     return Served(dict(_SERVED))
 
 
@@ -179,25 +170,25 @@ def _serve(sources: dict[str, Source]) -> None:
 
 
 def _serve_file(path: Path, place: str) -> str:
-    """Name of the module that a file is now served as; the modules beside it that it imports are inside that."""
+    """Return the name of the module that a file is now served as; the neighbours that it imports are inside that."""
     try:
         sources = _with_neighbours(path)
     except FileNotFoundError:
-        raise OwnCodeError(f"there is no file {place}; names start at the folder of the specification") from None
-    except OwnCodeError:
+        raise CustomCodeError(f"there is no file {place}; names start at the folder of the specification") from None
+    except CustomCodeError:
         raise
     except (OSError, ValueError) as error:
-        raise OwnCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise CustomCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     contents = [(name, source.content, source.data) for name, source in sorted(sources.items())]
     digest = hashlib.sha256(repr(contents).encode())
     # Named by content, so that a changed file is another module.
-    main = f"own_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
+    main = f"custom_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
     _serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
     return main
 
 
 def _with_neighbours(path: Path) -> dict[str, Source]:
-    """A file, under no name, and the modules in its folder that it imports, directly or not."""
+    """Return a file, under no name, and the modules in its folder that it imports, directly or not."""
     found, waiting = {"": Source.read(path)}, [""]
     while waiting:
         name = waiting.pop()
@@ -218,8 +209,8 @@ def _beside(folder: Path, name: str) -> Path | None:
 # What a module is made of
 
 
-def is_own_file(file: str | None) -> bool:
-    """Whether a file is neither part of Python, nor of an installed package, nor of ctid."""
+def is_custom_file(file: str | None) -> bool:
+    """Return whether a file is neither part of Python, nor of an installed package, nor of ctid."""
     if not file or not os.path.isabs(file):
         return False
     parts = Path(file).parts
@@ -228,13 +219,13 @@ def is_own_file(file: str | None) -> bool:
 
 
 def source_of(name: str) -> Source | None:
-    """What a module of one's own is made from; None for any other name."""
+    """Return what a custom module is made from; None for any other name."""
     if name in _SERVED:
         return _SERVED[name]
     # What has side effects when it is imported may do anything.
     with suppress(BaseException):
         spec = importlib.util.find_spec(name)
-        if spec is not None and is_own_file(spec.origin):
+        if spec is not None and is_custom_file(spec.origin):
             return Source.read(Path(str(spec.origin)))
     return None
 
@@ -244,22 +235,22 @@ def _is_installed(name: str) -> bool:
     with suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(top)
         places: Iterable[str | None] = () if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
-        return spec is not None and not any(map(is_own_file, places))
+        return spec is not None and not any(map(is_custom_file, places))
     return False
 
 
 def imports_of(source: Source, name: str) -> set[str]:
-    """Modules, and names that may be modules, that a module imports by a statement anywhere in it."""
+    """Return the modules, and names that may be modules, that a module imports by a statement anywhere in it."""
     found = _named(source.content, name if source.is_package else name.rpartition(".")[0])
     neighbours = {other: f"{name.partition('.')[0]}.{other}" for other in found}
     return {private if private in _SERVED else other for other, private in neighbours.items()} - {name}
 
 
 def _data_files(content: bytes, place: str) -> tuple[str, ...]:
-    """What a module assigns to FILES: names of data files, seen from its folder."""
+    """Return what a module assigns to FILES: names of data files, seen from its folder."""
     try:
         body = ast.parse(content).body
-    except (SyntaxError, ValueError):
+    except _UNREADABLE:
         return ()
     for node in body:
         if isinstance(node, ast.Assign) and any(isinstance(at, ast.Name) and at.id == "FILES" for at in node.targets):
@@ -267,7 +258,7 @@ def _data_files(content: bytes, place: str) -> tuple[str, ...]:
                 names = ast.literal_eval(node.value)
                 if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
                     return tuple(names)
-            raise OwnCodeError(f'FILES in {place} must be a list of names that stands there: FILES = ["table.csv"]')
+            raise CustomCodeError(f'FILES in {place} must be a list of names that stands there: FILES = ["table.csv"]')
     return ()
 
 
@@ -275,7 +266,7 @@ def _data_files(content: bytes, place: str) -> tuple[str, ...]:
 def _named(content: bytes, package: str) -> set[str]:
     try:
         nodes = list(ast.walk(ast.parse(content)))
-    except (SyntaxError, ValueError):
+    except _UNREADABLE:
         return set()
     return {parent for node in nodes for full in _imported(node, package) for parent in _parents(full)}
 

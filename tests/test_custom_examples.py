@@ -1,4 +1,4 @@
-"""The examples of components of one's own run as documented, and permission is asked for where it is needed."""
+"""The examples of custom components run as documented, and permission is asked for where it is needed."""
 
 import json
 import re
@@ -22,13 +22,13 @@ def ctid(*arguments, code=0, env=None):
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
-    files = [EXAMPLES / "own_study.yaml", EXAMPLES / "tank.yaml"]
+    files = [EXAMPLES / "custom_study.yaml", EXAMPLES / "tank.yaml"]
     assert ctid("run", *files, "--allow-code", "--quiet", "--jobs", "2", "--out", folder).stdout == ""
     return folder
 
 
 def test_the_study(out):
-    rows = json.loads(ctid("export", "own-study", "--format", "json", "--out", out).stdout)
+    rows = json.loads(ctid("export", "custom-study", "--format", "json", "--out", out).stdout)
     assert len(rows) == 12
     by_name = {name: [row for row in rows if row["estimator"] == name] for name in ("mine", "external", "srivc")}
     assert {row["status"] for row in by_name["external"]} == {"LEAST_SQUARES"}
@@ -38,7 +38,7 @@ def test_the_study(out):
         assert mine["delay"] == pytest.approx(ours["delay"], abs=2 * ours["standard_errors"]["delay"])
         assert mine["standard_errors"]["delay"] == pytest.approx(ours["standard_errors"]["delay"], rel=0.2)
         assert mine["parameters"]["b0"] == mine["numerator"][0]
-    assert "mine: %" in ctid("table", "own-study", "--out", out).stdout
+    assert "mine: %" in ctid("table", "custom-study", "--out", out).stdout
 
 
 def test_the_tank_is_nearly_linear(out):
@@ -48,7 +48,7 @@ def test_the_tank_is_nearly_linear(out):
 
 
 def test_one_estimate_is_computed_once_more_with_permission_only(out):
-    row = json.loads(ctid("export", "own-study", "--format", "json", "--out", out).stdout)[0]
+    row = json.loads(ctid("export", "custom-study", "--format", "json", "--out", out).stdout)[0]
     assert "mine (./output_error.py:OutputError)" in ctid("show", row["id"], "--out", out).stdout
     assert "--allow-code" in ctid("show", row["id"], "--history", "--out", out, code=3).stderr
     again = ctid("show", row["id"], "--history", "--allow-code", "--out", out).stdout
@@ -57,17 +57,17 @@ def test_one_estimate_is_computed_once_more_with_permission_only(out):
 
 @pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("check", "accuracy")])
 def test_permission(command, tmp_path, monkeypatch):
-    file = EXAMPLES / "own_study.yaml"
+    file = EXAMPLES / "custom_study.yaml"
     place = () if command[0] != "run" else ("--out", tmp_path)
     message = ctid(*command, file, *place, code=3).stderr
-    assert re.search(r"own_study.yaml:6:21: noise.kind: names code, which would be run; .*--allow-code", message)
+    assert re.search(r"custom_study.yaml:6:21: noise.kind: names code, which would be run; .*--allow-code", message)
     answer = ctid(*command, file, *place, env={"CTID_ALLOW_CODE": "1"}).stdout
-    assert "no theory: there is no theory here" in answer if command[0] == "check" else "own-study: " in answer
+    assert "no theory: there is no theory here" in answer if command[0] == "check" else "custom-study: " in answer
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
-    page = (EXAMPLES.parent / "own-study.md").read_text(encoding="utf-8")
+    page = (EXAMPLES.parent / "custom-study.md").read_text(encoding="utf-8")
     for language, name in (("py", "projection.py"), ("yaml", "projection.yaml")):
         assert f"```{language}\n{(EXAMPLES / name).read_text(encoding='utf-8')}```\n" in page
     smaller = ["--runs", "1", "--set", "sampling.samples=100", "--set", "noise.snr_db=20", "--jobs", "1"]
@@ -81,7 +81,7 @@ def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
 
 
 def test_the_documentation_names_what_there_is():
-    text = (EXAMPLES.parent / "own-components.md").read_text(encoding="utf-8")
+    text = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))
     assert {"output_error.py", "external_fit.py", "bursts.py", "tank.py"} <= names
     for name in names:

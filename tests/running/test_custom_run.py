@@ -1,4 +1,4 @@
-"""Components of one's own in worker processes: the same numbers as here, and a failure costs its own estimates only."""
+"""Custom components in worker processes: the same numbers as here, and a failure costs its own estimates only."""
 
 import json
 import os
@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from ctid_cli.errors import RefusedError, SpecError
+from ctid_cli.running.custom_check import check_components
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.job import Job
-from ctid_cli.running.own_check import check_components
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.estimates import read_stored
@@ -20,10 +20,11 @@ import os, random, signal
 from dataclasses import dataclass
 from typing import Literal
 import numpy as np
+import ctid_cli
 from level import LEVEL
 
 @dataclass(frozen=True)
-class Mean:
+class Mean(ctid_cli.Estimator):
     mischief: Literal["none", "raise", "die", "nan", "always", "global", "mistake", "fail"] = "none"
     def fit(self, record, start):
         print("a word that must not get into the answer")
@@ -43,7 +44,7 @@ class Mean:
         return {"parameters": {"mean": record.y.mean()}, "standard_errors": {"mean": 0.1}}
 
 @dataclass(frozen=True)
-class Noise:
+class Noise(ctid_cli.Noise):
     unseeded: bool = False
     def generate(self, output, rng):
         if self.unseeded:
@@ -53,7 +54,7 @@ class Noise:
 """
 
 SPEC = """\
-experiment: own-run
+experiment: custom-run
 system:      {numerator: [2], denominator: [1, 2]}
 excitation:  {kind: prbs, stages: 6, clock_period: 0.2, amplitude: 1.0}
 sampling:    {kind: regular, interval: 0.1, samples: 200}

@@ -1,23 +1,16 @@
-"""What components of one's own may return, and what they may not do."""
+"""What custom components may return, and what they may not do."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, Record, Srivc, TransferFunction, simulate
+import ctid_cli
+from ctid_cli import HeldSignal, Prbs, Record, RegularSampling, Srivc, TransferFunction, WhiteNoise, simulate
 from ctid_cli.canonical import plain
-from ctid_cli.simulation.dataset import DataSet
-from ctid_cli.simulation.own_components import (
-    ContractError,
-    OwnEstimation,
-    OwnExcitation,
-    OwnNoise,
-    OwnSampling,
-    OwnSystem,
-    taken,
-)
+from ctid_cli.simulation.components import ComponentError, CustomEstimation, taken
+from ctid_cli.simulation.dataset import DataSet, SimulatedSource
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +37,7 @@ class Answer:
         return self.answer(one) if callable(self.answer) else self.answer
 
     simulate = fit
+    input_record = "exact"
 
     def times(self, rng: Any) -> Any:
         return self.answer
@@ -52,7 +46,7 @@ class Answer:
 def test_a_mapping_and_a_fit_of_the_same_model_are_stored_alike(record):
     fit = Srivc(poles=1, zeros=0).fit(record)
     answer = {"parameters": fit.parameters, "standard_errors": fit.standard_errors, "status": "CONVERGED"}
-    fits = [OwnEstimation(Answer(found)).prepare(record).fit() for found in (answer, fit)]
+    fits = [CustomEstimation(Answer(found)).prepare(record).fit() for found in (answer, fit)]
     one, other = (plain(DataSet(record).result_of(found, None, None)) for found in fits)
     assert other == plain(DataSet(record).result_of(fit, None, None))
     assert one["parameters"] == fit.parameters
@@ -94,7 +88,7 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_no_fit_is_said_to_be_none(case, record):
     found, words = REFUSED[case]
-    with pytest.raises(ContractError) as caught:
+    with pytest.raises(ComponentError) as caught:
         taken(found, record, "E.fit")
     assert str(caught.value).startswith("E.fit returned")
     assert words in str(caught.value)
@@ -110,16 +104,16 @@ def write(record):
     record.inputs[0].values[:] = 0.0
 
 
-def replace(record):
+def replaced(record):
     object.__setattr__(record, "y", record.y + 1.0)
     return {"parameters": {"k": 1.0}}
 
 
-@pytest.mark.parametrize("mischief", [set_flags, write, replace])
+@pytest.mark.parametrize("mischief", [set_flags, write, replaced])
 def test_a_record_that_an_estimator_changes_is_the_same_for_the_next(mischief, record):
     y, u = record.y.copy(), record.input.values.copy()
-    with pytest.raises(ContractError, match=r"Answer.fit changes the record that it is given; copy first"):
-        OwnEstimation(Answer(mischief)).prepare(record).fit()
+    with pytest.raises(ComponentError, match=r"Answer.fit changes the record that it is given; copy first"):
+        CustomEstimation(Answer(mischief)).prepare(record).fit()
     np.testing.assert_array_equal(record.y, y)
     np.testing.assert_array_equal(record.input.values, u)
 
@@ -127,32 +121,48 @@ def test_a_record_that_an_estimator_changes_is_the_same_for_the_next(mischief, r
 def test_an_estimator_keeps_nothing_from_one_fit_to_the_next_and_is_not_told_the_truth(record):
     given = []
     options = Answer(lambda record: given.append(record.noise_free) or {"parameters": {"k": 1.0}})
-    prepared = OwnEstimation(options).prepare(record)
+    prepared = CustomEstimation(options).prepare(record)
     prepared.fit()
     prepared.fit()
     assert (options.calls, given) == ([], [None, None])
 
 
-def test_data_of_the_wrong_kind_are_refused(record):
-    t, rng = record.t, np.random.default_rng(0)
-    wrong = [
-        (
-            lambda: OwnNoise(Answer("loud")).generate(t, rng),
-            "generate returned str, and an array of 300 finite numbers",
-        ),
-        (lambda: OwnNoise(Answer(np.ones(3))).generate(t, rng), "shape (3,)"),
-        (lambda: OwnNoise(Answer(1.0)).generate(t, rng), "shape ()"),
-        (lambda: OwnNoise(Answer(np.full(300, np.inf))).generate(t, rng), "returned inf"),
-        (lambda: OwnSystem(Answer(np.full(300, np.nan))).simulate(record.input, t), "returned nan"),
-        (lambda: OwnSampling(Answer([0.0, 2.0, 1.0])).times(rng), "instants that increase"),
-        (lambda: OwnExcitation(Answer([1.0])).generate(t, rng), "returned list, and a ctid_cli.HeldSignal"),
-        (lambda: OwnNoise(Answer(lambda y: y.fill(0.0))).generate(t.copy(), rng), "read-only"),
-        (lambda: OwnNoise(Answer(lambda y: y.loud)).generate(t, rng), "AttributeError: 'numpy.ndarray' object has no"),
-    ]
-    for call, words in wrong:
-        with pytest.raises(ContractError) as caught:
-            call()
-        assert words in str(caught.value)
-        assert isinstance(caught.value.component, Answer)
+def test_classes_of_ctid_are_what_custom_ones_derive_from():
+    assert isinstance(TransferFunction([1.0], [1.0, 1.0]), ctid_cli.System)
+    assert isinstance(Prbs(stages=5, clock_period=0.1), ctid_cli.Excitation)
+    assert isinstance(RegularSampling(0.1, 10), ctid_cli.Sampling)
+    assert isinstance(WhiteNoise(variance=1.0), ctid_cli.Noise)
+    assert isinstance(Srivc(poles=1, zeros=0), ctid_cli.Estimator)
+
+
+SOURCE = SimulatedSource(
+    TransferFunction([2.0], [1.0, 2.0]), Prbs(stages=6, clock_period=0.5), RegularSampling(0.1, 300), None, seed=1
+)
+READ_ONLY = "failed: ValueError: assignment destination is read-only"
+
+
+@pytest.mark.parametrize(
+    ("part", "answer", "words"),
+    [
+        ("noise", "loud", "generate returned str, and an array of 300 finite numbers"),
+        ("noise", np.ones(3), "shape (3,)"),
+        ("noise", 1.0, "shape ()"),
+        ("noise", np.full(300, np.inf), "returned inf"),
+        ("noise", lambda y: y.fill(0.0), READ_ONLY),
+        ("noise", lambda y: y.loud, "failed: AttributeError: 'numpy.ndarray' object has no"),
+        ("system", np.full(300, np.nan), "returned nan"),
+        ("sampling", [0.0, 2.0, 1.0], "instants that increase"),
+        ("excitation", [1.0], "returned list, and a ctid_cli.HeldSignal"),
+    ],
+)
+def test_data_of_the_wrong_kind_are_refused(part, answer, words):
+    with pytest.raises(ComponentError) as caught:
+        replace(SOURCE, **{part: Answer(answer)}).dataset(0)
+    assert words in str(caught.value)
+    assert caught.value.section == part
+
+
+def test_a_noise_may_lose_samples():
     missing = np.where(np.arange(300) == 5, np.nan, 0.0)
-    np.testing.assert_array_equal(OwnNoise(Answer(missing)).generate(t, rng), missing)
+    record = replace(SOURCE, noise=Answer(missing)).dataset(0).record
+    np.testing.assert_array_equal(record.y, record.noise_free + missing)

@@ -1,0 +1,165 @@
+"""Custom components in a specification: what is wrong with them is said with its place, and never a traceback."""
+
+import random
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from ctid_cli.custom_code import find_class
+from ctid_cli.errors import CtidError, RefusedError, SpecError
+from ctid_cli.running.plan import build_plan
+from ctid_cli.specification.load import load_spec, spec_from_canonical
+from tests.specification.written import CUSTOM as SPEC
+from tests.specification.written import CUSTOM_PARTS as CODE
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "parts.py").write_text(CODE, encoding="utf-8")
+    (tmp_path / "gains.py").write_text("GAIN = 2.0\n", encoding="utf-8")
+    (tmp_path / "spec.yaml").write_text(SPEC, encoding="utf-8")
+    return tmp_path
+
+
+def edited(folder, file, old, new):
+    path = folder / file
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def load(folder):
+    return load_spec(folder / "spec.yaml", allow_code=True)
+
+
+def problem(folder):
+    with pytest.raises(SpecError) as caught:
+        load(folder)
+    (found,) = caught.value.problems
+    return found
+
+
+def test_options_are_swept_validated_and_canonical(folder):
+    spec = load(folder)
+    plan = build_plan(spec)
+    assert len(plan.data_cells) == 4
+    first = plan.estimators[0]
+    assert first.estimator.options.bounds == (0.0, 1.0)
+    assert first.estimator.options.inner.size == 2.0
+    assert [cell.swept for cell in plan.estimators] == [{"cutoff": 1.0}, {"cutoff": 2.0}, {}]
+    assert [start.label for _, cell, start in plan.keys(plan.tasks()[0]) if cell is first] == [
+        "0.3",
+        "uniform(0.2, 0.5)",
+    ]
+    # The name of an option stands for its value.
+    truths = [cell.content["system"]["truth"] for cell in plan.data_cells]
+    assert truths == [{"area": area, "b0": 0.5} for area in (1.0, 1.0, 2.0, 2.0)]
+    again = build_plan(spec_from_canonical(spec.canonical(), folder, allow_code=True))
+    assert [cell.hash for cell in again.data_cells] == [cell.hash for cell in plan.data_cells]
+    assert [cell.hash for cell in again.estimators] == [cell.hash for cell in plan.estimators]
+
+
+def test_nothing_is_imported_without_permission(folder):
+    edited(folder, "parts.py", "GAIN\n", 'GAIN\nraise SystemExit("imported")\n')
+    canonical = {"experiment": "x", "estimators": {"a": {"kind": "parts:X"}}}
+    with pytest.raises(RefusedError, match=r"spec.yaml:2:21: system.kind: names code(.|\n)*spec.yaml:8:11"):
+        load_spec(folder / "spec.yaml")
+    with pytest.raises(RefusedError, match="--allow-code"):
+        spec_from_canonical(canonical)
+
+
+def test_a_noise_may_ask_for_the_instants(folder):
+    edited(folder, "parts.py", "generate(self, output, rng)", "generate_at(self, times, output, rng)")
+    edited(folder, "parts.py", "return GAIN * self.deviation * rng", "return times + 0 * GAIN * rng")
+    record = build_plan(load(folder)).data_cells[0].dataset(0).record
+    np.testing.assert_allclose(record.y, record.noise_free + record.t)
+    edited(folder, "parts.py", "times, output, rng", "output")
+    assert "needs generate(self, output, rng) or generate_at(self, times, output, rng)" in str(problem(folder))
+
+
+def test_a_class_with_a_fitting_fit_alone_is_an_estimator(folder):
+    edited(folder, "parts.py", "class Estimator(Base)", "class Estimator")
+    assert build_plan(load(folder)).estimators[0].estimator.start_from == "delay"
+    (folder / "parts.py").write_text(CODE + "class Plain:\n    def fit(self, record, start):\n        return {}\n")
+    edited(folder, "spec.yaml", "./parts.py:Estimator\n    order: 2\n    cutoff: [1.0, 2.0]", "./parts.py:Plain")
+    edited(folder, "spec.yaml", "    mode: slow\n    bounds: [0, 1]\n    names: [a1, b0]\n    inner: {size: 2.0}\n", "")
+    assert build_plan(load(folder)).estimators[0].content == {"kind": "./parts.py:Plain"}
+
+
+def test_what_custom_options_are_called_means_nothing(folder):
+    edited(
+        folder, "parts.py", "    area: float = 2.0", "    area: float = 2.0\n    delay: str = 'd'\n    poles: str = 'p'"
+    )
+    edited(folder, "parts.py", "    deviation: float", "    deviation: float\n    snr_db: str = 's'")
+    edited(folder, "parts.py", "    interval: float = 0.1", "    interval: float = 0.1\n    samples: str = 'many'")
+    edited(
+        folder,
+        "parts.py",
+        "    deterministic = True",
+        "    deterministic = True\n    file: int = 3\n    clock_period: str = 'c'",
+    )
+    edited(folder, "parts.py", "    order: int\n", "    order: int\n    delay_bounds: str = 'b'\n    zeros: int = 1\n")
+    assert load(folder).warnings == ()
+
+
+def test_every_folder_has_neighbours_of_its_own(folder, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    (other / "gains.py").write_text("GAIN = 3.0\n", encoding="utf-8")
+    (other / "inner").mkdir()
+    (other / "inner" / "__init__.py").write_text("from .deep import DEEP\n", encoding="utf-8")
+    (other / "inner" / "deep.py").write_text("import gains\nDEEP = 2 * gains.GAIN\n", encoding="utf-8")
+    lines = [
+        "from inner import deep, DEEP",
+        "import inner.deep",
+        "class A:",
+        "    def f():",
+        "        from gains import GAIN",
+    ]
+    text = "\n".join([*lines, "        return GAIN, DEEP, deep.DEEP, inner.deep.DEEP", ""])
+    (other / "parts.py").write_text(text, encoding="utf-8")
+    first, second = find_class("./parts.py:Noise", folder), find_class("./parts.py:A", other)
+    assert (first.generate.__globals__["GAIN"], second.f()) == (2.0, (3.0, 6.0, 6.0, 6.0))
+    # The same file with another content is another module, also behind a module that did not change.
+    edited(folder, "gains.py", "2.0", "4.0")
+    after = find_class("./parts.py:Noise", folder)
+    assert [c.generate.__globals__["GAIN"] for c in (first, after)] == [2.0, 4.0]
+    assert "gains" not in sys.modules
+
+
+def test_500_mutations_end_in_a_sentence_or_in_a_plan(folder):
+    rng = random.Random(14)
+    words = [
+        *re.findall(r"[\w./:]+|[^\w\s]", SPEC),
+        "null",
+        "[]",
+        "{}",
+        "-1",
+        "1e400",
+        "'",
+        ".nan",
+        "parts:",
+        ":X",
+        "..:Y",
+    ]
+    good, refused = 0, []
+    for _ in range(500):
+        file, text = rng.choice([("spec.yaml", SPEC), ("spec.yaml", SPEC), ("parts.py", CODE)])
+        pieces = re.split(r"(\W)", text)
+        for _ in range(rng.randint(1, 2)):
+            k = rng.randrange(len(pieces))
+            pieces[k] = rng.choice(["", pieces[k] * 2, rng.choice(words), rng.choice(pieces)])
+        (folder / "spec.yaml").write_text(SPEC, encoding="utf-8")
+        (folder / "parts.py").write_text(CODE, encoding="utf-8")
+        (folder / file).write_text("".join(pieces), encoding="utf-8")
+        try:
+            build_plan(load(folder))
+            good += 1
+        except CtidError as error:
+            refused.append(error)
+    assert good > 50
+    assert len(refused) > 150
+    assert {error.exit_code for error in refused} <= {2, 3}
+    for error in refused:
+        assert all(re.search(r"spec.yaml:\d+:\d+: |: \d+ data ", line) for line in str(error).splitlines()), error
