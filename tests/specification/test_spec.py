@@ -1,14 +1,16 @@
 """Specifications: what is accepted, and what is said, with line and column, about what is not."""
 
+import copy
 import hashlib
 import json
+import math
 import shutil
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctid_cli.canonical import canonical_json, content_hash
@@ -16,7 +18,18 @@ from ctid_cli.errors import SpecError
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
-from tests.specification.written import MEASURED, RECORD, SIMULATED, changed, load, problems
+from tests.specification.written import (
+    CLOSED_LOOP,
+    MEASURED,
+    MEASURED_LOOP,
+    OPEN_LOOP,
+    RECORD,
+    SIGNAL,
+    SIMULATED,
+    changed,
+    load,
+    problems,
+)
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
@@ -100,6 +113,40 @@ def test_hashes_are_what_they_were():
     assert content_hash({"b": [1.0, 1e-3, None], "a": "é"}) == "1700a7aeb6dfa5c8"
     with pytest.raises(ValueError, match="JSON compliant"):
         canonical_json([float("nan")])
+
+
+BASES = [yaml.safe_load(text) for text in (SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP)]
+VALUES = [None, [], {}, -1, 0, 2, 0.5, 1e300, 1e-300, math.nan, math.inf, True, "", "x", [1, 1], [1, -2], {"kind": "x"}]
+SECTIONS = [(name, section) for tree in BASES for name, section in tree.items()]
+
+
+def places(node):
+    """Yield every mapping or list in a tree with each of its keys."""
+    for key, value in list(node.items() if isinstance(node, dict) else enumerate(node)):
+        yield node, key
+        if isinstance(value, dict | list):
+            yield from places(value)
+
+
+@settings(max_examples=200)
+@given(st.data())
+def test_whatever_is_wrong_ends_in_problems_with_their_places(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("spec")
+    (folder / "record.csv").write_text(RECORD, encoding="utf-8")
+    tree = copy.deepcopy(data.draw(st.sampled_from(BASES)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        node, key = data.draw(st.sampled_from(list(places(tree)) or [(tree, "experiment")]))
+        name, section = data.draw(st.sampled_from(SECTIONS))
+        if data.draw(st.booleans()):
+            node[key] = copy.deepcopy(data.draw(st.sampled_from(VALUES)))
+        else:
+            tree[name] = copy.deepcopy(section)
+    found = []
+    try:
+        build_plan(load(folder, yaml.safe_dump(tree, sort_keys=False)))
+    except SpecError as error:
+        found = error.problems
+    assert all(problem.line >= 1 and problem.column >= 1 and problem.message for problem in found)
 
 
 # -- measured records and files ---------------------------------------------------------------------------------------
