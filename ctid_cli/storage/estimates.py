@@ -222,18 +222,17 @@ class Estimates:
     def _clocks(self) -> tuple[Array, Array]:
         """Return times of the estimates [s]; NaN where they are not known."""
         found = np.full((2, len(self)), np.nan)
-        if self._times is not None and len(self):
-            replicates, starts = self.column("replicate").tolist(), self.values("start")
-            for block in self.blocks:
-                times = self._times(block.cell["hash"], block.hash)
-                inside = range(block.first, block.last)
-                if times is not None:
-                    try:
-                        pairs = [times[replicates[k], starts[k]] for k in inside]
-                    except KeyError as error:
-                        lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
-                        raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
-                    found[:, inside] = np.array(pairs, dtype=float).T
+        for block in self.blocks if self._times is not None else ():
+            assert self._times is not None
+            own, times = slice(block.first, block.last), self._times(block.cell["hash"], block.hash)
+            if times is not None:
+                starts = [start.decode() for start in self.column("start")[own].tolist()]
+                try:
+                    pairs = [times[key] for key in zip(self.column("replicate")[own].tolist(), starts, strict=True)]
+                except KeyError as error:
+                    lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
+                    raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
+                found[:, own] = np.array(pairs, dtype=float).T
         return found[0], found[1]
 
     @cached_property
