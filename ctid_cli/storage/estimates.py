@@ -31,7 +31,6 @@ from ctid_cli.errors import DamageError, StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.export import (
-    MISSING,
     ROWS,
     AnyArray,
     Export,
@@ -207,13 +206,8 @@ class Estimates:
         if name == "true_delay":
             return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
         if name == "converged":
-            found = self._judged
-            return [value for part in found for value in ([None] * part if isinstance(part, int) else part.tolist())]
+            return [None if value != value else bool(value) for value in self._judged.tolist()]
         values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
-        if name == "standard_errors" and self.has("denominator"):
-            # An estimate with a model has a table of errors, if an empty one.
-            models = (self.column("denominator_length") != MISSING).tolist()
-            values = [value or ({} if there else None) for value, there in zip(values, models, strict=True)]
         return values
 
     def _by_block(self, value: Callable[[Block], Any]) -> list[Any]:
@@ -222,18 +216,17 @@ class Estimates:
     def _clocks(self) -> tuple[Array, Array]:
         """Return times of the estimates [s]; NaN where they are not known."""
         found = np.full((2, len(self)), np.nan)
-        if self._times is not None and len(self):
-            replicates, starts = self.column("replicate").tolist(), self.values("start")
-            for block in self.blocks:
-                times = self._times(block.cell["hash"], block.hash)
-                inside = range(block.first, block.last)
-                if times is not None:
-                    try:
-                        pairs = [times[replicates[k], starts[k]] for k in inside]
-                    except KeyError as error:
-                        lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
-                        raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
-                    found[:, inside] = np.array(pairs, dtype=float).T
+        for block in self.blocks if self._times is not None else ():
+            assert self._times is not None
+            own, times = slice(block.first, block.last), self._times(block.cell["hash"], block.hash)
+            if times is not None:
+                starts = [start.decode() for start in self.column("start")[own].tolist()]
+                try:
+                    pairs = [times[key] for key in zip(self.column("replicate")[own].tolist(), starts, strict=True)]
+                except KeyError as error:
+                    lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
+                    raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
+                found[:, own] = np.array(pairs, dtype=float).T
         return found[0], found[1]
 
     @cached_property
@@ -276,23 +269,23 @@ class Estimates:
     @property
     def converged(self) -> BoolArray | None:
         """Return which of them satisfy the rule of success; None where there is none for all of them."""
-        known = [part for part in self._judged if not isinstance(part, int)]
-        return np.concatenate(known) if known and len(known) == len(self._judged) else None
+        found = self._judged
+        return None if not len(found) or np.isnan(found).any() else found.astype(bool)
 
     @cached_property
-    def _judged(self) -> list[BoolArray | int]:
-        """Return by block which of the estimates satisfy the rule; where there is none, their number."""
-        success = self.manifest["success"]
+    def _judged(self) -> Array:
+        """Return 1 for those that satisfy the rule of success, 0 for others, NaN where there is none."""
+        found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:
-            return [block.last - block.first for block in self.blocks]
+            return found
         failures, fits = self.failures, self.column("fit_percent")
         measures = self.values("measures") if success.get("band") is not None else None
-        found: list[BoolArray | int] = []
         for block in self.blocks:
             own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
             values = dict(zip(truth, self._found(own, tuple(truth), errors=False)[0].T, strict=True))
             hits = judged(success, truth, failures[own], values, fits[own], measures and measures[own])
-            found.append(block.last - block.first if hits is None else hits)
+            if hits is not None:
+                found[own] = hits
         return found
 
     def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:

@@ -358,10 +358,15 @@ class Export:
             return [None if n == MISSING else row[:n] for row, n in zip(plain, lengths, strict=True)]
         if column.type == "by name":
             names, present = self.parts(name), self.read(f"{name}_present", start, stop).tolist()
-            return [
+            found = [
                 {part: value for part, value, there in zip(names, row, mask, strict=True) if there} or None
                 for row, mask in zip(plain, present, strict=True)
             ]
+            if name == "standard_errors":
+                # An estimate with a model has a table of errors, if an empty one.
+                models = (self.read("denominator_length", start, stop) != MISSING).tolist()
+                found = [one or ({} if there else None) for one, there in zip(found, models, strict=True)]
+            return found
         return list(plain)
 
     def keys(self, start: int = 0, stop: int | None = None) -> list[Key]:
@@ -374,8 +379,7 @@ class Export:
         """Return results of some estimates, as they were computed."""
         wanted = [column for column in columns.COLUMNS if column.source == "result"]
         values = [self.values(column, start, stop) for column in wanted]
-        found = [dict(zip((c.name for c in wanted), row, strict=True)) for row in zip(*values, strict=True)]
-        return [with_errors(result) for result in found]
+        return [dict(zip((c.name for c in wanted), row, strict=True)) for row in zip(*values, strict=True)]
 
     def verify(self) -> None:
         """Read all of it, so that HDF5 compares every part with its checksum."""
@@ -404,11 +408,6 @@ def sha256_of(path: Path) -> str | None:
     with suppress(OSError), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
     return None
-
-
-def with_errors(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a row whose model, if it has one, has a table of errors, if an empty one."""
-    return row if row["denominator"] is None else row | {"standard_errors": row["standard_errors"] or {}}
 
 
 def names_of(name: str) -> str:
