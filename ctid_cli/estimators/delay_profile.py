@@ -264,8 +264,6 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             raise OptionError(
                 "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"
             )
-        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
-        _check_stable(known, self.poles)
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
         allowed = self.order if low == high else self.order - 1
@@ -273,6 +271,8 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             reason = "" if low == high else " while the delay is estimated"
             given = f"got {self.zeros} zeros and {self.order} poles" + ", integrators included" * (self.integrators > 0)
             raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
+        # Names are made of degrees that make sense only.
+        _check_stable(places_of(self.fixed, Structure(self.poles, self.zeros).names), self.poles)
 
     @property
     def order(self) -> int:
