@@ -4,10 +4,6 @@
 #                 goes on where it was; with RUNS=20 fewer data sets, which are checked and not published
 # make reproduce-small
 #                 the first data sets of every study, compared with the committed estimates: what CI does after make test
-# make faults     20,000 inputs that nobody meant to write, 2,600 faults at storage calls, 300 of processes, 360 damaged
-#                 files, and a table of what came of them (three quarters of an hour of one processor); stop it and run it
-#                 again at will, it goes on where it was; SHARE=0.1 a tenth of all, MINUTES=20 for so long, AGAIN=1 what
-#                 failed once more, PUBLISH=1 with the table in results/published
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -20,7 +16,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test faults reproduce reproduce-small bench clean
+.PHONY: demo test reproduce reproduce-small bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -34,10 +30,6 @@ test: $(VENV)/.test-installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile
-
-faults: $(VENV)/.test-installed
-	$(BIN)/python -m tests.faults --share $(or $(SHARE),1) $(if $(MINUTES),--minutes $(MINUTES)) \
-		$(if $(AGAIN),--again) $(if $(PUBLISH),--publish)
 
 reproduce: $(VENV)/.installed
 	$(BIN)/ctid study run $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"

@@ -28,8 +28,7 @@ import numpy as np
 import yaml
 
 from ctid_cli.running.job import Job, run_job
-from ctid_cli.running.origins import current_origins
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import build_plan, current_origins
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import failed

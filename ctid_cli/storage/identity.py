@@ -41,7 +41,7 @@ PATH = (
     *("ctid_cli.specification.system_sections", "ctid_cli.specification.loop_section"),
     *("ctid_cli.specification.signal_sections", "ctid_cli.specification.start_sections"),
     *("ctid_cli.specification.option_sections", "ctid_cli.specification.start_points"),
-    *("ctid_cli.running.plan", "ctid_cli.running.cells", "ctid_cli.running.job", "ctid_cli.canonical"),
+    *("ctid_cli.running.plan", "ctid_cli.running.job", "ctid_cli.canonical"),
 )
 #: Libraries whose version decides what is computed.
 NUMERICAL_LIBRARIES = ("numpy", "scipy", "numba")

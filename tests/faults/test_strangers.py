@@ -12,14 +12,15 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DataError, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.running.engine import run_experiment
 from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
-from tests.faults import trials
 from tests.faults.conftest import STORED, TINY
 from tests.faults.harness import COMMANDS, asked, resealed
+from tests.running.fakes import FakePlan
 from tests.storage.sealed_images import read_sealed
 
 MEASURED = """\
@@ -251,7 +252,7 @@ def test_a_run_writes_through_no_link_that_lies_in_its_folder(name, tmp_path):
     elsewhere.write_text(mine)
     (place / name).symlink_to(elsewhere)
     with pytest.raises(RefusedError, match=r"is a link, and results are written into their folder alone"):
-        trials.run(place)
+        run_experiment(FakePlan(), place, jobs=1, warm=lambda plan: None)
     assert elsewhere.read_text() == mine
     assert [path.name for path in place.iterdir()] == [name]
 

@@ -41,7 +41,7 @@ monte_carlo: {runs: 5, seed: 1}
 
 
 def run(toys: FakePlan, place: Path) -> Path:
-    run_experiment(toys, place, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    run_experiment(toys, place, jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
     return place
 
 

@@ -216,16 +216,15 @@ def test_results_are_sealed_and_read_back(tmp_path):
 RUN = """\
 import sys
 from pathlib import Path
-from ctid_cli.running import events
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
-def tell(event):
-    if isinstance(event, events.EstimatesDone):
+def tell(progress):
+    for _ in progress.stored:
         print("stored", flush=True)
 
-run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, on_event=tell)
+run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, progress=tell)
 """
 
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ctid_cli.running.cells import Plan
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import identity
 from ctid_cli.storage.identity import (
@@ -137,7 +136,7 @@ def test_words_do_not_matter(tree: Path) -> None:
         # Neither comments nor the places of line breaks survive this.
         changed = ast.unparse(ast.parse(text))
         file.write_text(changed.replace('"""', '"""In other words: ', 1) + "\n# a comment\n", encoding="utf-8")
-    for module in ("errors", "text", "running.events", "running.stopping", "storage.journal", "storage.sealed"):
+    for module in ("errors", "text", "running.engine", "running.stopping", "storage.journal", "storage.sealed"):
         file = path_of(f"ctid_cli.{module}", tree)
         file.write_text(mutated(file.read_text(encoding="utf-8")), encoding="utf-8")
     assert {name: versions(plan, tree) for name, plan in PLANS.items()} == before

@@ -28,7 +28,7 @@ FILES = {"journal.sqlite", "runs.h5", "spec.yaml", "spec.canonical.json", "timin
 
 
 def run(place: Path, plan: FakePlan = PLAN) -> RunSummary:
-    return run_experiment(plan, place, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    return run_experiment(plan, place, jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
 
 
 def ctid(*arguments: object) -> tuple[int, str]:

@@ -16,7 +16,7 @@ import pytest
 
 from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.origins import current_origins
+from ctid_cli.running.plan import current_origins
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.identity import origin_of
@@ -37,7 +37,7 @@ ORIGIN = origin_of(PLAN.data_cells[0], PLAN.estimators[0].estimator)
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("store") / "results" / "toys"
-    run_experiment(PLAN, place, jobs=2, warm=lambda: 0.0)  # type: ignore[arg-type]
+    run_experiment(PLAN, place, jobs=2, warm=lambda plan: None)  # type: ignore[arg-type]
     return place
 
 
@@ -263,7 +263,7 @@ def test_sealed_and_journalled_estimates_count_alike(place: Path, runs: int) -> 
     plan = FakePlan(Toy("raise", at=1), Toy(order=3), runs=runs)
     # With fewer data sets some are set aside; a name more shares the estimates of another.
     plan.estimators = (*plan.estimators, replace(plan.estimators[0], name="again"))
-    run_experiment(plan, place, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    run_experiment(plan, place, jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
     sealed = experiment_status(place)
     (place / "runs.h5").unlink()
     assert experiment_status(place) == sealed
@@ -297,7 +297,7 @@ def test_folders_without_results(tmp_path: Path) -> None:
 def test_folders_with_spaces_and_umlauts(made: Path, tmp_path: Path) -> None:
     odd = Path(shutil.copytree(made, tmp_path / "Ergebnisse für #1 100%?" / "toys"))
     assert len(load_estimates(odd)) == 36
-    summary = run_experiment(PLAN, odd, jobs=1, warm=lambda: 0.0)  # type: ignore[arg-type]
+    summary = run_experiment(PLAN, odd, jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
     assert summary.computed == 0
 
 

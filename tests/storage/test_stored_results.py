@@ -138,7 +138,7 @@ def test_nothing_of_the_present_code_is_added_to_them(tmp_path: Path) -> None:
     before = {file.name: file.read_bytes() for file in place.iterdir()}
     plan = build_plan(load_spec(STORED / "system" / "spec.yaml"))
     with pytest.raises(RefusedError, match=r"code version 64dead06a043ab0d then, [0-9a-f]+-[0-9a-f]+ now"):
-        run_experiment(plan, place, warm=lambda: 0.0)
+        run_experiment(plan, place, warm=lambda plan: None)
     assert {file.name: file.read_bytes() for file in place.iterdir()} == before
 
 
