@@ -98,12 +98,14 @@ class Course:
         with closing(self._workers.results(self._handed_out())) as results:
             for result in results:
                 yield from self._slow() if result is None else self._settle(*result)
-        while self._suspects and not self._stopping():
-            suspects, self._suspects = self._suspects, []
-            yield Suspected([key for job in suspects for key in job.keys])
-            yield from self._alone(suspects, self._workers.count, tries=1)
-        undecided, self._undecided = self._undecided, []
-        yield from self._alone(undecided, 1, tries=2)
+        while (self._suspects or self._undecided) and not self._stopping():
+            if self._suspects:
+                suspects, self._suspects = self._suspects, []
+                yield Suspected([key for job in suspects for key in job.keys])
+                yield from self._alone(suspects, self._workers.count, tries=1)
+            else:
+                undecided, self._undecided = self._undecided, []
+                yield from self._alone(undecided, 1, tries=2)
         self._short = 0
 
     def _handed_out(self) -> Iterator[Job]:

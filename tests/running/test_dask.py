@@ -20,7 +20,7 @@ from tests.running.hostile import Hostile
 
 
 def plan() -> Any:
-    hostile = (Hostile("loop", at=1, order=5), Hostile("leave", at=3, order=6), Hostile("grow", at=4, order=7))
+    hostile = (Hostile("leave", at=3, order=6), Hostile("grow", at=4, order=7))
     limits = {"cpu_seconds": 2, "memory_mb": 300}
     return FakePlan(Toy(seconds=0.05), *hostile, Toy("raise", at=2), levels=(5,), runs=7, limits=limits)
 

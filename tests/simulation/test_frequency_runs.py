@@ -220,8 +220,11 @@ from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 
+told = []
+
 def tell(progress):
-    for _ in progress.stored:
+    while len(told) < progress.done:
+        told.append(progress.done)
         print("stored", flush=True)
 
 run_experiment(build_plan(load_spec(Path(sys.argv[1]))), Path(sys.argv[2]), jobs=1, progress=tell)
