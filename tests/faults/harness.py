@@ -38,7 +38,7 @@ COMMANDS = {
     "show": ["--out", "--json", "--history", "0"],
     "export": ["--format", "json", "--file", "--out"],
     "validate": ["--set", "noise.snr_db=3", "--set", "a.b=[", "--allow-code", "--allow-outside"],
-    "run --dry-run": ["--set", "--runs", "--jobs", "--json", "--out", "--fresh", "monte_carlo.runs=3"],
+    "run --dry-run": ["--set", "--runs", "--jobs", "--out", "--fresh", "monte_carlo.runs=3"],
     "schema": ["--text", "sampling", "td_srivc"],
 }
 
