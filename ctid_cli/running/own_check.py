@@ -1,8 +1,7 @@
-"""A first look at components of one's own, before anything is stored: one data set, twice, in a worker process."""
+"""A first look at custom components, before anything is stored: one data set, twice, in a process of its own."""
 
 import random
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,10 +11,10 @@ import numpy as np
 from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.errors import SpecError
 from ctid_cli.own_code import reason
-from ctid_cli.running.cells import Plan, Task
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.pool import in_worker
+from ctid_cli.running.plan import Plan, Task
+from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.own_components import (
     ContractError,
@@ -27,6 +26,7 @@ from ctid_cli.simulation.own_components import (
 )
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import found_values, true_values
+from ctid_cli.temporary import TemporaryFolder
 
 STAND_INS = (OwnSampling, OwnExcitation, OwnSystem, OwnNoise)
 #: Key path, and what is wrong there.
@@ -41,7 +41,7 @@ GLOBAL = "depends on the global random state, so that no run could be repeated; 
 
 @dataclass(frozen=True)
 class Look:
-    """What components of one's own do wrong on a data set, and what is odd about it."""
+    """What custom components do wrong on a data set, and what is odd about it."""
 
     wrong: list[Complaint] = field(default_factory=list)
     odd: list[Complaint] = field(default_factory=list)
@@ -49,26 +49,21 @@ class Look:
     returned: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-def check_components(
-    plan: Plan,
-    limits: Limits | None = None,
-    stopping: Callable[[], bool] = lambda: False,
-    warn: Callable[[str], None] = lambda text: None,
-) -> bool:
-    """Refuse components that fail on the first data set, or come out otherwise the second time.
+def check_components(plan: Plan, limits: Limits, warn: Callable[[str], object]) -> bool:
+    """Refuse custom components that fail on the first data set, or come out otherwise the second time.
 
     A component that ends the process, or takes too long, is left to the run, which stores that for every estimate; what
-    other data sets may mend is a warning. Says whether data are made by a component of one's own, so that no other
-    process but a worker should make them.
+    other data sets may mend is a warning. Returns whether custom components make the data.
     """
-    task = Task(0, 0)
-    cell = plan.data_cells[task.cell]
-    wanted = [entry for entry in plan.keys(task) if isinstance(entry[1].estimator, OwnEstimation)]
+    cell = plan.data_cells[0]
+    wanted = [entry for entry in plan.keys(Task(0, 0)) if isinstance(entry[1].estimator, OwnEstimation)]
     makes_data = bool(_parts(cell.source))
     if not wanted and not makes_data:
         return False
-    job = Job(cell, task.replicate, plan.monte_carlo.get("seed"), tuple(wanted), plan.terms)
-    found: Look = in_worker(look, job, limits=limits or Limits(), stopping=stopping) or Look()
+    job = Job(cell, 0, plan.monte_carlo.get("seed"), tuple(wanted), plan.terms)
+    with TemporaryFolder() as folder:
+        returned, _, _ = call_alone(folder, look, job, limits, str(folder / "late"))
+    found: Look = returned or Look()
     if found.wrong:
         raise SpecError([plan.spec.problem(path, message) for path, message in found.wrong])
     success = plan.spec.canonical().get("success") or {}
@@ -77,14 +72,15 @@ def check_components(
     return makes_data
 
 
-def look(job: Job) -> Look:
-    """What is seen of components of one's own on a data set."""
+def look(job: Job, limits: Limits, late: str) -> Look:
+    """Return what is seen of custom components on a data set, within the limits of an estimate."""
     found = Look()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with open(late, "wb") as watched:
+        limits.begin(watched)
         found.wrong.extend(_of_data(job))
         if not found.wrong:
             _of_estimators(job, found)
+        limits.end()
     return found
 
 
@@ -107,7 +103,7 @@ def _uncounted(
 
 
 def _parts(source: Any) -> dict[str, Any]:
-    """Components of one's own that make a data set, by their place in the specification, in the order of their work."""
+    """Return the custom components that make a data set, by their place in the specification, in the order of work."""
     if not isinstance(source, SimulatedSource):
         return {}
     reference = None if source.loop is None else source.loop.reference
@@ -176,7 +172,7 @@ def _of_estimators(job: Job, found: Look) -> None:
 
 
 def _of_estimator(estimator: Any, data: Any, start: Any, terms: Sequence[Any] | None) -> dict[str, Any]:
-    """What comes out of an estimator, twice the same."""
+    """Return what comes out of an estimator, twice the same."""
     results: list[dict[str, Any]] = []
     for seed in (0, 1):
         begun = time.perf_counter()
