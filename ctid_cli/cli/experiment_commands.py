@@ -163,7 +163,7 @@ def run(
         stop = StopAt(failures=max_failures, seconds=left)
         with Reporter(plan.experiment, quiet=quiet) as reporter:
             how |= {"progress": reporter, "warn": reporter.warn, "dask": dask}
-            summary = run_experiment(plan, folder, jobs=jobs, stop=stop, **how)
+            summary = run_experiment(plan, folder, jobs=jobs, stop=stop, keep_readable=keep_readable, **how)
         if not quiet:
             typer.echo(_conclusion(summary, out, part))
         if summary.exit_code == MachineError.exit_code:
