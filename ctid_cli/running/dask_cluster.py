@@ -74,7 +74,7 @@ class DaskWorkers:
                 raise MachineError(f"{self._address} has no worker; {start}. What was finished is stored")
         return max(self.count, 1)
 
-    def results(self, jobs: Iterator[Job]) -> Results:
+    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
         return self._computed(jobs, compute_there, self._look)
 

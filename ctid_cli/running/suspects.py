@@ -95,7 +95,7 @@ class Course:
 
     def _round(self) -> Generator[Event]:
         """Compute until all is done or a process dies; then each of the suspects alone."""
-        with closing(self._workers.results(self._handed_out())) as results:
+        with closing(self._workers.results(self._handed_out(), self._stopping)) as results:
             for result in results:
                 yield from self._slow() if result is None else self._settle(*result)
         while (self._suspects or self._undecided) and not self._stopping():

@@ -36,6 +36,8 @@ from ctid_cli.temporary import TemporaryFolder
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
+#: File beside the records that tells workers to begin nothing more.
+_STOP = "stop"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
@@ -247,20 +249,25 @@ class LocalWorkers:
         #: Why the last workers ended before all was done.
         self.trouble = ""
         self._folder = TemporaryFolder()
+        self._stop = self._folder.path / _STOP
         self._numbers = itertools.count()
         #: What is in work, by the place of its record.
         self._at_work: dict[Path, Job] = {}
 
-    def results(self, jobs: Iterator[Job]) -> Results:
+    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
 
-        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken.
+        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
+        job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
+        self._stop.unlink(missing_ok=True)
         news: queue.SimpleQueue[Any] = queue.SimpleQueue()
         working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
         working.add_done_callback(lambda _: news.put(None))
         try:
             while True:
+                if stopping():
+                    self._stop.touch()
                 try:
                     item = news.get(timeout=TICK)
                 except queue.Empty:
@@ -293,8 +300,9 @@ class LocalWorkers:
 
         settings = {"initializer": initialise, "initargs": (os.getpid(),)}
         with parallel_config("loky", inner_max_num_threads=1, **settings):
-            # One job runs in this very process, unless there are two workers.
-            how = {"n_jobs": max(self.count, 2), "pre_dispatch": self.count, "batch_size": 1, "max_nbytes": None}
+            # With one worker joblib would compute in this very process: there are two, of which one is at work.
+            ahead = self.count + 1 if self.count > 1 else 1
+            how = {"n_jobs": max(self.count, 2), "pre_dispatch": ahead, "batch_size": 1, "max_nbytes": None}
             parallel = Parallel(return_as="generator_unordered", **how)
             for found in parallel(self._calls(jobs, news)):
                 news.put(found)
@@ -380,5 +388,5 @@ class LocalWorkers:
 
 
 def _compute_named(record: Path, keys: Collection[Key], packed: bytes, limits: Limits) -> tuple[Path, list[Entry]]:
-    """Compute a job, and say of which record it is."""
-    return record, compute(keys, packed, str(record), limits)
+    """Compute a job unless the run is to stop, and say of which record it is."""
+    return record, [] if record.with_name(_STOP).exists() else compute(keys, packed, str(record), limits)

@@ -47,7 +47,7 @@ class Here:
     def __init__(self, count, limits):
         pass
 
-    def results(self, jobs):
+    def results(self, jobs, stopping):
         for job in jobs:
             yield job, Ending([entry for entry in run_job(job) if not isinstance(entry, Begun)])
 
