@@ -20,8 +20,10 @@ from pathlib import Path
 
 import _timing  # noqa: F401
 
-from ctid_cli.running.engine import run_experiment, usable_processors
-from ctid_cli.running.pool import end_idle_workers
+from joblib.externals.loky import get_reusable_executor
+
+from ctid_cli.processors import usable_processors
+from ctid_cli.running.engine import run_experiment
 from tests.running.fakes import FakePlan, Toy
 
 TASK = 0.05
@@ -34,7 +36,7 @@ def measure(data_sets: int, jobs: int, busy: bool, folder: Path) -> float:
     # One estimate per data set, so that a data set takes TASK.
     plan.estimators = (plan.estimators[0].only("3"),)
     began = time.perf_counter()
-    summary = run_experiment(plan, folder, jobs=jobs, warm=lambda: 0.0)  # type: ignore[arg-type]
+    summary = run_experiment(plan, folder, jobs=jobs, warm=lambda plan: None)  # type: ignore[arg-type]
     total = time.perf_counter() - began
     if summary.computed != data_sets or summary.failed:
         raise SystemExit(f"the run went wrong: {summary}")
@@ -54,8 +56,8 @@ def main() -> None:
             for jobs in all_jobs:
                 ideal = data_sets * TASK / jobs
                 name = f"{busy}-{jobs}"
-                end_idle_workers()
-                # So short a run is all start; the second one has the workers that are there.
+                # A run this short is all start; the second one has the workers that are there.
+                get_reusable_executor().shutdown()
                 started = measure(jobs, jobs, busy, Path(scratch) / f"{name}-started")
                 there = measure(jobs, jobs, busy, Path(scratch) / f"{name}-short")
                 used = time.process_time()

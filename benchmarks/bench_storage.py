@@ -28,8 +28,7 @@ import numpy as np
 import yaml
 
 from ctid_cli.running.job import Job, run_job
-from ctid_cli.running.origins import current_origin
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import build_plan, current_origin
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import journal
 from ctid_cli.storage.columns import failed
@@ -113,8 +112,8 @@ def measure(name: str, folder: Path, spec: Path) -> None:
         with h5py.File(folder / NAME / "runs.h5") as file:
             some = file["estimates/id"][-1].decode()
     arguments = {
-        "seal": ["run", str(spec), "--yes", "--jobs", "1", *results],
-        "run": ["run", str(spec), "--yes", "--jobs", "1", *results],
+        "seal": ["run", str(spec), "--jobs", "1", *results],
+        "run": ["run", str(spec), "--jobs", "1", *results],
         "show": ["show", some, *results],
         "export": ["export", NAME, *results, "--file", str(folder / "all.csv")],
     }.get(name, [name, NAME, *results])

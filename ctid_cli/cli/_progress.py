@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import re
 import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Self
 
 import typer
@@ -19,7 +16,7 @@ from ctid_cli.reporting.precision_words import block_sentence
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, TaskID
 
-    from ctid_cli.running.events import Event
+    from ctid_cli.running.engine import Progress as RunProgress
 
 #: Seconds between two lines where stderr is not a terminal.
 LINE_EVERY = 10.0
@@ -132,73 +129,47 @@ class FitProgress(RecordProgress):
 
 
 class Reporter(_Progress):
-    """Shows the events of one run on stderr."""
+    """Shows the progress of one run on stderr."""
 
-    failed = done = 0
+    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic, *, quiet: bool = False) -> None:
+        super().__init__(name, clock)
+        self._quiet = quiet
+        #: What was said first begins the run.
+        self._ready = False
 
-    def __call__(self, event: Event) -> None:
-        """Show one event."""
-        from ctid_cli.running import events
+    def __call__(self, progress: RunProgress) -> None:
+        """Show how far the run is."""
+        if self._quiet:
+            return
+        if progress.message:
+            self._say(progress.message)
+        if progress.precision:
+            self._say(block_sentence(progress.precision))
+        if not self._ready:
+            self._begin(progress.total)
+        elif progress.stored:
+            self._advance(progress)
+        else:
+            self._update(progress.done, total=progress.total)
 
-        match event:
-            case events.PlanReady():
-                self._plan(event)
-            case events.Warned():
-                self._say(f"warning: {event.text}")
-            case events.EstimatesDone():
-                self._advance(event)
-            case events.BlockDone():
-                self._say(block_sentence(event.precision))
-                self._update(self.done, total=event.total)
-            case events.WorkerDied():
-                what = count(event.estimates, "estimate")
-                self._say(f"a worker process died ({event.reason}); computing {what} once more")
-            case events.Slow():
-                what = f"{event.estimator} on replicate {event.replicate} has been at work for {seconds(event.seconds)}"
-                self._say(f"{what}; limits.wall_seconds would end what takes longer than it says")
-            case events.GivenUp():
-                what = f"{count(event.estimates, 'estimate')} given up, not stored ({event.names[0]}"
-                self._say(f"{what}{', …' if event.estimates > 1 else ''}): {event.reason}")
-            case events.Stopping():
-                self._say(f"stopping ({event.reason}): storing what is finished; once more to stop at once")
+    def warn(self, text: str) -> None:
+        """Say what is odd, and does not stop the run."""
+        if not self._quiet:
+            self._say(f"warning: {text}")
 
-    def _plan(self, event: Any) -> None:
-        parts = [f"{count(event.estimates, 'estimate')} of {count(event.data_sets, 'data set')} to compute"]
-        if event.again:
-            parts.append(f"{event.again} of them once more")
-        if event.reused:
-            parts.append(f"{event.reused} already stored")
-        if event.left_aside:
-            parts.append(f"{event.left_aside} stored ones set aside")
-        if event.at_most is not None and event.estimates:
-            parts.append(f"then in blocks until they are enough, {event.at_most} data sets of a cell at most")
-        self._say(", ".join(parts))
+    def _begin(self, total: int) -> None:
+        self._ready = True
         self._began = self._last
-        if event.data_sets and sys.stderr.isatty():
+        if total and sys.stderr.isatty():
             from rich.progress import MofNCompleteColumn, TextColumn
 
             rate = TextColumn("data sets, {task.fields[rate]}, {task.fields[failed]} failed, ETA")
-            self._start(event.data_sets, MofNCompleteColumn(), rate, rate="-", failed=0)
+            self._start(total, MofNCompleteColumn(), rate, rate="-", failed=0)
 
-    def _advance(self, event: Any) -> None:
-        from ctid_cli.storage.columns import FAILURES
-
-        self.done = event.done
-        self.failed += sum(row["status"] in FAILURES for row in event.rows)
-        speed = event.done / max(self._clock() - self._began, 1e-9)
-        self._update(event.done, rate=rate(speed), failed=self.failed)
-        if self._is_time() or (self._bar is None and event.done == event.total):
-            left = f", ETA {seconds((event.total - event.done) / speed)}" if 0 < event.done < event.total else ""
-            self._say(f"{event.done}/{event.total} data sets, {rate(speed)}, {self.failed} failed{left}")
-
-
-def json_lines(event: Event) -> list[str]:
-    """An event as JSON objects, one per line; a data set gives one object per estimate."""
-    from ctid_cli.reporting.estimate import as_object
-    from ctid_cli.running import events
-
-    if isinstance(event, events.EstimatesDone):
-        return [json.dumps({"event": "estimate", **as_object(row)}, allow_nan=False) for row in event.rows]
-    # PlanReady is "plan", KernelsCompiling "kernels_compiling".
-    name = re.sub("(?<=.)([A-Z])", r"_\1", type(event).__name__).lower().removesuffix("_ready")
-    return [json.dumps({"event": name, **asdict(event)}, default=str, allow_nan=False)]
+    def _advance(self, progress: RunProgress) -> None:
+        done, total, failed = progress.done, progress.total, progress.failed
+        speed = done / max(self._clock() - self._began, 1e-9)
+        self._update(done, total=total, rate=rate(speed), failed=failed)
+        if self._is_time() or (self._bar is None and done == total):
+            left = f", ETA {seconds((total - done) / speed)}" if 0 < done < total else ""
+            self._say(f"{done}/{total} data sets, {rate(speed)}, {failed} failed{left}")

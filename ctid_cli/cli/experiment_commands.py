@@ -5,14 +5,11 @@ from __future__ import annotations
 import gc
 import json
 import shlex
-import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from enum import StrEnum
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,16 +28,13 @@ from ctid_cli.cli._common import (
     printable,
     require_within,
 )
-from ctid_cli.cli._progress import Reporter, json_lines
+from ctid_cli.cli._progress import Reporter
 from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import count, seconds
 
 if TYPE_CHECKING:
-    from ctid_cli.running.cells import Plan
-    from ctid_cli.running.engine import RunSummary
-    from ctid_cli.running.events import Event, PlanReady
-    from ctid_cli.running.executor import Executor
-    from ctid_cli.running.limits import Limits
+    from ctid_cli.running.engine import RunSummary, Workload
+    from ctid_cli.running.plan import Plan
     from ctid_cli.storage.manifest import Shard
 
 
@@ -113,7 +107,6 @@ def run(
     retry: Annotated[
         list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
     ] = None,
-    fail_fast: Annotated[bool, typer.Option("--fail-fast", help="Stop at the first estimate that fails.")] = False,
     max_failures: Annotated[
         int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
     ] = None,
@@ -122,7 +115,6 @@ def run(
         typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before a very large run.")] = False,
     out: Out = Path("results"),
     fresh: Fresh = False,
     keep_readable: Annotated[
@@ -134,15 +126,11 @@ def run(
         str | None,
         typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
     ] = None,
-    backend: Annotated[
-        Literal["loky", "dask"], typer.Option("--backend", help="Processes of this machine, or workers of dask.")
-    ] = "loky",
-    scheduler: Annotated[
+    dask: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="With --backend dask: tcp://host:port of yours."),
+        typer.Option("--dask", metavar="ADDRESS", help="Workers of the dask scheduler at tcp://host:port compute."),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object per line to stdout.")] = False,
 ) -> None:
     """Run experiments; the same command again resumes.
 
@@ -155,8 +143,6 @@ def run(
 
     if keep_readable and not fresh:
         raise UsageError("--keep-readable goes with --fresh")
-    if scheduler is not None and backend != "dask":
-        raise UsageError("--scheduler goes with --backend dask")
     allowed = {"allow_code": allow_code, "allow_outside": allow_outside}
     plans = [plan for _, plan in load_plans(configs, overrides or [], runs, **allowed)]
     folders = [out / plan.experiment for plan in plans]
@@ -167,29 +153,19 @@ def run(
     how: dict[str, Any] = {"fresh": fresh, "allow_mixed": allow_mixed, "retry": [kind.upper() for kind in retry or ()]}
     if dry_run:
         for plan, folder in zip(plans, folders, strict=True):
-            ready = preview(plan, folder, **how)
-            typer.echo(json_lines(ready)[0] if as_json else _intention(ready))
+            typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **how), folder)}")
         return
-    if not yes:
-        for plan, folder in zip(plans, folders, strict=True):
-            _ask_if_large(plan, folder, jobs, how)
     # What was imported stays: looking for garbage in it again and again would be a tenth of sealing many estimates.
     gc.freeze()
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
-        stop = StopAt(failures=1 if fail_fast else max_failures, seconds=left)
-        with Reporter(plan.experiment) as reporter:
-            tell = partial(_tell, None if quiet else reporter, as_json)
-            executor = None if backend == "loky" else _on_dask(plan, scheduler, jobs)
-            summary = run_experiment(
-                plan, folder, jobs=jobs, on_event=tell, stop=stop, executor=executor, keep_readable=keep_readable, **how
-            )
-        if as_json:
-            content = asdict(summary) | {"missing": summary.missing, "exit_code": summary.exit_code}
-            typer.echo(json.dumps({"event": "summary", **content}, default=str))
+        stop = StopAt(failures=max_failures, seconds=left)
+        with Reporter(plan.experiment, quiet=quiet) as reporter:
+            how |= {"progress": reporter, "warn": reporter.warn, "dask": dask}
+            summary = run_experiment(plan, folder, jobs=jobs, stop=stop, keep_readable=keep_readable, **how)
         if not quiet:
-            typer.echo(_conclusion(summary, out, part), err=as_json)
+            typer.echo(_conclusion(summary, out, part))
         if summary.exit_code == MachineError.exit_code:
             raise summary.machine_error()
         if summary.exit_code:
@@ -200,56 +176,13 @@ def run(
         raise TooManyFailuresError("\n".join(hopeless))
 
 
-def _ask_if_large(plan: Plan, folder: Path, jobs: int | None, how: dict[str, Any]) -> None:
-    """Say what a very large run will take, and ask whether it is meant."""
-    from ctid_cli.processors import usable_processors
-    from ctid_cli.running.engine import preview
-    from ctid_cli.running.forecast import LARGE, forecast
-
-    if plan.data_sets * plan.estimates_each <= LARGE:
-        return
-    ready = preview(plan, folder, **how)
-    if ready.estimates <= LARGE:
-        return
-    processes = jobs or usable_processors()
-    found = forecast(ready, processes, fresh=how["fresh"])
-    text = f"{plan.experiment}: {found.estimates} estimates to compute, about {found.bytes / 1e9:.2g} GB of disk"
-    if found.seconds is not None:
-        workers = count(processes, "worker")
-        text += f" and {seconds(found.seconds)} with {workers}, going by the {found.known_from} that are stored"
-    else:
-        text += "; --runs 10 first, and the same command again tells how long it will take"
-    if not sys.stdin.isatty():
-        raise UsageError(f"{text}. If that is meant: --yes")
-    if not typer.confirm(f"{text}. Go on?", err=True):
-        raise typer.Exit(UsageError.exit_code)
-
-
-def _on_dask(plan: Plan, scheduler: str | None, jobs: int | None) -> Callable[[Limits], Executor]:
-    """What makes an executor of workers of dask."""
-    from ctid_cli.processors import usable_processors
-    from ctid_cli.running.dask_executor import DaskExecutor
-
-    def say(text: str) -> None:
-        typer.echo(f"{plan.experiment}: {text}", err=True)
-
-    return lambda limits: DaskExecutor(plan, limits, scheduler, jobs or usable_processors(), say)
-
-
-def _tell(reporter: Reporter | None, as_json: bool, event: Event) -> None:
-    for line in json_lines(event) if as_json else ():
-        typer.echo(line)
-    if reporter is not None:
-        reporter(event)
-
-
-def _intention(ready: PlanReady) -> str:
-    text = f"{ready.experiment}: would compute {count(ready.estimates, 'estimate')} of "
-    text += f"{count(ready.data_sets, 'data set')} into {ready.folder}; {ready.reused} are already stored"
-    text += f", {ready.again} failed ones are tried again" if ready.again else ""
-    text += f", {ready.left_aside} stored ones set aside" if ready.left_aside else ""
-    more = f"; then in blocks until they are enough, {ready.at_most} data sets of a cell at most"
-    return text + more if ready.at_most is not None and ready.estimates else text
+def _intention(work: Workload, folder: Path) -> str:
+    text = f"would compute {count(work.estimates, 'estimate')} of "
+    text += f"{count(work.data_sets, 'data set')} into {folder}; {work.reused} are already stored"
+    text += f", {work.again} failed ones are tried again" if work.again else ""
+    text += f", {work.left_aside} stored ones set aside" if work.left_aside else ""
+    more = f"; then in blocks until they are enough, {work.at_most} data sets of a cell at most"
+    return text + more if work.at_most is not None and work.estimates else text
 
 
 def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
@@ -288,9 +221,10 @@ def validate(
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
     from ctid_cli.running.custom_check import check_components
+    from ctid_cli.running.limits import Limits
 
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
-        check_components(plan, warn=lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))
+        check_components(plan, Limits(), lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

@@ -11,7 +11,8 @@ from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.surprises import FEWEST, surprises
 from ctid_cli.reporting.table_blocks import setting_text, setting_title
-from ctid_cli.running.cells import DataCell, EstimatorCell, Plan
+from ctid_cli.running.job import DataCell, EstimatorCell
+from ctid_cli.running.plan import Plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.text import listed
 

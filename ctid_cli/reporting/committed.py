@@ -9,8 +9,7 @@ from typing import Any
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.percentages import Row
 from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
-from ctid_cli.running.origins import current_version
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import load_spec
 
 #: Columns that tables must have to be compared with.

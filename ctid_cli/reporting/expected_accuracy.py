@@ -21,7 +21,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.cells import Plan
+from ctid_cli.running.plan import Plan
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling

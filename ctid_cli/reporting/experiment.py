@@ -17,7 +17,7 @@ from ctid_cli.reporting.measures import default_measures, measure_rows
 from ctid_cli.reporting.paired_table import compare_estimators
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.tables import experiment_report, notes_of
-from ctid_cli.running import engine, events
+from ctid_cli.running import engine
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.estimates import read_stored
@@ -228,11 +228,10 @@ def run_experiment(
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) / plan.experiment
 
-    def heed(event: events.Event) -> None:
-        if isinstance(event, events.Warned):
-            warnings.warn(event.text, stacklevel=4)
+    def warn(text: str) -> None:
+        warnings.warn(text, stacklevel=5)
 
-    summary = engine.run_experiment(plan, folder, jobs=jobs, on_event=heed, fresh=fresh, allow_mixed=allow_mixed)
+    summary = engine.run_experiment(plan, folder, jobs=jobs, warn=warn, fresh=fresh, allow_mixed=allow_mixed)
     if summary.exit_code == MachineError.exit_code:
         raise summary.machine_error()
     return read_results(folder)

@@ -32,8 +32,7 @@ from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
 from ctid_cli.reporting.expected_accuracy import expected_accuracy, long_record_variances
 from ctid_cli.reporting.results import Group, Results, lookup
-from ctid_cli.running.cells import Plan
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.estimates import Estimates

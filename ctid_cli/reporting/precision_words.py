@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.reporting.layout import Table, count, number
 
 if TYPE_CHECKING:
-    from ctid_cli.running.cell_precision import CellPrecision, Widest
+    from ctid_cli.running.precision import CellPrecision, Widest
 
 #: Data cells that a summary lists.
 LISTED = 5

@@ -1,30 +1,30 @@
 """A first look at custom components before a run: data sets and estimates, twice, in a process of its own."""
 
-import os
 import random
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ctid_cli.canonical import canonical_json, plain
-from ctid_cli.custom_code import Served, reason, served
+from ctid_cli.custom_code import reason
 from ctid_cli.errors import SpecError
-from ctid_cli.running.cells import EstimatorCell, Plan, Task
-from ctid_cli.running.job import Job
+from ctid_cli.running.job import EstimatorCell, Job
 from ctid_cli.running.limits import Limits
+from ctid_cli.running.plan import Plan, Task
+from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource, StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS, trial
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import found_values, true_values
+from ctid_cli.temporary import TemporaryFolder
 
 #: What takes longer is not repeated, and what takes far longer is left to the run [s].
 SLOW = 30.0
@@ -45,54 +45,29 @@ class Look:
     returned: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
-def check_components(
-    plan: Plan,
-    limits: Limits | None = None,
-    stopping: Callable[[], bool] = lambda: False,
-    warn: Callable[[str], None] = lambda text: None,
-) -> bool:
+def check_components(plan: Plan, limits: Limits, warn: Callable[[str], object]) -> bool:
     """Refuse custom components that fail on the first data sets, or come out otherwise the second time.
 
     A component that ends the process, or takes too long, is left to the run, which stores that for every estimate; what
     other data sets may mend is a warning. Returns whether data are made by a custom component, so that no other process
     but a worker should make them.
     """
-    task = Task(0, 0)
-    cell = plan.data_cells[task.cell]
-    wanted = [entry for entry in plan.keys(task) if isinstance(entry[1].estimator, CustomEstimation)]
+    cell = plan.data_cells[0]
+    wanted = [entry for entry in plan.keys(Task(0, 0)) if isinstance(entry[1].estimator, CustomEstimation)]
     makes_data = bool(_parts(cell.source))
     if not wanted and not makes_data:
         return False
-    job = Job(cell, task.replicate, plan.monte_carlo.get("seed"), tuple(wanted), plan.terms)
+    job = Job(cell, 0, plan.monte_carlo.get("seed"), tuple(wanted), plan.terms)
     sources = [plan.data_cells[k].source for k in range(min(len(plan.data_cells), MAX_TRIALS))] if makes_data else []
-    most = min(PATIENCE, (limits or Limits()).wall_seconds or PATIENCE)
-    found = _in_process_of_its_own(_look, sources, job, seconds=most, stopping=stopping) or Look()
+    with TemporaryFolder() as folder:
+        returned, _, _ = call_alone(folder, _look, sources, job, limits, str(folder / "late"))
+    found: Look = returned or Look()
     if found.wrong:
         raise SpecError([plan.spec.problem(path, message) for path, message in found.wrong])
     success = plan.spec.canonical().get("success") or {}
     for path, message in (*found.odd, *_uncounted(found.returned, true_values({"content": cell.content}), success)):
         warn(str(plan.spec.problem(path, message)))
     return makes_data
-
-
-def _in_process_of_its_own(
-    function: Callable[..., Look], *given: Any, seconds: float, stopping: Callable[[], bool]
-) -> Look | None:
-    """Return what a function returns in another process; None if that ends, or takes too long."""
-    from joblib.externals.loky import ProcessPoolExecutor
-
-    pool, end = ProcessPoolExecutor(1), time.monotonic() + seconds
-    try:
-        future = pool.submit(_after_code, served(), function, given)
-        while time.monotonic() < end and not stopping():
-            with suppress(TimeoutError):
-                found: Look = future.result(timeout=0.1)
-                return found
-    except Exception:
-        pass
-    finally:
-        pool.shutdown(kill_workers=True)
-    return None
 
 
 def _uncounted(
@@ -117,16 +92,14 @@ def _uncounted(
 # In the other process
 
 
-def _after_code(code: Served, function: Callable[..., Look], given: tuple[Any, ...]) -> Look:
-    # What components print must not stand between the lines of a command's output.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    return function(*given)
-
-
-def _look(sources: list[SimulatedSource], job: Job) -> Look:
+def _look(sources: list[SimulatedSource], job: Job, limits: Limits, late: str) -> Look:
+    """Return what is seen of custom components on first data sets, within the limits of an estimate."""
     found = Look()
-    with warnings.catch_warnings():
+    if limits.wall_seconds is None:
+        limits = replace(limits, wall_seconds=PATIENCE)
+    with open(late, "wb") as watched, warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        limits.begin(watched)
         end = time.monotonic() + SLOW
         for source in sources:
             found.wrong.extend(_of_data(source))
@@ -134,6 +107,7 @@ def _look(sources: list[SimulatedSource], job: Job) -> Look:
                 break
         if not found.wrong:
             _of_estimators(job, found)
+        limits.end()
     return found
 
 

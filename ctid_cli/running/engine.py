@@ -6,54 +6,83 @@ estimate is reported as done after the journal has it safely.
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
-from ctid_cli.errors import DataError, MachineError, StorageError, UsageError
+from ctid_cli.errors import MachineError, RefusedError, StorageError
 from ctid_cli.processors import usable_processors
-from ctid_cli.running import events
-from ctid_cli.running.cell_precision import CellPrecision, as_needed, stored_precisions
-from ctid_cli.running.custom_check import check_components
-from ctid_cli.running.dispatch import GivenUp, Slow, Unable, run_jobs
-from ctid_cli.running.executor import Computed, Executor
-from ctid_cli.running.hindrances import advice
+from ctid_cli.running.first_data import check_first_data, compile_kernels
 from ctid_cli.running.job import Job
-from ctid_cli.running.key_set import KeySet
-from ctid_cli.running.limits import WATCHES_PROCESSES, Limits
-from ctid_cli.running.origins import current_origin
-from ctid_cli.running.pool import LokyPool
-from ctid_cli.running.retry import Stock, take_stock
+from ctid_cli.running.limits import Limits, advice
+from ctid_cli.running.plan import Plan, current_origin
+from ctid_cli.running.precision import CellPrecision, as_needed, stored_precisions
+from ctid_cli.running.states import States
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
-from ctid_cli.running.todo import Todo
+from ctid_cli.running.suspects import Course, GivenUp, Slow, Suspected
+from ctid_cli.running.workers import LocalWorkers
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.export import seal
 from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import EXPORT, FILE_NAME, Journal, open_journal
-from ctid_cli.storage.manifest import Key, Outcome, Slot, assemble
+from ctid_cli.storage.journal import FILE_NAME, Journal, open_journal
+from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.storage.merge import keep_readable as keep_readable_of
-
-if TYPE_CHECKING:
-    from ctid_cli.running.cells import Plan
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
 COMMIT_ESTIMATES = 200
-#: So many of the estimates that were given up are named at the end.
+#: Estimates given up that are named at the end.
 CULPRITS = 3
 
 _EXIT_CODES = {"SIGINT": 130, "SIGTERM": 143, MACHINE: MachineError.exit_code}
 #: Exit code after any other stop.
 STOPPED = 5
+
+
+class Workload(NamedTuple):
+    """What a run has to do."""
+
+    data_sets: int
+    estimates: int
+    #: Stored ones that stay, failures among those to compute, and stored ones of other plans.
+    reused: int
+    again: int
+    left_aside: int
+    #: Most data sets of a data cell, where it gets as many as a precision needs.
+    at_most: int | None = None
+
+    def __str__(self) -> str:
+        text = f"{_count(self.estimates, 'estimate')} of {_count(self.data_sets, 'data set')} to compute"
+        text += f", {self.again} of them once more" if self.again else ""
+        text += f", {self.reused} already stored" if self.reused else ""
+        text += f", {self.left_aside} stored ones set aside" if self.left_aside else ""
+        more = f", then in blocks until they are enough, {self.at_most} data sets of a cell at most"
+        return text + more if self.at_most is not None and self.estimates else text
+
+
+class Progress(NamedTuple):
+    """How far a run is; it is told when what it tells of is safely stored."""
+
+    #: Data sets, and estimates of this run that failed.
+    done: int
+    total: int
+    failed: int
+    #: Estimates that were stored since the last call.
+    stored: Sequence[Key] = ()
+    #: What else happened, as a sentence; empty for nothing.
+    message: str = ""
+    #: How well the data cells are known, where a block of data sets has just been finished.
+    precision: tuple[CellPrecision, ...] = ()
+
+
+def _ignore(progress: Progress) -> None:
+    """Take no notice."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +103,9 @@ class RunSummary:
     stopped_by: str | None
     #: How well each data cell is known; empty where the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()
-    #: Estimates that the machine did not let finish, and what was in their way.
-    given_up: int = 0
+    #: Estimator and replicate of estimates that the machine did not let finish, and what was in their way.
+    given_up: tuple[str, ...] = ()
     hindrance: str = ""
-    #: Estimator and replicate of the first of them.
-    culprits: tuple[str, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -87,18 +114,18 @@ class RunSummary:
 
     @property
     def exit_code(self) -> int:
-        """What a command should answer: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop.
+        """Exit code of a command: 0 if everything is stored, 130 or 143 after a signal, 5 after another stop.
 
         8 where the machine stood in the way.
         """
         return 0 if self.stopped_by is None else _EXIT_CODES.get(self.stopped_by, STOPPED)
 
     def machine_error(self) -> MachineError:
-        """What to say where the machine stood in the way."""
+        """Return what to say where the machine stood in the way."""
         text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
-        if self.culprits:
-            more = ", …" if self.given_up > len(self.culprits) else ""
-            text += f" ({', '.join(self.culprits)}{more})"
+        if self.given_up:
+            more = ", …" if len(self.given_up) > CULPRITS else ""
+            text += f" ({', '.join(self.given_up[:CULPRITS])}{more})"
         return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
 
 
@@ -107,33 +134,41 @@ def run_experiment(
     folder: Path,
     *,
     jobs: int | None = None,
-    on_event: events.OnEvent = events.ignore,
+    progress: Callable[[Progress], object] = _ignore,
+    warn: Callable[[str], object] = warnings.warn,
     fresh: bool = False,
     keep_readable: bool = False,
     allow_mixed: bool = False,
     stop: StopAt | None = None,
-    warm: Callable[[], float] | None = None,
-    executor: Callable[[Limits], Executor] | None = None,
     retry: Collection[str] = (),
+    dask: str | None = None,
+    warm: Callable[[Plan], object] = compile_kernels,
 ) -> RunSummary:
     """Compute the missing estimates of a plan and seal all of them.
 
-    An executor is made for the limits that it is to watch; by default `jobs` processes on this machine. Stored failures
-    of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
+    They are computed by `jobs` processes of this machine, or by the workers of the dask scheduler at an address. Stored
+    failures of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
     """
     begun = time.monotonic()
-    origin = current_origin(plan)
-    limits = Limits.of(plan.spec.canonical())
-    if limits.of_processes and not WATCHES_PROCESSES:
-        raise UsageError("limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere")
-    with StopRequest(stop) as stopping, ExitStack() as stack:
-        found = _look(plan, folder, origin, retry, fresh=fresh, allow_mixed=allow_mixed)
-        todo = Todo(found.plan, found.stock)
-        if todo.data_sets:
-            on_event(events.KernelsCompiling())
-            on_event(events.KernelsCompiled(warm() if warm else _compile_kernels(plan)))
-            if not check_components(plan, limits, stopping, lambda text: on_event(events.Warned(text))):
-                _check_first_records(todo)
+    stopping = StopRequest(stop)
+    origin, limits = current_origin(plan), Limits.of(plan.spec.canonical())
+    limits.require_support()
+    found = _look(plan, folder, origin, retry, limits, fresh=fresh, allow_mixed=allow_mixed)
+    missing = found.states.missing(found.plan)
+    if any(lacking.any() for lacking in missing):
+        # Until workers are at work, a signal ends the process as it ends any other.
+        warm(plan)
+        check_first_data(plan, found.states.jobs(found.plan, missing, {}), limits, warn)
+    with ExitStack() as stack:
+        workers: Any
+        if dask is None:
+            workers = LocalWorkers(jobs or usable_processors(), limits)
+        else:
+            from ctid_cli.running.dask_cluster import DaskWorkers
+
+            workers = DaskWorkers(dask, plan, origin, limits)
+        stack.callback(workers.close)
+        stack.enter_context(stopping)
         moved = place.move_aside(folder) if fresh else None
         with _writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -146,18 +181,15 @@ def run_experiment(
         stack.callback(log.close)
         if moved is not None and keep_readable:
             kept = keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)
-            on_event(events.Warned(f"{plan.experiment}: {kept}"))
-        workers = jobs or usable_processors()
-        computing = executor(limits) if executor else LokyPool(workers, limits)
-        stack.callback(computing.close)
+            warn(f"{plan.experiment}: {kept}")
         if found.state is None or log.state() != found.state:
-            found = _Found(as_needed(plan, log), take_stock(log, retry, limits))
-        run = _Run(found.plan, folder, log, found.stock, origin, on_event, computing)
+            found = _Found(as_needed(plan, log), States.read(log, retry, limits))
+        run = _Run(found, folder, log, origin, progress)
         stack.callback(place.retract, folder)
-        run.start({"jobs": workers, "limits": asdict(limits)})
-        run.compute(stopping)
-        while run.needs_more() and not stopping():
-            run.compute(stopping)
+        run.start({"jobs": workers.count, "limits": asdict(limits)})
+        run.compute(workers, limits, stopping)
+        while not stopping() and run.needs_more():
+            run.compute(workers, limits, stopping)
         return run.finish(stopping.reason, moved, begun)
 
 
@@ -166,40 +198,31 @@ class _Run:
 
     def __init__(
         self,
-        plan: Plan,
+        found: _Found,
         folder: Path,
         log: Journal,
-        stock: Stock,
         origin: Origin,
-        on_event: events.OnEvent,
-        executor: Executor,
+        progress: Callable[[Progress], object],
     ) -> None:
-        self.plan, self.folder, self.log, self.origin = plan, folder, log, origin
-        self.on_event, self.executor = on_event, executor
-        #: What is stored, which grows.
-        self.stock = stock
-        self.computed = self.done = self.total = self.failures = self.given_up = 0
+        self.plan, self.states, _ = found
+        self.folder, self.log, self.origin, self.progress = folder, log, origin, progress
+        self.computed = self.done = self.total = self.failures = 0
+        self.given_up: tuple[str, ...] = ()
         self.hindrance = ""
-        self.culprits: tuple[str, ...] = ()
         self.precision: tuple[CellPrecision, ...] = ()
+        #: Latest time of an estimate by data cell and estimator [s], and estimates left of the data sets in work.
+        self.seconds: dict[tuple[str, str], float] = {}
+        self.unfinished: dict[tuple[str, int], int] = {}
         self.started = now()
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Where the estimates of the plan belong, and what there is to compute."""
+        """Find what of the plan is to be computed."""
         self.manifest = self.plan.manifest()
-        self.planned = KeySet.planned(self.manifest)
-        self.cells: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-        self.estimators: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-        for parts, known in ((self.manifest["data_cells"], self.cells), (self.manifest["estimators"], self.estimators)):
-            for part in parts:
-                known[part["hash"]].append(part)
-        ready = _ready(self.plan, self.folder, self.stock)
-        # What this run has computed by now was not there when it began.
-        estimates, reused = ready.estimates + self.computed, ready.reused - self.computed
-        self.ready = replace(ready, estimates=estimates, reused=reused)
-        self.todo = Todo(self.plan, self.stock)
-        self.total += self.todo.data_sets
+        self.names = {part["hash"]: part["name"] for part in self.manifest["estimators"]}
+        self.missing = self.states.missing(self.plan)
+        self.work = _workload(self.plan, self.states, self.missing)
+        self.total = self.done + self.work.data_sets
 
     def start(self, circumstances: dict[str, Any]) -> None:
         spec = self.plan.spec
@@ -209,11 +232,10 @@ class _Run:
                 self.log.write_beside(name, text.encode())
         info = session_info(spec.text, spec.folder) | circumstances
         self.session = self.log.begin(self.manifest, self.origin, self.started, info)
-        self._announce()
-        self.on_event(self.ready)
+        self._tell(message=str(self.work))
 
     def needs_more(self) -> bool:
-        """Whether the finished block leaves data cells that are not known well enough; plan their next one."""
+        """Return whether the finished block leaves data cells that are not known well enough; plan their next one."""
         self.precision = stored_precisions(self.manifest, self.log)
         needed = tuple(cell.needed for cell in self.precision)
         if needed in ((), self.plan.replicates):
@@ -221,110 +243,105 @@ class _Run:
         self.plan = self.plan.with_replicates(needed)
         self._lay_out()
         self.log.replan(self.manifest)
-        self.on_event(events.BlockDone(self.total, self.precision))
+        self._tell(precision=self.precision)
         return True
 
-    def compute(self, stopping: StopRequest) -> None:
-        self.unfinished: dict[tuple[str, int], int] = {}
+    def compute(self, workers: Any, limits: Limits, stopping: StopRequest) -> None:
+        """Compute what is missing: store it and tell of it, in whichever order it comes."""
         batch: list[Outcome] = []
         since = time.monotonic()
         told = False
-        try:
-            for item in run_jobs(self._handed_out(), self.executor, stopping):
-                if stopping() and not told:
-                    told = True
-                    self.on_event(events.Stopping(stopping.reason or ""))
-                if isinstance(item, Computed):
-                    batch += item.outcomes
-                elif item is not None:
-                    self._note(item, stopping)
-                late = time.monotonic() - since >= COMMIT_SECONDS
-                if batch and (late or len(batch) >= COMMIT_ESTIMATES):
-                    self._commit(batch)
-                    batch = []
-                    if self.failures >= (stopping.at.failures or math.inf):
-                        stopping.ask(TOO_MANY_FAILURES)
-                if late:
-                    since = time.monotonic()
-            if batch:
+        course = Course(self._jobs(), workers, limits, stopping)
+        with closing(course.events()) as events:
+            try:
+                for event in events:
+                    if stopping() and not told:
+                        told = True
+                        what = "waiting for what is in work; once more to stop at once"
+                        self._tell(message=f"stopping ({stopping.reason}): {what}")
+                    if isinstance(event, list):
+                        batch += event
+                    elif event is not None:
+                        self._note(event, stopping)
+                    if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):
+                        batch = self._commit(batch)
+                        since = time.monotonic()
+                        if self.failures >= (stopping.at.failures or math.inf):
+                            stopping.ask(TOO_MANY_FAILURES)
+            except (MachineError, RefusedError):
+                # A cluster that is gone does not take with it what it has finished.
                 self._commit(batch)
-        except BaseException:
-            self.executor.stop()
-            raise
+                raise
+        self._commit(batch)
 
-    def _handed_out(self) -> Iterator[Job]:
-        for job in self.todo.jobs():
+    def _jobs(self) -> Iterator[Job]:
+        for job in self.states.jobs(self.plan, self.missing, self.seconds):
             self.unfinished[job.cell.hash, job.replicate] = len(job.wanted)
             yield job
 
-    def _slots(self, key: Key) -> Iterator[Slot]:
-        """Where an estimate belongs: two names of the same estimator share it."""
-        for estimator in self.estimators[key.estimator_hash]:
-            for cell in self.cells[key.data_hash]:
-                if key.start in estimator["starts"] and key.replicate < cell["replicates"]:
-                    yield Slot(key, cell, estimator)
-
-    def _note(self, item: events.WorkerDied | GivenUp | Slow | Unable, stopping: StopRequest) -> None:
-        """Take note of what is not a result."""
-        match item:
-            case events.WorkerDied():
-                self.on_event(item)
-            case GivenUp():
-                self.given_up += len(item.keys)
-                self.hindrance = item.reason
-                names = tuple(f"{self._name(key)} on replicate {key.replicate}" for key in item.keys)
-                self.culprits = (self.culprits + names)[:CULPRITS]
-                self.on_event(events.GivenUp(names, item.reason))
+    def _note(self, event: Suspected | GivenUp | Slow, stopping: StopRequest) -> None:
+        """Tell of what is not a result."""
+        match event:
+            case Suspected():
+                what = f"{_count(len(event.keys), 'estimate')} again, each in a process of its own"
+                self._tell(message=f"a worker process died; computing {what}")
             case Slow():
-                self.on_event(events.Slow(item.key.id, self._name(item.key), item.key.replicate, item.seconds))
-            case Unable():
-                self.hindrance = item.reason
-                stopping.ask(MACHINE)
+                took = f"{self._name(event.key)} has been in work for {event.seconds / 60:.0f} min"
+                self._tell(message=f"{took}; limits.wall_seconds would end what takes longer than it says")
+            case GivenUp():
+                names = tuple(map(self._name, event.keys))
+                self.given_up += names
+                self.hindrance = event.reason
+                if names:
+                    what = f"{_count(len(names), 'estimate')} given up, not stored ({', '.join(names[:CULPRITS])})"
+                    self._tell(message=f"{what}: {event.reason}")
+                else:
+                    stopping.ask(MACHINE)
 
     def _name(self, key: Key) -> str:
-        return str(next(self._slots(key)).estimator["name"])
+        return f"{self.names[key.estimator_hash]} on replicate {key.replicate}"
 
-    def _commit(self, batch: Sequence[Outcome]) -> None:
+    def _commit(self, batch: list[Outcome]) -> list[Outcome]:
+        """Store estimates, then tell of them; nothing is left of the batch."""
+        if not batch:
+            return batch
         self.log.add(batch, self.session)
         for outcome in batch:
-            self.stock.note(outcome.key, outcome.result["status"])
-        self.failures += sum(outcome.result["status"] in FAILURES for outcome in batch)
-        for data_set, found in groupby(batch, key=lambda outcome: outcome.key[:2]):
-            outcomes = list(found)
-            self.unfinished[data_set] -= len(outcomes)
+            key, status = outcome.key, outcome.result["status"]
+            self.states.note(key, status)
+            self.failures += status in FAILURES
+            self.seconds[key.data_hash, key.estimator_hash] = outcome.seconds or 0.0
+            data_set = key.data_hash, key.replicate
+            self.unfinished[data_set] -= 1
             if not self.unfinished[data_set]:
                 del self.unfinished[data_set]
                 self.done += 1
-            self.computed += len(outcomes)
-            rows = tuple(
-                assemble(slot, self.manifest, outcome.result, outcome.seconds, outcome.cpu_seconds)
-                for outcome in outcomes
-                for slot in self._slots(outcome.key)
-            )
-            self.on_event(events.EstimatesDone(self.done, self.total, rows))
-        self._announce()
+        self.computed += len(batch)
+        self._tell(stored=[outcome.key for outcome in batch])
+        return []
 
-    def _announce(self) -> None:
+    def _tell(self, **what: Any) -> None:
         place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
+        self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        self.on_event(events.Sealed(self.folder / EXPORT, *seal(self.folder, self.log)))
-        failed = self.planned.count_in(self.stock.failed)
-        missing = self.ready.estimates - self.computed
+        seal(self.folder, self.log)
+        counts = self.states.counts(self.plan)
+        missing = counts.planned - counts.reused
         reason = reason or (MACHINE if self.given_up else None)
         stopped, ended = now(), "finished" if not missing else reason or "unfinished"
-        counts = {
-            "planned": len(self.planned),
-            "reused": self.ready.reused,
+        told = {
+            "planned": counts.planned,
+            "reused": counts.reused - self.computed,
             "computed": self.computed,
-            "failed": failed,
+            "failed": counts.failed,
         }
         self.log.end(self.session, stopped, ended)
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,
-            **counts,
-            left_aside=self.ready.left_aside,
+            **told,
+            left_aside=self.work.left_aside,
             mixed=len(self.log.origins()) > 1,
             moved_aside=moved,
             seconds=time.monotonic() - begun,
@@ -332,39 +349,32 @@ class _Run:
             precision=self.precision,
             given_up=self.given_up,
             hindrance=self.hindrance,
-            culprits=self.culprits,
         )
 
 
 def preview(
     plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
-) -> events.PlanReady:
-    """What a run would do, without doing or writing anything."""
-    found = _look(plan, folder, current_origin(plan), retry, fresh=fresh, allow_mixed=allow_mixed)
-    needed = found.plan
-    if len(found.stock.keys):
-        return _ready(needed, folder, found.stock)
-    # Of a million data sets, counting is quicker than naming.
-    counts = (needed.data_sets, needed.data_sets * needed.distinct_each, 0, 0)
-    return events.PlanReady(plan.experiment, folder, *counts, at_most=plan.monte_carlo.get("at_most"))
+) -> Workload:
+    """Return what a run would do, without doing or writing anything."""
+    limits = Limits.of(plan.spec.canonical())
+    found = _look(plan, folder, current_origin(plan), retry, limits, fresh=fresh, allow_mixed=allow_mixed)
+    return _workload(found.plan, found.states, found.states.missing(found.plan))
 
 
-def _ready(plan: Plan, folder: Path, stock: Stock) -> events.PlanReady:
-    """What there is to do, in numbers."""
-    planned = KeySet.planned(plan.manifest())
-    stored, again = planned.count_in(stock.keys), planned.count_in(stock.again)
-    reused = stored - again
-    counts = (Todo(plan, stock).data_sets, len(planned) - reused, reused, len(stock.keys) - stored)
-    at_most = plan.monte_carlo.get("at_most")
-    return events.PlanReady(plan.experiment, folder, *counts, at_most=at_most, again=again)
+def _workload(plan: Plan, states: States, missing: Sequence[Any]) -> Workload:
+    counts = states.counts(plan)
+    stored = counts.reused + counts.again
+    data_sets, at_most = sum(int(lacking.sum()) for lacking in missing), plan.monte_carlo.get("at_most")
+    return Workload(
+        data_sets, counts.planned - counts.reused, counts.reused, counts.again, states.stored - stored, at_most
+    )
 
 
-@dataclass(frozen=True)
-class _Found:
+class _Found(NamedTuple):
     """A plan as far as it is decided by what is stored, and that."""
 
     plan: Plan
-    stock: Stock
+    states: States
     #: State of the journal that tells it.
     state: str | None = None
 
@@ -374,61 +384,20 @@ def _look(
     folder: Path,
     origin: Origin,
     retry: Collection[str],
+    limits: Limits,
     *,
     fresh: bool,
     allow_mixed: bool,
 ) -> _Found:
-    """What there is in a folder that a plan may be run into."""
+    """Read what there is in a folder that a plan may be run into."""
     if fresh or not folder.exists():
-        return _Found(plan, Stock())
+        return _Found(plan, States())
     with place.lock(folder, shared=True):
         place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
             if log is None:
-                return _Found(plan, Stock())
-            stock = take_stock(log, retry, Limits.of(plan.spec.canonical()))
-            return _Found(as_needed(plan, log), stock, log.state())
-
-
-def _check_first_records(todo: Todo) -> None:
-    """Refuse a plan whose first data sets no estimator can use, before anything is written.
-
-    One record in a thousand that cannot be used is a result; the very first one is a mistake in the specification.
-    """
-    for job in itertools.takewhile(lambda job: not job.replicate, todo.jobs()):
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                data = job.cell.dataset(job.replicate)
-                for estimator in {id(cell): cell for _, cell, _ in job.wanted}.values():
-                    estimator.estimator.prepare(data.record)
-        except DataError:
-            raise
-        except Exception:
-            # Any other failure is for the worker to record, with its place in the code.
-            continue
-
-
-def _compile_kernels(plan: Plan) -> float:
-    from ctid_cli.estimation.compilation import compile_kernels
-    from ctid_cli.signals.sampling import RegularSampling
-    from ctid_cli.simulation.components import CustomEstimation
-    from ctid_cli.simulation.frequency_measures import FrequencyEstimation, SignalSource
-
-    source = plan.data_cells[0].source
-    if not isinstance(source, SignalSource):
-        ours = [cell.estimator for cell in plan.estimators if not isinstance(cell.estimator, CustomEstimation)]
-        clocks = [
-            (getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells
-        ]
-        # A clock that is not known before the data are read is taken as regular.
-        kinds = {(isinstance(clock, RegularSampling | None), loop is not None) for clock, loop in clocks}
-        return sum(compile_kernels(ours, regular=regular, closed=closed) for regular, closed in sorted(kinds))
-    begun = time.perf_counter()
-    for cell in plan.estimators:
-        if isinstance(cell.estimator, FrequencyEstimation):
-            cell.estimator.compile(source.sampling.interval)
-    return time.perf_counter() - begun
+                return _Found(plan, States())
+            return _Found(as_needed(plan, log), States.read(log, retry, limits), log.state())
 
 
 @contextmanager
@@ -438,3 +407,7 @@ def _writing(folder: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or error
         raise StorageError(f"{folder} cannot be written ({reason}); stored estimates are untouched") from error
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

@@ -1,24 +1,42 @@
-"""What one estimate may take of the machine, and how much a process has taken so far."""
+"""What one estimate may take of the machine, and what the machine may lack.
+
+Limits are those of the operating system, which keeps them whatever the estimator does, in Python or in C: a timer of
+processor time, a watchdog that ends the process after some wall time, and a limit of memory that lets allocations fail.
+"""
 
 from __future__ import annotations
 
+import errno
+import faulthandler
 import os
+import re
+import resource
+import signal
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, BinaryIO, Self
 
-#: Whether the processor time and memory of another process can be read here.
-WATCHES_PROCESSES = sys.platform == "linux"
+from ctid_cli.errors import UsageError
+
 _MEGABYTE = 1e6
+#: Least time that a limit is set to [s]: zero would be none.
+_LEAST = 1e-3
+#: Errors of the operating system that another machine, or another moment, would not have.
+SHORTAGES = frozenset(
+    getattr(errno, name)
+    for name in ("EMFILE", "ENFILE", "ENOMEM", "EAGAIN", "ENOSPC", "EDQUOT", "EIO", "ENOLCK", "ESTALE", "ENOBUFS")
+    if hasattr(errno, name)
+)
 
 
 @dataclass(frozen=True)
 class Limits:
     """Limits of a single estimate; None where there is none."""
 
-    #: Processor time, and time [s].
+    #: Processor time, and wall time [s].
     cpu_seconds: float | None = None
     wall_seconds: float | None = None
     #: Memory beyond what the process held before [MB].
@@ -26,63 +44,95 @@ class Limits:
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Self:
-        """The limits in the canonical form of a specification, or in what is known of a run."""
+        """Read the limits in the canonical form of a specification, or in what is known of a run."""
         return cls(**(content.get("limits") or {}))
 
-    def __bool__(self) -> bool:
-        return self != Limits()
+    def require_support(self) -> None:
+        """Refuse limits that this operating system does not keep."""
+        if sys.platform != "linux" and (self.cpu_seconds or self.memory_mb):
+            raise UsageError(
+                "limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere"
+            )
 
     def rose_since(self, other: Limits, status: str) -> bool:
-        """Whether an estimate that ended with a status under other limits may take more now."""
+        """Return whether an estimate that ended with a status under other limits may take more now."""
         names = {"TIMEOUT": ("cpu_seconds", "wall_seconds"), "MEMORY": ("memory_mb",)}.get(status, ())
         pairs = [(getattr(other, name), getattr(self, name)) for name in names]
         return any(old is not None and (new is None or new > old) for old, new in pairs)
 
-    def allows(self, size: float) -> bool:
-        """Whether so much memory may be asked for [bytes]."""
-        return self.memory_mb is None or size <= self.memory_mb * _MEGABYTE
+    def begin(self, watched: BinaryIO | None, spent: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Set the limits for what this process does next; a wall time that is over is noted in a file."""
+        if self.wall_seconds is not None and watched is not None:
+            faulthandler.dump_traceback_later(max(self.wall_seconds - spent[0], _LEAST), exit=True, file=watched)
+        if self.cpu_seconds is not None:
+            # Unlike RLIMIT_CPU it counts from now on, in fractions of a second, and is not what a batch system sets.
+            signal.setitimer(signal.ITIMER_PROF, max(self.cpu_seconds - spent[1], _LEAST))
+        if self.memory_mb is not None:
+            _limit_memory(_data_bytes() + int(self.memory_mb * _MEGABYTE))
 
-    @property
-    def of_processes(self) -> bool:
-        """Whether the processor or the memory is limited."""
-        return self.cpu_seconds is not None or self.memory_mb is not None
+    def end(self) -> None:
+        """Take the limits back."""
+        if self.wall_seconds is not None:
+            faulthandler.cancel_dump_traceback_later()
+        if self.cpu_seconds is not None:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+        if self.memory_mb is not None:
+            _limit_memory(None)
 
-    def exceeded(self, wall: float, cpu: float, memory: float) -> tuple[Literal["time", "memory"], str] | None:
-        """The limit that was exceeded, ``time`` or ``memory``, and a sentence; memory in bytes."""
-        if self.wall_seconds is not None and wall > self.wall_seconds:
-            return "time", f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
-        if self.cpu_seconds is not None and cpu > self.cpu_seconds:
-            return "time", f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
-        return None if self.allows(memory) else ("memory", self.too_much())
+    def too_late(self, *, wall: bool) -> str:
+        """Return what is said of an estimate that needs more time than it may have."""
+        if wall:
+            return f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
+        return f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
 
     def too_much(self) -> str:
-        """What is said of an estimate that needs more memory than it may have."""
+        """Return what is said of an estimate that needs more memory than it may have."""
         return f"needed more than {self.memory_mb:g} MB (limits.memory_mb)"
 
 
-@dataclass(frozen=True)
-class Usage:
-    """What a process has used of its own since it began."""
-
-    #: Processor time, that of finished child processes included [s].
-    cpu: float
-    #: Memory that is not shared with files [bytes].
-    memory: float
-
-    def __sub__(self, other: Usage) -> Usage:
-        return Usage(self.cpu - other.cpu, self.memory - other.memory)
+def _data_bytes() -> int:
+    """Return the private memory of this process, which RLIMIT_DATA counts; the code of libraries is not in it."""
+    return int(Path("/proc/self/statm").read_bytes().split()[5]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def usage(process: int | str) -> Usage | None:
-    """What a process uses, by its number or ``self``; None if that cannot be known, or if it is gone."""
-    if not WATCHES_PROCESSES:
-        return None
-    place = Path("/proc") / str(process)
-    try:
-        # The name of the program, in brackets, may hold anything.
-        times = (place / "stat").read_bytes().rpartition(b")")[2].split()[11:15]
-        lines = dict(line.split(b":", 1) for line in (place / "status").read_bytes().splitlines())
-    except (OSError, ValueError):
-        return None
-    kilobytes = sum(int(lines[name].split()[0]) for name in (b"RssAnon", b"RssShmem", b"VmSwap") if name in lines)
-    return Usage(sum(map(int, times)) / os.sysconf("SC_CLK_TCK"), 1024.0 * kilobytes)
+@cache
+def _given_memory() -> tuple[int, int]:
+    """Return the limit of memory that this process began with, and the most that it may be."""
+    return resource.getrlimit(resource.RLIMIT_DATA)
+
+
+def _limit_memory(size: int | None) -> None:
+    given, hard = _given_memory()
+    within = given if size is None else size if given == resource.RLIM_INFINITY else min(size, given)
+    resource.setrlimit(resource.RLIMIT_DATA, (within, hard))
+
+
+def shortage(error: BaseException) -> BaseException | None:
+    """Return the exception that tells what the machine was short of; None if there is none behind an error."""
+    seen: BaseException | None = error
+    while seen is not None:
+        if isinstance(seen, MemoryError) or (isinstance(seen, OSError) and seen.errno in SHORTAGES):
+            return seen
+        seen = seen.__cause__ or seen.__context__
+    return None
+
+
+_FEWER = "use fewer worker processes (--jobs)"
+#: What a reason mentions, and what helps.
+_ADVICE = (
+    (
+        r"SIGKILL|[Oo]ut of memory|Cannot allocate",
+        f"the machine was probably out of memory: {_FEWER}, close other programs, or give limits: {{memory_mb: …}} in "
+        "the specification, so that what needs more is a failure of its estimator",
+    ),
+    (r"Too many open files", f"raise the number of open files ('ulimit -n 4096'), or {_FEWER}"),
+    (r"Resource temporarily unavailable|can't start new thread", f"raise the number of processes, or {_FEWER}"),
+    (r"No space left|[Dd]isk quota", "make room on the disk, also that of temporary files (TMPDIR)"),
+    (r"SIGXCPU", "raise the limit of processor time of this shell or batch job ('ulimit -t')"),
+)
+_ANY = f"look whether something ends processes here, {_FEWER}, or try another machine"
+
+
+def advice(reason: str) -> str:
+    """Return what helps against something that stood in the way of estimates."""
+    return next((text for pattern, text in _ADVICE if re.search(pattern, reason)), _ANY)

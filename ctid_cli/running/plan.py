@@ -1,18 +1,26 @@
-"""From a specification to the data sets and estimates that it asks for."""
+"""Plans: the data sets that a specification asks for, and the estimates wanted of each."""
+
+from __future__ import annotations
 
 import dataclasses
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ctid_cli.arrays import BoolArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import KINDS
-from ctid_cli.running.cells import DataCell, DataCells, EstimatorCell, Plan, starts_of
+from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.running.job import DataCell, EstimatorCell, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import NO_START, DataSet, Source, located
+from ctid_cli.simulation.dataset import NO_START, DataSet, SimulatedSource, Source, StartPoint, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
@@ -20,9 +28,170 @@ from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
+from ctid_cli.storage.identity import Origin, code_version, modules_of, origin_of
+from ctid_cli.storage.manifest import Key, Manifest, Shard
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
 MAX_DATA_SETS = 1_000_000
+
+
+class DataCells(Sequence[DataCell]):
+    """The data cells of a plan; very many of them are made when they are asked for."""
+
+    #: So many are made at once, so that what is wrong with any of them is said at once.
+    FEW = 1000
+
+    def __init__(self, count: int, make: Callable[[int], DataCell]) -> None:
+        self._make = make
+        self._made: list[DataCell | None] = [None] * count
+        for number in range(count if count <= self.FEW else 1):
+            self._made[number] = make(number)
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    def __getitem__(self, item: int) -> DataCell:  # type: ignore[override]  # nobody takes a part of them
+        found = self._made[item]
+        if found is None:
+            found = self._made[item] = self._make(item % len(self))
+        return found
+
+
+@dataclass(frozen=True)
+class Task:
+    """One data set."""
+
+    cell: int
+    replicate: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All data sets and estimates of an experiment."""
+
+    spec: Spec
+    data_cells: Sequence[DataCell]
+    estimators: tuple[EstimatorCell, ...]
+    starts: tuple[StartPoint, ...]
+    #: Number of data sets of each data cell.
+    replicates: tuple[int, ...]
+    spec_hash: str
+    #: Whose data sets are computed; None for all.
+    shard: Shard | None = None
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment."""
+        return self.spec.experiment
+
+    @cached_property
+    def monte_carlo(self) -> Mapping[str, Any]:
+        """The section on the number of data sets and their seed; empty where nothing is random."""
+        return self.spec.canonical().get("monte_carlo") or {}
+
+    @property
+    def runs(self) -> int:
+        """Number of data sets of the data cell that has most."""
+        return max(self.replicates)
+
+    def asked(self, cell: int) -> BoolArray:
+        """Return which replicates of a data cell are asked for: all, or those of the shard."""
+        own, shard, cells = self.replicates[cell], self.shard, len(self.data_cells)
+        if shard is None:
+            return np.ones(own, dtype=bool)
+        return np.array([shard.has(cell, replicate, cells) for replicate in range(own)], dtype=bool)
+
+    def tasks(self) -> list[Task]:
+        """Return the data sets that are asked for, replicate by replicate."""
+        asked = [self.asked(cell) for cell in range(len(self.data_cells))]
+        return [
+            Task(cell, replicate)
+            for replicate in range(self.runs)
+            for cell, some in enumerate(asked)
+            if replicate < len(some) and some[replicate]
+        ]
+
+    @property
+    def data_sets(self) -> int:
+        """Number of data sets."""
+        return int(sum(self.asked(cell).sum() for cell in range(len(self.data_cells))))
+
+    @property
+    def estimates_each(self) -> int:
+        """Number of estimates of every data set."""
+        return len(self.keys(Task(0, 0)))
+
+    def with_replicates(self, replicates: Sequence[int]) -> Plan:
+        """Return the plan with other numbers of data sets."""
+        return dataclasses.replace(self, replicates=tuple(replicates))
+
+    def part(self, shard: Shard) -> Plan:
+        """Return the part of the plan that one shard computes."""
+        section = self.spec.monte_carlo
+        if section is not None and section.until is not None:
+            raise UsageError(
+                f"{self.experiment}: monte_carlo.until decides on all data sets together, and no shard sees those of "
+                f"the others; give their number, for example --runs {section.most}. After the merge, ctid run without "
+                "--shard and --runs takes as many of them as the precision needs"
+            )
+        return dataclasses.replace(self, shard=shard)
+
+    def keys(self, task: Task) -> list[Wanted]:
+        """Return the estimates wanted of a data set."""
+        data_hash = self.data_cells[task.cell].hash
+        return [
+            (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
+            for cell in self.estimators
+            for start in starts_of(cell.estimator.start_from, self.starts)
+        ]
+
+    @cached_property
+    def terms(self) -> tuple[Term, ...] | None:
+        """Structure of the submodels that estimates of one fraction are also given as; None for none.
+
+        That of the simulated system, by rising natural frequency, or else of the first estimator of submodels.
+        """
+        cell = self.data_cells[0].source
+        if isinstance(cell, SimulatedSource) and isinstance(cell.system, AdditiveModel):
+            return cell.system.sorted().terms
+        found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
+        return next((tuple(terms) for terms in found if terms is not None), None)
+
+    def manifest(self) -> Manifest:
+        """Return the plan as plain data."""
+        canonical, wanted = dict(self.spec.canonical()), self.keys(Task(0, 0))
+        # Limits end estimates; they are no part of what the results are of.
+        canonical.pop("limits", None)
+        return {
+            "experiment": self.experiment,
+            "runs": self.runs,
+            "seed": self.monte_carlo.get("seed"),
+            "spec_hash": self.spec_hash,
+            "spec": canonical,
+            "success": canonical.get("success"),
+            "data_cells": [
+                {"hash": cell.hash, "replicates": own, "swept": dict(cell.swept), "content": cell.content}
+                for cell, own in zip(self.data_cells, self.replicates, strict=True)
+            ],
+            "estimators": [
+                {
+                    "name": cell.name,
+                    "kind": cell.kind,
+                    "hash": cell.hash,
+                    "swept": dict(cell.swept),
+                    "content": cell.content,
+                    "starts": [start.label for _, other, start in wanted if other is cell],
+                }
+                for cell in self.estimators
+            ],
+            "starts": {start.label: start.initial_delay for start in self.starts},
+            **({} if self.shard is None else {"shard": [self.shard.number, self.shard.of]}),
+        }
+
+
+def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPoint, ...]:
+    """Return the starts that an estimator which takes one of a kind begins from."""
+    return tuple(start for start in starts if start.of == kind) or (NO_START,)
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
@@ -212,3 +381,19 @@ def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
     if content.get("monte_carlo") is not None:
         content["monte_carlo"] = {"seed": content["monte_carlo"]["seed"]}
     return content
+
+
+def current_origin(plan: Plan) -> Origin:
+    """Return where the estimates of a plan would come from now."""
+    return origin_of(*computing_parts(plan))
+
+
+def current_version(plan: Plan) -> str:
+    """Return the code version of these estimates, on whichever processor."""
+    return code_version(set().union(*map(modules_of, computing_parts(plan))))
+
+
+def computing_parts(plan: Plan) -> list[Any]:
+    """Return what computes the estimates of a plan: the source of its data sets, and its estimators."""
+    # All data cells are made by the same classes; only the values of their fields differ.
+    return [plan.data_cells[0].source, *(cell.estimator for cell in plan.estimators)]

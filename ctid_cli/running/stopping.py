@@ -1,6 +1,5 @@
 """Requests to stop: an interrupt (Ctrl-C), a termination signal, an event set by the caller, a budget of time."""
 
-import os
 import signal
 import threading
 import time
@@ -9,7 +8,6 @@ from types import FrameType, TracebackType
 from typing import Any, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
 
 #: Reasons that are neither signals nor the caller's event.
 TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
@@ -21,23 +19,22 @@ class StopAt:
 
     #: Set by the caller.
     event: threading.Event | None = None
-    #: So many estimates of this run that failed.
+    #: Number of estimates of this run that failed.
     failures: int | None = None
-    #: So long after its beginning [s].
+    #: Time after its beginning [s].
     seconds: float | None = None
 
 
 class StopRequest:
-    """Notices requests to stop while it is entered.
+    """Notices requests to stop; signals, while it is entered.
 
-    The first signal is only noted, so that what is finished can be stored. The second ends the process at once, as if
-    nobody had listened; the workers end with it, and the journal is made for that.
+    The first signal is only noted, so that what is in work can be finished and stored. The second ends the process at
+    once, as if nobody had listened; the workers end with it, and the journal is made for that.
     """
 
     def __init__(self, at: StopAt | None = None) -> None:
         self.at = at or StopAt()
         self._deadline = None if self.at.seconds is None else time.monotonic() + self.at.seconds
-        self._signal: signal.Signals | None = None
         self._reason: str | None = None
         self._before: dict[signal.Signals, Any] = {}
 
@@ -55,21 +52,17 @@ class StopRequest:
             signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self._signal is None:
-            self._signal = signal.Signals(number)
-            return
-        signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)
+        self.ask(signal.Signals(number).name)
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
 
     def ask(self, reason: str) -> None:
         """Ask for a stop; the first reason counts."""
         self._reason = self._reason or reason
 
     def __call__(self) -> bool:
-        """Whether a stop was asked for."""
-        if self._signal is not None:
-            self.ask(self._signal.name)
-        elif self.at.event is not None and self.at.event.is_set():
+        """Return whether a stop was asked for."""
+        if self.at.event is not None and self.at.event.is_set():
             self.ask("stop")
         elif self._deadline is not None and time.monotonic() > self._deadline:
             self.ask(TIME_BUDGET)

@@ -12,8 +12,7 @@ from typing import Any
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
 from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
-from ctid_cli.running.cells import Plan
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.text import did_you_mean
 

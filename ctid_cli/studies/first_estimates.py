@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctid_cli.reporting.results import read_results
-from ctid_cli.running.cells import Plan
 from ctid_cli.running.engine import run_experiment
+from ctid_cli.running.plan import Plan
 from ctid_cli.studies.catalogue import StudyFolder
 from ctid_cli.written_files import write_file
 

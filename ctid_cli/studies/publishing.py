@@ -11,8 +11,7 @@ from pathlib import Path
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.layout import csv_text
 from ctid_cli.reporting.study import data_folder
-from ctid_cli.running.origins import current_version
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.status import public_sessions
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part

@@ -12,7 +12,7 @@ import numpy as np
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import Results
-from ctid_cli.running.cells import DataCell, EstimatorCell
+from ctid_cli.running.job import DataCell, EstimatorCell
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
 

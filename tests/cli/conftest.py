@@ -4,9 +4,8 @@ import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.running import engine
-from ctid_cli.running.executor import Computed, Done
-from ctid_cli.running.job import run_job
-from ctid_cli.storage.manifest import Outcome
+from ctid_cli.running.job import Begun, run_job
+from ctid_cli.running.workers import Ending
 
 TINY = """\
 experiment: tiny
@@ -41,33 +40,26 @@ def record_text(samples=300):
 
 
 class Here:
-    """An executor that computes in this process: for tests of what is computed, not of how processes are treated."""
+    """Workers in this process: for tests of what is computed, not of how processes are treated."""
 
-    def __init__(self, workers, limits):
-        self.messages = []
+    count = 1
 
-    @property
-    def room(self):
-        return 0 if self.messages else 1
-
-    def submit(self, job, *, alone=False):
-        self.messages = [Computed(job, [found]) for found in run_job(job) if isinstance(found, Outcome)] + [Done(job)]
-
-    def collect(self, seconds):
-        told, self.messages = self.messages, []
-        return told
-
-    def stop(self):
+    def __init__(self, count, limits):
         pass
 
-    close = stop
+    def results(self, jobs, stopping):
+        for job in jobs:
+            yield job, Ending([entry for entry in run_job(job) if not isinstance(entry, Begun)])
+
+    def close(self):
+        pass
 
 
 @pytest.fixture(scope="module")
 def without_workers():
     """Runs compute in the process of the test."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine, "LokyPool", Here)
+        patch.setattr(engine, "LocalWorkers", Here)
         yield
 
 

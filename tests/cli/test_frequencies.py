@@ -36,17 +36,6 @@ def estimates(ctid, beat):
     return json.loads(ctid("export", "beat", "--format", "json", "--out", beat).stdout)
 
 
-def test_run_reports_measures_as_events(ctid, tmp_path):
-    (tmp_path / "beat.yaml").write_text(SPEC, encoding="utf-8")
-    options = ("--runs", 1, "--jobs", 1, "--json", "--out", tmp_path / "results")
-    lines = ctid("run", tmp_path / "beat.yaml", "--set", "disturbance=none", *options).stdout.splitlines()
-    rows = [event for event in map(json.loads, lines) if event.get("event") == "estimate"]
-    assert len(rows) == 4
-    for row in rows:
-        assert row["measures"]["omega_2"] == pytest.approx(3.0, abs=0.1)
-        assert "track" not in row
-
-
 def test_export_has_every_measure_of_every_estimate(ctid, beat, estimates):
     assert len(estimates) == 2 * 3 * 4
     by_id = {row["id"]: row for row in estimates}

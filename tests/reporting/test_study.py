@@ -9,8 +9,7 @@ from ctid_cli.reporting.percentages import pooled_rows, study_rows
 from ctid_cli.reporting.study import data_folder, load_study
 from ctid_cli.reporting.table_blocks import study_blocks
 from ctid_cli.reporting.tables import build_tables
-from ctid_cli.running.origins import current_version
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import load_spec
 from experiments.useful_redundancy.tables import failures, searches
 

@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.running.cells import Plan, Task
 from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.plan import Plan, Task
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.manifest import Key, Outcome, Shard
 
@@ -196,7 +196,7 @@ class FakePlan:
 
     terms = None
     shard: Shard | None = None
-    manifest, runs, tasks, distinct_each = Plan.manifest, Plan.runs, Plan.tasks, Plan.distinct_each
+    manifest, runs, tasks, asked = Plan.manifest, Plan.runs, Plan.tasks, Plan.asked
     data_sets, monte_carlo = Plan.data_sets, Plan.monte_carlo
 
     def __init__(

@@ -8,8 +8,7 @@ import sys
 from pathlib import Path
 
 from ctid_cli.errors import CtidError
-from ctid_cli.running import events
-from ctid_cli.running.engine import run_experiment
+from ctid_cli.running.engine import Progress, run_experiment
 from tests.running.fakes import FakePlan, Toy
 
 
@@ -17,11 +16,11 @@ def plan(seconds: float = 0.02, runs: int = 20) -> FakePlan:
     return FakePlan(Toy(seconds=seconds), Toy(order=3, mischief="raise", at=4), runs=runs)
 
 
-def report(event: events.Event) -> None:
-    if isinstance(event, events.EstimatesDone):
-        print(*[row["id"] for row in event.rows], flush=True)
-    elif isinstance(event, events.PlanReady):
+def report(progress: Progress) -> None:
+    if progress.message.endswith("to compute") or "already stored" in progress.message:
         print("ready", flush=True)
+    if progress.stored:
+        print(*[key.id for key in progress.stored], flush=True)
 
 
 def main() -> int:
@@ -42,7 +41,7 @@ def main() -> int:
     if options.shard:
         toys = toys.part(*map(int, options.shard.split("/")))
     try:
-        summary = run_experiment(toys, options.folder, jobs=options.jobs, on_event=report, warm=lambda: 0.0)
+        summary = run_experiment(toys, options.folder, jobs=options.jobs, progress=report, warm=lambda plan: None)
     except CtidError as error:
         print(error, file=sys.stderr)
         return error.exit_code

@@ -10,6 +10,7 @@ from ctid_cli.errors import RefusedError, SpecError
 from ctid_cli.running.custom_check import check_components
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.job import Job
+from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.estimates import read_stored
@@ -90,7 +91,7 @@ def jobs(plan):
 
 def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(folder, tmp_path, capfd):
     plan = planned(folder)
-    summary = run_experiment(plan, tmp_path / "out", jobs=2, warm=lambda: 0.0)
+    summary = run_experiment(plan, tmp_path / "out", jobs=2, warm=lambda plan: None)
     assert capfd.readouterr().out == ""
     stored = read_stored(tmp_path / "out")
     results = {
@@ -116,11 +117,11 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
 
     # Nothing is left to do, whatever is said in comments; other numbers are other results.
     (folder / "level.py").write_text("LEVEL = 0.5  # of the noise\n", encoding="utf-8")
-    assert run_experiment(planned(folder), tmp_path / "out", warm=lambda: 0.0).computed == 0
+    assert run_experiment(planned(folder), tmp_path / "out", warm=lambda plan: None).computed == 0
     before = {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir() if file.is_file()}
     (folder / "level.py").write_text("LEVEL = 0.6\n", encoding="utf-8")
     with pytest.raises(RefusedError, match="results of other code"):
-        run_experiment(planned(folder), tmp_path / "out", warm=lambda: 0.0)
+        run_experiment(planned(folder), tmp_path / "out", warm=lambda plan: None)
     assert {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir() if file.is_file()} == before
     # Results are read without the code.
     os.unlink(folder / "parts.py")
@@ -138,7 +139,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
 def test_what_shows_on_the_first_data_set_is_said_before_the_run(changes, place, words, folder):
     plan = planned(folder, *changes)
     with pytest.raises(SpecError) as caught:
-        check_components(plan)
+        check_components(plan, Limits(), print)
     assert f"spec.yaml:{place}" in str(caught.value)
     assert words in str(caught.value)
 
@@ -165,11 +166,11 @@ RULE = ("seed: 5}", "seed: 5}\nsuccess: {delay_relative_error: 0.1}")
 )
 def test_what_is_odd_on_the_first_data_set_is_a_warning(changes, at, words, folder):
     heard = []
-    assert check_components(planned(folder, *changes), warn=heard.append)
+    assert check_components(planned(folder, *changes), Limits(), heard.append)
     for text, expected in zip(heard, words, strict=True):
         assert at in text
         assert expected in text
 
 
 def test_a_component_that_ends_the_process_is_left_to_the_run(folder):
-    assert check_components(planned(folder, ("[raise, die, nan]", "always")))
+    assert check_components(planned(folder, ("[raise, die, nan]", "always")), Limits(), print)

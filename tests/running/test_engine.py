@@ -18,21 +18,17 @@ from typing import Any
 import pytest
 
 from ctid_cli.errors import DataError, RefusedError, StorageError
-from ctid_cli.running import engine, events
-from ctid_cli.running.engine import RunSummary, preview, run_experiment
-from ctid_cli.running.job_order import JobQueue
-from ctid_cli.running.origins import current_origin
-from ctid_cli.running.plan import build_plan
-from ctid_cli.running.retry import Stock
+from ctid_cli.running import engine
+from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
+from ctid_cli.running.plan import build_plan, current_origin
+from ctid_cli.running.states import States
 from ctid_cli.running.stopping import StopAt
-from ctid_cli.running.todo import Todo
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder
-from ctid_cli.storage.columns import no_result
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import read_journal
-from ctid_cli.storage.manifest import Key, Outcome, slots
+from ctid_cli.storage.manifest import Key, slots
 from ctid_cli.storage.status import experiment_status
 from tests.running import run_toys
 from tests.running.fakes import FakePlan, Toy
@@ -41,7 +37,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(plan: Any, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
-    return run_experiment(plan, place, jobs=jobs, warm=lambda: 0.0, **options)
+    return run_experiment(plan, place, jobs=jobs, warm=lambda plan: None, **options)
 
 
 def sealed(place: Path) -> bytes:
@@ -119,17 +115,14 @@ def test_sealed_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path) -> None:
     assert sealed(tmp_path / "one") == sealed(tmp_path / "two") == sealed(tmp_path / "shuffled")
 
 
-def test_the_longest_of_a_replicate_comes_first_and_the_last_replicate_is_split() -> None:
-    plan = FakePlan(runs=3, levels=(1, 2, 3))
-    queue = JobQueue(Todo(plan, Stock()).jobs())  # type: ignore[arg-type]
-    taken: list[tuple[int, float, int]] = []
-    while queue:
-        job = queue.pop()
-        taken.append((job.replicate, job.cell.content["level"], len(job.wanted)))
-        queue.learn([Outcome(key, {}, {1: 1.0, 2: 3.0, 3: 2.0}[taken[-1][1]]) for key, _, _ in job.wanted])
-    assert taken[:6] == [(0, 1, 3), (0, 2, 3), (0, 3, 3), (1, 2, 3), (1, 3, 3), (1, 1, 3)]
-    # The first estimator has two starts, the second one.
-    assert taken[6:] == [(2, 2, 2), (2, 3, 2), (2, 2, 1), (2, 1, 2), (2, 3, 1), (2, 1, 1)]
+def test_the_longest_of_a_replicate_comes_first() -> None:
+    plan: Any = FakePlan(runs=3, levels=(1, 2, 3))
+    states, seconds = States(), dict[tuple[str, str], float]()
+    taken: list[tuple[int, float]] = []
+    for job in states.jobs(plan, states.missing(plan), seconds):
+        taken.append((job.replicate, job.cell.content["level"]))
+        seconds |= {(key.data_hash, key.estimator_hash): {1: 1.0, 2: 3.0, 3: 2.0}[taken[-1][1]] for key in job.keys}
+    assert taken == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (1, 1), (2, 2), (2, 3), (2, 1)]
 
 
 def test_every_estimate_of_the_plan_is_stored_once_in_its_order(tmp_path: Path) -> None:
@@ -143,47 +136,35 @@ def test_every_estimate_of_the_plan_is_stored_once_in_its_order(tmp_path: Path) 
     assert summary.exit_code == 0
 
 
-def test_events_tell_the_story_in_order(tmp_path: Path) -> None:
-    seen: list[events.Event] = []
-    run(FakePlan(runs=3), tmp_path, on_event=seen.append)
-    kinds = [type(event).__name__ for event in seen]
-    assert list(dict.fromkeys(kinds)) == ["KernelsCompiling", "KernelsCompiled", "PlanReady", "EstimatesDone", "Sealed"]
-    ready = next(event for event in seen if isinstance(event, events.PlanReady))
-    assert (ready.data_sets, ready.estimates, ready.reused, ready.left_aside) == (6, 18, 0, 0)
-    done = [event for event in seen if isinstance(event, events.EstimatesDone)]
-    # The estimators of the last data sets are spread over the workers.
-    assert [event.done for event in done] == sorted(event.done for event in done)
-    assert done[-1].done == 6
-    assert len({row["id"] for event in done for row in event.rows}) == sum(len(event.rows) for event in done) == 18
-    assert {event.total for event in done} == {6}
-    row = done[0].rows[0]
-    results = set(no_result()) - {"measures"}
-    assert {"id", "experiment", "estimator", "cell", "replicate", "start", "seconds", "level"} | results <= set(row)
-    assert "measures" not in row, "only experiments on signals have them"
+def test_progress_begins_with_the_workload_and_counts_data_sets(tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    run(FakePlan(runs=3), tmp_path, progress=seen.append)
+    assert seen[0] == Progress(0, 6, 0, message="18 estimates of 6 data sets to compute")
+    assert [each.done for each in seen] == sorted(each.done for each in seen)
+    assert (seen[-1].done, seen[-1].failed) == (6, 0)
+    stored = [key for each in seen for key in each.stored]
+    assert len(set(stored)) == len(stored) == 18
 
 
 def test_an_estimate_is_reported_only_after_it_is_stored(tmp_path: Path) -> None:
     unsafe: list[str] = []
 
-    def check(event: events.Event) -> None:
-        if isinstance(event, events.EstimatesDone):
-            copy = tmp_path / "copy"
-            shutil.copytree(tmp_path / "toys", copy)
-            unsafe.extend({row["id"] for row in event.rows} - stored_ids(copy))
-            shutil.rmtree(copy)
+    def check(progress: Progress) -> None:
+        copy = tmp_path / "copy"
+        shutil.copytree(tmp_path / "toys", copy)
+        unsafe.extend({key.id for key in progress.stored} - stored_ids(copy))
+        shutil.rmtree(copy)
 
-    run(FakePlan(runs=3), tmp_path / "toys", on_event=check)
+    run(FakePlan(runs=3), tmp_path / "toys", progress=check)
     assert unsafe == []
 
 
 def test_a_finished_experiment_is_left_as_it_is(tmp_path: Path) -> None:
     run(FakePlan(), tmp_path)
     before = sealed(tmp_path)
-    seen: list[events.Event] = []
-    summary = run(FakePlan(), tmp_path, on_event=seen.append)
+    summary = run_experiment(FakePlan(), tmp_path, warm=lambda plan: pytest.fail("nothing is to be compiled"))  # type: ignore[arg-type]
     assert (summary.computed, summary.reused, summary.missing) == (0, 36, 0)
     assert sealed(tmp_path) == before
-    assert not any(isinstance(event, events.KernelsCompiling) for event in seen)
 
 
 def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
@@ -242,17 +223,17 @@ def test_an_estimator_that_raises_is_recorded_with_the_place(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_deadly_estimate_is_found_and_all_others_survive(tmp_path: Path, jobs: int) -> None:
-    seen: list[events.Event] = []
+    seen: list[Progress] = []
     plan = FakePlan(Toy(), Toy("die", at=2), levels=(5,), runs=7)
-    summary = run(plan, tmp_path, jobs=jobs, on_event=seen.append)
+    summary = run(plan, tmp_path, jobs=jobs, progress=seen.append)
     frame = read_estimates(tmp_path)
     crashed = frame[frame["status"] == "CRASHED"]
     assert crashed[["estimator", "replicate"]].to_numpy().tolist() == [["toy1", 2]]
     assert "SIGSEGV" in crashed["message"].iloc[0]
     assert len(frame) == summary.computed == 21
     assert summary.exit_code == 0
-    assert any(isinstance(event, events.WorkerDied) for event in seen)
-    assert [event.done for event in seen if isinstance(event, events.EstimatesDone)][-1] == 7
+    assert any(each.message.startswith("a worker process died; computing") for each in seen)
+    assert seen[-1].done == 7
 
 
 def test_a_worker_that_dies_once_costs_nothing(tmp_path: Path) -> None:
@@ -339,28 +320,19 @@ def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path) -> None:
 
 def test_the_callers_event_stops_a_run(tmp_path: Path) -> None:
     stop = threading.Event()
-    seen: list[events.Event] = []
+    seen: list[Progress] = []
 
-    def stop_soon(event: events.Event) -> None:
-        seen.append(event)
-        if isinstance(event, events.EstimatesDone):
+    def stop_soon(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.stored:
             stop.set()
 
-    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, on_event=stop_soon, stop=StopAt(stop))
+    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopAt(stop))
     assert summary.stopped_by == "stop"
     assert summary.exit_code == 5
     assert 0 < summary.computed < summary.planned
     assert len(read_estimates(tmp_path)) == summary.computed
-    assert sum(isinstance(event, events.Stopping) for event in seen) == 1
-
-
-def test_running_jobs_are_abandoned_when_they_take_long(tmp_path: Path) -> None:
-    stop = threading.Event()
-    threading.Timer(1.0, stop.set).start()
-    began = time.monotonic()
-    summary = run(FakePlan(Toy(seconds=30.0)), tmp_path, stop=StopAt(stop))
-    assert time.monotonic() - began < 10
-    assert (summary.computed, summary.exit_code) == (0, 5)
+    assert sum(each.message.startswith("stopping (stop)") for each in seen) == 1
 
 
 # Refusals
@@ -526,9 +498,9 @@ def test_a_folder_that_is_gone_ends_the_run_before_anything_is_reported(
     reported: list[str] = []
     gone: list[int] = []
 
-    def lose_it(event: events.Event) -> None:
-        if isinstance(event, events.EstimatesDone):
-            reported.extend(row["id"] for row in event.rows)
+    def lose_it(progress: Progress) -> None:
+        if progress.stored:
+            reported.extend(key.id for key in progress.stored)
             if len(reported) > 10 and not gone:
                 gone.append(len(reported))
                 shutil.rmtree(place) if change == "delete" else place.rename(elsewhere)
@@ -536,7 +508,7 @@ def test_a_folder_that_is_gone_ends_the_run_before_anything_is_reported(
                     run(FakePlan(runs=1), place)
 
     with pytest.raises(StorageError, match="while a run wrote to it"):
-        run(FakePlan(Toy(seconds=0.02), runs=20), place, on_event=lose_it)
+        run(FakePlan(Toy(seconds=0.02), runs=20), place, progress=lose_it)
     assert len(reported) == gone[0]
     if change == "replace":
         assert len(read_estimates(place)) == 6

@@ -23,9 +23,9 @@ from ctid_cli.inference.monte_carlo import (
     root_mean_square,
     wilson_interval,
 )
-from ctid_cli.running import events
-from ctid_cli.running.cell_precision import cell_precisions
-from ctid_cli.running.engine import RunSummary, preview, run_experiment
+from ctid_cli.running import engine
+from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
+from ctid_cli.running.precision import cell_precisions
 from ctid_cli.running.stopping import StopAt
 from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import FakePlan
@@ -139,7 +139,7 @@ def plan(**options: Any) -> FakePlan:
 
 
 def run(asked: FakePlan, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
-    return run_experiment(asked, place, jobs=jobs, warm=lambda: 0.0, **options)  # type: ignore[arg-type]
+    return run_experiment(asked, place, jobs=jobs, warm=lambda plan: None, **options)  # type: ignore[arg-type]
 
 
 def sealed(place: Path) -> bytes:
@@ -173,13 +173,16 @@ def test_every_cell_gets_the_data_sets_it_needs(undisturbed: Path) -> None:
     assert first.widest.half_width == 50 * (high - low) <= 13.0
 
 
-def test_neither_workers_nor_interruptions_change_a_byte(tmp_path: Path, undisturbed: Path) -> None:
+def test_neither_workers_nor_interruptions_change_a_byte(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "COMMIT_SECONDS", 0.0)
     place, stop, seen = tmp_path / "toys", threading.Event(), 0
 
     def after(count: int) -> Any:
-        def listen(event: events.Event) -> None:
+        def listen(progress: Progress) -> None:
             nonlocal seen
-            seen += isinstance(event, events.EstimatesDone)
+            seen += bool(progress.stored)
             if seen >= count:
                 stop.set()
 
@@ -189,11 +192,10 @@ def test_neither_workers_nor_interruptions_change_a_byte(tmp_path: Path, undistu
     for count in (1, 1, 20):
         stop.clear()
         seen = 0
-        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopAt(stop), on_event=after(count))
+        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopAt(stop), progress=after(count))
         interruptions += summary.exit_code == 5
     assert interruptions > 0
-    told: list[events.Event] = []
-    summary = run(plan(), place, on_event=told.append)
+    summary = run(plan(), place)
     assert (summary.exit_code, summary.missing) == (0, 0)
     assert sealed(place) == sealed(undisturbed)
     # Once more there is nothing to do.
@@ -213,15 +215,15 @@ def test_estimates_of_other_plans_are_used_and_neither_more_nor_fewer(tmp_path: 
 
 
 def test_a_cell_that_is_not_precise_in_the_end_is_said(small_blocks: None, tmp_path: Path) -> None:
-    told: list[events.Event] = []
+    told: list[Progress] = []
     asked = plan(precision={"until": {"percent_half_width": 13.0, "rmse_relative": 0.04}, "at_most": 26})
-    summary = run(asked, tmp_path, on_event=told.append)
+    summary = run(asked, tmp_path, progress=told.append)
     assert summary.exit_code == 0
     assert [cell.state for cell in summary.precision] == ["at_most", "at_most"]
     assert sizes(tmp_path) == [26, 26]
     widest = [cell.widest for cell in summary.precision if cell.widest is not None]
     assert {(one.estimator, one.measure, one.parameter) for one in widest} == {("toy0", "rmse", "delay")}
     assert all(one.half_width is not None and one.half_width > 0.04 for one in widest)
-    blocks = [event for event in told if isinstance(event, events.BlockDone)]
-    assert [[cell.needed for cell in event.precision] for event in blocks] == [[25, 25], [26, 26]]
+    blocks = [each for each in told if each.precision]
+    assert [[cell.needed for cell in each.precision] for each in blocks] == [[25, 25], [26, 26]]
     assert blocks[-1].total == 2 * 26

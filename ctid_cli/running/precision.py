@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.inference.monte_carlo import Replications, Until, decide
-from ctid_cli.running.cells import Plan
+from ctid_cli.running.plan import Plan
 from ctid_cli.storage.estimates import is_converged
 from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key, Manifest, found_values, true_values

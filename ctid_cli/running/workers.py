@@ -1,0 +1,392 @@
+"""Worker processes: jobs go through joblib, and what a process died of is computed again, alone in a process.
+
+joblib gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
+which estimates it has begun and finished, so that nothing is lost with it and the suspects are known: one for each
+worker. Every suspect is computed again in a process of its own, whose exit code decides.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import itertools
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctid_cli import custom_code
+from ctid_cli.running.job import Begun, Entry, Job, ended, run_job
+from ctid_cli.running.limits import Limits
+from ctid_cli.storage.manifest import Key, Outcome
+from ctid_cli.temporary import TemporaryFolder
+
+#: How often the caller gets a chance to do something else while nothing is finished [s].
+TICK = 0.1
+#: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
+GRACE = 3.0
+#: File beside the records that tells workers to begin nothing more.
+_STOP = "stop"
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
+#: With more threads, linear algebra has other last bits.
+_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
+_PR_SET_PDEATHSIG = 1
+
+
+class Ending(NamedTuple):
+    """What came of a job, and how its process ended."""
+
+    #: What was begun and finished, in this order.
+    entries: list[Entry]
+    #: Empty where the job is over; else a signal, an exit code, or why there is neither.
+    how: str = ""
+    #: Whether the limit of wall time ended it, and the processor time that it had since the last beginning [s].
+    late: bool = False
+    processor: float = 0.0
+
+    @property
+    def begun(self) -> tuple[Key, ...]:
+        """The estimates that were in work last."""
+        return next((entry.keys for entry in reversed(self.entries) if isinstance(entry, Begun)), ())
+
+
+#: Jobs that are over, in any order; None where nothing has come for a while.
+Results = Generator[tuple[Job, Ending] | None]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# In a worker
+
+
+def initialise(parent: int) -> None:
+    """Set up a new worker process: it leaves signals to its parent, and must not outlive it.
+
+    Linux can be asked to see to that, elsewhere a thread looks now and then.
+    """
+    for number in _SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    # What a custom estimator prints must not stand between the lines of a table.
+    sys.stdout = sys.stderr
+    # Estimators report through their status; warnings of several workers at once would only garble the terminal.
+    warnings.simplefilter("ignore")
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+    else:
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def compute(keys: Collection[Key], packed: bytes, record: str, limits: Limits) -> list[Entry]:
+    """Compute the estimates of a job under limits, and keep a record of what is begun and finished."""
+    found: list[Entry] = []
+    in_work = keys
+    # The traceback of a process that dies would garble the terminal; loky has asked for it.
+    faulthandler.disable()
+    try:
+        with open(record, "wb", buffering=0) as file, open(f"{record}.late", "wb") as late:
+            file.write(pickle.dumps(os.getpid()))
+            # The code of custom components is imported here.
+            _, job = pickle.loads(packed)
+            for entry in run_job(job, limits):
+                if isinstance(entry, Begun):
+                    in_work = entry.keys
+                    file.write(pickle.dumps(entry._replace(since=time.process_time())))
+                    limits.begin(late, entry.spent)
+                else:
+                    file.write(pickle.dumps(entry))
+                    found.append(entry)
+    except BaseException as error:
+        limits.end()
+        finished = {entry.key for entry in found if isinstance(entry, Outcome)}
+        found += ended([key for key in in_work if key not in finished], error, limits)
+    finally:
+        limits.end()
+    return found
+
+
+def main() -> None:
+    """Call the function that a file holds, and write what it returns to another: a process of its own does this."""
+    folder, parent = Path(sys.argv[1]), int(sys.argv[2])
+    initialise(parent)
+    _, function, given = pickle.loads((folder / "call").read_bytes())
+    (folder / "returned").write_bytes(pickle.dumps(function(*given)))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# In the process of the run
+
+
+def packed(*content: Any) -> bytes:
+    """Return content for another process, after the custom code that it needs to read it."""
+    return pickle.dumps((custom_code.served(), *content))
+
+
+def task_of(job: Job) -> tuple[tuple[Key, ...], bytes] | list[Entry]:
+    """Return what is sent of a job, or what comes of it where it cannot be sent."""
+    try:
+        return job.keys, packed(job)
+    except Exception as error:
+        return list(ended(job.keys, error, Limits()))
+
+
+def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple[Any, str, float]:
+    """Call a function in a process of its own, through files in a folder; waits for it.
+
+    Returns what it returned, or how the process ended before that, and the processor time [s].
+    """
+    folder.mkdir(exist_ok=True)
+    (folder / "call").write_bytes(packed(function, given))
+    program = "from ctid_cli.running.workers import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, str(folder), str(os.getpid())],
+        env=os.environ | _ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.DEVNULL,
+        stdout=2,
+        # A terminal's Ctrl-C does not reach it there.
+        start_new_session=True,
+    )
+    (folder / "process").write_text(str(process.pid), encoding="ascii")
+    _, status, used = os.wait4(process.pid, 0)
+    (folder / "process").unlink()
+    process.returncode = code = os.waitstatus_to_exitcode(status)
+    processor = used.ru_utime + used.ru_stime
+    try:
+        return pickle.loads((folder / "returned").read_bytes()), "", processor
+    except (OSError, EOFError, pickle.UnpicklingError):
+        return None, signal.Signals(-code).name if code < 0 else f"exit code {code}", processor
+
+
+def compute_alone(keys: Collection[Key], packed: bytes, limits: Limits, folder: Path) -> Ending:
+    """Compute a job in a process of its own, which is told how it ended."""
+    record = folder / "record"
+    try:
+        found, how, used = call_alone(folder, compute, keys, packed, str(record), limits)
+    except OSError as error:
+        return Ending([], f"no process could be started ({error.strerror or error})")
+    return _remains(record, how, used) if how else Ending(found)
+
+
+def _remains(record: Path, how: str, used: float = 0.0) -> Ending:
+    """Return what the record of a dead process says."""
+    entries, late = _read(record)[1:], Path(f"{record}.late")
+    since = next((entry.since for entry in reversed(entries) if isinstance(entry, Begun)), 0.0)
+    return Ending(entries, how, late.exists() and late.stat().st_size > 0, used - since)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except OSError:
+        return ""
+
+
+def _read(record: Path) -> list[Any]:
+    entries = []
+    # A worker may have died in the midst of an entry, or before the first.
+    with suppress(OSError, EOFError, pickle.UnpicklingError), record.open("rb") as file:
+        while True:
+            entries.append(pickle.load(file))
+    return entries
+
+
+@cache
+def _joblib_thread(process: int) -> ThreadPoolExecutor:
+    """Return the one thread of this process that starts workers, for as long as the process lives.
+
+    Workers end with the thread that started them, and inherit that it leaves signals to others.
+    """
+    return ThreadPoolExecutor(1, "joblib", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
+
+
+def in_parallel(
+    jobs: Iterator[Job], submit: Callable[[Job], Future[Any] | list[Entry]], at_once: Callable[[], int]
+) -> Iterator[tuple[Job, Any] | None]:
+    """Keep a number of jobs in work, and yield each with its future, or what came of it, when it is over.
+
+    None is yielded where nothing has ended for a while.
+    """
+    in_work: dict[Future[Any], Job] = {}
+    while True:
+        while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
+            future = submit(job)
+            if isinstance(future, list):
+                yield job, Ending(future)
+            else:
+                in_work[future] = job
+        if not in_work:
+            return
+        done, _ = wait(in_work, TICK, FIRST_COMPLETED)
+        for future in done:
+            yield in_work.pop(future), future
+        if not done:
+            yield None
+
+
+class LocalWorkers:
+    """Worker processes on this machine; joblib keeps them for the next run."""
+
+    def __init__(self, count: int, limits: Limits) -> None:
+        self.count, self._limits = count, limits
+        #: Why the last workers ended before all was done.
+        self.trouble = ""
+        self._folder = TemporaryFolder()
+        self._stop = self._folder.path / _STOP
+        self._numbers = itertools.count()
+        #: What is in work, by the place of its record.
+        self._at_work: dict[Path, Job] = {}
+
+    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
+        """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
+
+        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
+        job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
+        """
+        self._stop.unlink(missing_ok=True)
+        news: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
+        working.add_done_callback(lambda _: news.put(None))
+        try:
+            while True:
+                if stopping():
+                    self._stop.touch()
+                try:
+                    item = news.get(timeout=TICK)
+                except queue.Empty:
+                    self._watch()
+                    yield None
+                    continue
+                if item is None:
+                    break
+                if isinstance(item, BaseException):
+                    raise item
+                record, entries = item
+                yield self._over(record), Ending(entries)
+            error = working.exception()
+            if error is not None and not isinstance(error, BrokenExecutor | OSError | MemoryError):
+                raise error
+            how = self.trouble = str(error or "").strip().partition("\n")[0]
+            for record in list(self._at_work):
+                ending = _remains(record, how)
+                yield self._over(record), ending
+        finally:
+            # Otherwise what is in work would be waited for.
+            while not working.done():
+                self._kill(number for record in list(self._at_work) for number in _read(record)[:1])
+                time.sleep(TICK)
+            self._at_work.clear()
+
+    def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
+        """Put what comes of jobs into a queue: what the thread of joblib does."""
+        from joblib import Parallel, parallel_config
+
+        settings = {"initializer": initialise, "initargs": (os.getpid(),)}
+        with parallel_config("loky", inner_max_num_threads=1, **settings):
+            # With one worker joblib would compute in this very process: there are two, of which one is at work.
+            ahead = self.count + 1 if self.count > 1 else 1
+            how = {"n_jobs": max(self.count, 2), "pre_dispatch": ahead, "batch_size": 1, "max_nbytes": None}
+            parallel = Parallel(return_as="generator_unordered", **how)
+            for found in parallel(self._calls(jobs, news)):
+                news.put(found)
+
+    def _calls(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> Iterator[Any]:
+        """Yield what joblib is to call; it asks for the next when a worker is free, in whichever thread."""
+        from joblib import delayed
+
+        try:
+            for job in jobs:
+                record, task = self._folder.path / str(next(self._numbers)), task_of(job)
+                self._at_work[record] = job
+                if isinstance(task, list):
+                    news.put((record, task))
+                else:
+                    yield delayed(_compute_named)(record, *task, self._limits)
+        except Exception as error:
+            # joblib would wait for ever.
+            news.put(error)
+
+    def _over(self, record: Path) -> Job:
+        """Forget a job that is over."""
+        for path in (record, Path(f"{record}.late")):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        return self._at_work.pop(record)
+
+    def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
+        """Compute jobs each in a process of its own, some at the same time."""
+        threads = ThreadPoolExecutor(at_once)
+        started: dict[Path, Future[Ending]] = {}
+
+        def submit(job: Job) -> Future[Any] | list[Entry]:
+            task, folder = task_of(job), self._folder.path / f"alone-{next(self._numbers)}"
+            if isinstance(task, list):
+                return task
+            self._at_work[folder / "record"] = job
+            started[folder] = threads.submit(compute_alone, *task, self._limits, folder)
+            return started[folder]
+
+        try:
+            for over in in_parallel(jobs, submit, lambda: at_once):
+                if over is None:
+                    self._watch()
+                yield over if over is None or isinstance(over[1], Ending) else (over[0], over[1].result())
+        finally:
+            # Otherwise what is in work would be waited for.
+            while in_work := [folder for folder, future in started.items() if not future.done()]:
+                self._kill(int(text) for folder in in_work if (text := _text(folder / "process")))
+                time.sleep(TICK)
+            threads.shutdown()
+            self._at_work.clear()
+
+    def at_work(self) -> Iterator[tuple[Path, float]]:
+        """Yield the record of each job in work, and for how long its estimate has been in work [s]."""
+        for record in list(self._at_work):
+            with suppress(OSError):
+                yield record, time.time() - record.stat().st_mtime
+
+    def _watch(self) -> None:
+        """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
+        if self._limits.wall_seconds is not None:
+            for record, seconds in self.at_work():
+                if seconds > self._limits.wall_seconds * 1.5 + GRACE:
+                    Path(f"{record}.late").write_bytes(b"killed")
+                    self._kill(_read(record)[:1])
+
+    def slow(self, least: float) -> Iterator[tuple[Key, float]]:
+        """Yield the estimates that have been in work for longer than this, and for how long [s]."""
+        for record, seconds in self.at_work():
+            if seconds > least:
+                yield (*_remains(record, "").begun, *self._at_work[record].keys)[0], seconds
+
+    @staticmethod
+    def _kill(processes: Iterable[int]) -> None:
+        for process in processes:
+            with suppress(OSError):
+                os.kill(process, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Remove the records."""
+        self._folder.close()
+
+
+def _compute_named(record: Path, keys: Collection[Key], packed: bytes, limits: Limits) -> tuple[Path, list[Entry]]:
+    """Compute a job unless the run is to stop, and say of which record it is."""
+    return record, [] if record.with_name(_STOP).exists() else compute(keys, packed, str(record), limits)
