@@ -18,8 +18,7 @@ from ctid_cli.simulation.frequency_measures import (
     measure_track,
 )
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.store import load_estimates, read_stored
-from ctid_cli.storage.summary import export_rows
+from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
 from tests.running.fakes import outcomes_of
 from tests.specification.written import SIGNAL as SPEC
 from tests.specification.written import load
@@ -90,7 +89,7 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
         assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
-    flat = export_rows(load_estimates(folder))
+    flat = export_rows(read_estimates(folder))
     assert {"omega_1", "settling_after_step_2", "rms_2", "false_alarms", "converged"} <= set(flat)
     assert not {"numerator", "delay", "b0", "measures"} & set(flat)
     restarting = flat[flat["estimator"] == "restarting"]
