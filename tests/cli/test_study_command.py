@@ -209,7 +209,7 @@ def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, mo
 def test_mixed_results_are_not_published(small, out, tmp_path, clean):
     found = read_study(small, out)
     (results,) = found.experiments.values()
-    other = dataclasses.replace(results.stored.origins[0], code_version="d")
+    other = results.stored.origins[0]._replace(code_version="d")
     stored = dataclasses.replace(results.stored, origins=(*results.stored.origins, other))
     mixed = dataclasses.replace(found, experiments={"two-tones": dataclasses.replace(results, stored=stored)})
     with pytest.raises(RefusedError, match="mixes results"):

@@ -124,7 +124,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
     assert {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir() if file.is_file()} == before
     # Results are read without the code.
     os.unlink(folder / "parts.py")
-    assert json.dumps(read_stored(tmp_path / "out").rows())
+    assert json.dumps(list(read_stored(tmp_path / "out").rows()))
 
 
 @pytest.mark.parametrize(
