@@ -60,9 +60,9 @@ class Limits:
         pairs = [(getattr(other, name), getattr(self, name)) for name in names]
         return any(old is not None and (new is None or new > old) for old, new in pairs)
 
-    def begin(self, watched: BinaryIO | None, spent: tuple[float, float] = (0.0, 0.0)) -> None:
+    def begin(self, watched: BinaryIO, spent: tuple[float, float] = (0.0, 0.0)) -> None:
         """Set the limits for what this process does next; a wall time that is over is noted in a file."""
-        if self.wall_seconds is not None and watched is not None:
+        if self.wall_seconds is not None:
             faulthandler.dump_traceback_later(max(self.wall_seconds - spent[0], _LEAST), exit=True, file=watched)
         if self.cpu_seconds is not None:
             # Unlike RLIMIT_CPU it counts from now on, in fractions of a second, and is not what a batch system sets.
