@@ -209,11 +209,10 @@ def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, mo
 def test_mixed_results_are_not_published(small, out, tmp_path, clean):
     found = read_study(small, out)
     (results,) = found.experiments.values()
-    other = results.stored.origins[0]._replace(code_version="d")
-    stored = dataclasses.replace(results.stored, origins=(*results.stored.origins, other))
-    mixed = dataclasses.replace(found, experiments={"two-tones": dataclasses.replace(results, stored=stored)})
+    export = results.stored.export
+    export.origins = (*export.origins, export.origins[0]._replace(code_version="d"))
     with pytest.raises(RefusedError, match="mixes results"):
-        publishing.publish(mixed, [], tmp_path)
+        publishing.publish(found, [], tmp_path)
 
 
 def test_an_installed_package_publishes_nothing(small, out, tmp_path, monkeypatch):
