@@ -38,7 +38,7 @@ MAX_DATA_SETS = 1_000_000
 class DataCells(Sequence[DataCell]):
     """The data cells of a plan; very many of them are made when they are asked for."""
 
-    #: So many are made at once, so that what is wrong with any of them is said at once.
+    #: This many are made at once, so that what is wrong with any of them is said at once.
     FEW = 1000
 
     def __init__(self, count: int, make: Callable[[int], DataCell]) -> None:

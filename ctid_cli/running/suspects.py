@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from ctid_cli.running.dask_cluster import DaskWorkers
     from ctid_cli.running.workers import LocalWorkers
 
-#: After so many rounds in which no estimate was finished, the machine is not fit to go on; before the next one the run
-#: waits the longer the more there were [s]. A round ends early when the machine was short of something so often.
+#: After this number of rounds without a finished estimate the run ends; before each next round it waits in proportion
+#: to their number [s]. A round ends early when the machine was short of something this often.
 PATIENCE, PAUSE = 4, 0.3
 SHORTAGES = 8
 #: An estimate that takes so long is mentioned, and again after twice the time [s].

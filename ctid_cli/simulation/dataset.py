@@ -70,7 +70,7 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
     """Return the submodels' parameters of an estimate, with errors and quantiles where it has them in another form.
 
     The covariance of a fraction's coefficients goes with the Jacobian of its partial fractions. A fraction has none in
-    the given terms if its poles are repeated, not as many, or more of them complex than the terms have room for.
+    the given terms if its poles are repeated, different in number, or more of them complex than the terms can take.
     """
     additive = getattr(fit, "additive", None)
     if additive is not None:

@@ -60,7 +60,7 @@ class Measuring:
 
 
 def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, tones: int, times: Array) -> Array:
-    """Return the frequencies that an estimator of so many tones should find."""
+    """Return the frequencies that an estimator of ``tones`` tones should find."""
     true = signal.frequencies_at(times)
     if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
         true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)

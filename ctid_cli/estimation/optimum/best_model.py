@@ -20,7 +20,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 #: A model found from a part of the records is one of all of them if its mean squared error there is at most so many
 #: times that in the part, and so large a share of the output's variance is explained.
 AS_GOOD, EXPLAINED = 1.5, 0.05
-#: Records of more samples than this are long, and so many of them are a part.
+#: Records of more samples than the first number are long; a part of them has the second.
 LONG, PART = 100_000, 20_000
 
 
@@ -244,7 +244,7 @@ def liveliest_parts(records: Sequence[FilterData], latest: float) -> list[slice]
 
 
 def liveliest(u: Array, y: Array, size: int) -> slice:
-    """So many samples around which the input moves and the output varies most."""
+    """Return the samples, ``size`` of them, around which the input moves and the output varies most."""
     if y.size <= size:
         return slice(None)
     moves, spread = np.abs(np.diff(u, append=u[-1])), np.abs(y - y.mean())
