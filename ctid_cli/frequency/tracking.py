@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.frequency import base
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.frequency_kernels import Output
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
@@ -107,7 +108,7 @@ class Recursion(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrequencyEstimator(ABC):
+class FrequencyEstimator(base.FrequencyEstimator):
     """Options of an estimator of frequencies."""
 
     kind: ClassVar[str]
@@ -142,6 +143,12 @@ class BatchEstimator(FrequencyEstimator):
 
     online: ClassVar[bool] = False
 
+    def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
+        """Return the one estimate of the record, at its last instant."""
+        found = self.estimate(samples, interval)
+        last = np.array([(np.size(samples) - 1) * interval])
+        return base.FrequencyTrack(last, found.omega[None, :], np.array([int(found.flags)], np.uint16))
+
     @abstractmethod
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
         """Estimate the frequencies of a record.
@@ -171,6 +178,11 @@ class OnlineEstimator(FrequencyEstimator):
     """Options of an estimator that takes sample after sample."""
 
     online: ClassVar[bool] = True
+
+    def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
+        """Return the estimate at every sample of the record."""
+        found = self.start(interval).run(samples)
+        return base.FrequencyTrack(found.t, found.omega, found.flags)
 
     @abstractmethod
     def _recursion(self, interval: float) -> Recursion:
