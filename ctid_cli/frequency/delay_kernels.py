@@ -21,6 +21,8 @@ UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = 16, 32, 64, 128
 NEWTON_STEPS = 60
 #: Second moments summed over many samples carry relative errors of about this size.
 ROUNDING = 4e-15
+#: A squared residual below so many times that is not known from the moments.
+DETERMINED = 10.0
 #: Added to the unit diagonal of scaled second moments where the best fit must exist even if it is not unique.
 REGULARISATION = 1e-10
 #: An estimation younger than so many periods, or beats of neighbours, is less certain than its misfit shows.
@@ -294,7 +296,9 @@ def flag_uncertain(
     size = np.sqrt(gram[n, n])
     for k in range(n):
         size += abs(theta[k]) * scales[k]
-    misfit = max(squared_residual(gram, theta), min(left, ROUNDING * size * size))
+    misfit, rounded = squared_residual(gram, theta), ROUNDING * size * size
+    if misfit < DETERMINED * rounded:
+        misfit = min(left, max(misfit, rounded))
     enough = min(span, elapsed / FIRST_PERIODS)
     for i in range(n):
         # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.

@@ -9,8 +9,10 @@ Z delays by h. Written out, ``psi = phi' theta`` with ``psi = -(Z^2 + 1)^n y`` a
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import comb, gcd
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,6 +46,10 @@ BLOCK = 1 << 15
 class DelayRegression(FrequencyEstimator):
     """Options of an estimator on the delay regression."""
 
+    online: ClassVar[bool] = True
+    #: Further options that say for how long samples are kept [s].
+    _kept: ClassVar[tuple[str, ...]] = ()
+
     h: float
     prefilter: float = 0.0
     difference: float = 0.0
@@ -57,6 +63,11 @@ class DelayRegression(FrequencyEstimator):
         require_not_negative("difference", self.difference, "s")
         require_bounds(self.lowest_frequency, self.highest_frequency)
         self._highest(self.h)
+
+    @property
+    def _stacked_over(self) -> float:
+        """Time that the rows of an estimate reach back [s]."""
+        return 0.0
 
     @abstractmethod
     def start(self, interval: float) -> Online:
@@ -91,13 +102,29 @@ class DelayRegression(FrequencyEstimator):
             online.advance(y[part], omega[part], flags[part])
         return FrequencyTrack(interval * np.arange(y.size, dtype=float), omega, flags)
 
-    def notes(self, interval: float) -> tuple[str, ...]:
-        """Say what a sampling interval [s] makes of the delay, if that is worth a sentence."""
+    def check(self, count: int, interval: float) -> None:
+        """Refuse delays that are longer than a record of ``count`` samples, and options that its clock cannot have."""
+        duration = interval * count
+        # First of all, since the estimation would keep all the samples of such a time.
+        for name in ("prefilter", "difference", *self._kept):
+            value = getattr(self, name)
+            if value > duration:
+                raise OptionError(name, f"{name} = {value:g} s is longer than the record, {duration:g} s")
+        filled = 2 * self.tones * self.h + self.prefilter + self.difference + self._stacked_over
+        if filled >= duration:
+            ends = f"the record ends at {duration:g} s; take a smaller h"
+            raise OptionError("h", f"its delays are filled after {filled:g} s, {ends}")
+        self.start(interval)
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say that a frequency has an alias at the delay, or that the clock does not have the delay."""
+        if highest * self.h > np.pi:
+            limit = f"with h = {self.h:g} s, frequencies above pi/h = {np.pi / self.h:.4g} rad/s"
+            yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
         delay = whole_delay("h", self.h, interval) * interval
-        if abs(delay - self.h) <= NOTEWORTHY_ROUNDING * self.h:
-            return ()
-        whole = f"no whole number of sampling intervals of {interval:g} s"
-        return (f"h = {self.h:g} s is {whole}; {delay:g} s is used.",)
+        if abs(delay - self.h) > NOTEWORTHY_ROUNDING * self.h:
+            whole = f"no whole number of sampling intervals of {interval:g} s"
+            yield "h", f"h = {self.h:g} s is {whole}; {delay:g} s is used."
 
     def clock(self, interval: float) -> Clock:
         """Return the regression at a sampling interval [s]."""

@@ -26,6 +26,8 @@ from ctid_cli.signals.checks import require_integer, require_positive
 class MixingOptions(DelayRegression):
     """Options of an estimator on the mixed regressions."""
 
+    _kept: ClassVar[tuple[str, ...]] = ("d",)
+
     d: float
     first_row: int = 1
 
@@ -33,6 +35,10 @@ class MixingOptions(DelayRegression):
         super().__post_init__()
         require_positive("d", self.d, "s")
         require_integer("first_row", self.first_row, 0, 1000)
+
+    @property
+    def _stacked_over(self) -> float:
+        return (self.first_row + self.tones - 1) * self.d
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,6 +237,7 @@ class DremWindow(MixingOptions):
     """
 
     kind: ClassVar[str] = "drem_window"
+    _kept: ClassVar[tuple[str, ...]] = ("d", "memory")
 
     memory: float
 

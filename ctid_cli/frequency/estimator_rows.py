@@ -11,6 +11,7 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.record_tones import USUAL_ROWS, follow_tones
 from ctid_cli.frequency.record_track import MOST_ASKED, Procedure, RecordTrack
 from ctid_cli.frequency.spikes import without_spikes
+from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.frequency.windows import WindowEstimate, sinusoids_of, wanted_tones
 
 #: Samples that an estimator takes between two reports of progress.
@@ -117,12 +118,15 @@ def _follow(
     thinned: Array, settings: Settings, step: int, tell: Callable[[int, int], None]
 ) -> Iterator[tuple[float, WindowEstimate, Array]]:
     """Every so many samples what is estimated, and the samples before that its amplitudes are found from."""
-    tracker = settings.estimator.start(settings.interval)
+    track = settings.estimator.track(thinned, settings.interval)
     for first in range(0, thinned.size, PIECE):
-        track = tracker.run(thinned[first : first + PIECE], fft=True)
-        last = first + track.flags.size
+        last = min(first + PIECE, thinned.size)
         for place in range(first + (-first - 1) % step, last, step):
-            found = wanted_tones(track[place - first], settings.expected, settings.tones)
+            flags = Flag(int(track.flags[place]))
+            unknown = np.full(track.frequencies.shape[1], np.inf if flags & Flag.UNCERTAIN else 0.0)
+            found = wanted_tones(
+                FrequencyEstimate(track.frequencies[place], flags, unknown), settings.expected, settings.tones
+            )
             begin = max(0, place + 1 - settings.window)
             if found.flags & (Flag.STARTING | Flag.GAP | Flag.CHANGED):
                 begin = place + 1

@@ -24,8 +24,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
+from ctid_cli.frequency.tracking import FrequencyEstimate
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb
 from ctid_cli.signals.streams import stream
@@ -73,9 +74,9 @@ def measure_track(
     track: FrequencyTrack, true: Array, signal: SumOfSinusoids, measuring: Measuring, options: Any
 ) -> dict[str, float | None]:
     """Measure the estimates of an online estimator."""
-    t, errors, valid = track.t, track.omega - true, track.valid
+    t, errors, valid = track.t, track.frequencies - true, track.valid
     count = errors.shape[1]
-    found = _numbered("omega", track.omega[-1])
+    found = _numbered("omega", track.frequencies[-1])
     found["valid_from"] = float(t[np.argmax(valid)]) if valid.any() else None
     if measuring.band is not None:
         steps = [float(step) for step in signal.frequency_steps]
@@ -183,12 +184,13 @@ class SignalDataSet:
         source, measuring = self.source, self.source.measuring
         times = self.record.interval * np.arange(self.record.samples.size, dtype=float)
         true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
-        last = fit.last
+        found = fit.found
+        reasons = found.reasons(-1) if isinstance(found, FrequencyTrack) else found.reasons
         result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
-        if not last.valid:
-            result = {"status": "INVALID", "message": " ".join(last.reasons)}
-        if not isinstance(fit.found, FrequencyTrack):
-            return result | {"measures": measure_estimate(last, true, measuring.window, times)}
+        if reasons:
+            result = {"status": "INVALID", "message": " ".join(reasons)}
+        if not isinstance(found, FrequencyTrack):
+            return result | {"measures": measure_estimate(found, true, measuring.window, times)}
         return result | {"measures": measure_track(fit.found, true, source.signal, measuring, fit.options)}
 
 
@@ -219,8 +221,7 @@ class FrequencyEstimation:
 
     def prepare(self, record: SignalRecord) -> PreparedFrequencies:
         """Get ready for a record."""
-        tracker = self.options.start(record.interval) if self.options.online else None
-        return PreparedFrequencies(self.options, record, tracker)
+        return PreparedFrequencies(self.options, record)
 
     def compile(self, interval: float) -> None:
         """Compile the kernels of the estimator."""
@@ -234,13 +235,12 @@ class PreparedFrequencies:
 
     options: Any
     record: SignalRecord
-    tracker: Any
 
     def fit(self, start: None = None) -> FrequencyFit:
         """Estimate the frequencies."""
-        if self.tracker is None:
-            return FrequencyFit(self.options, self.options.estimate(self.record.samples, self.record.interval))
-        return FrequencyFit(self.options, self.tracker.run(self.record.samples))
+        if self.options.online:
+            return FrequencyFit(self.options, self.options.track(self.record.samples, self.record.interval))
+        return FrequencyFit(self.options, self.options.estimate(self.record.samples, self.record.interval))
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,8 +249,3 @@ class FrequencyFit:
 
     options: Any
     found: FrequencyTrack | FrequencyEstimate
-
-    @property
-    def last(self) -> FrequencyEstimate:
-        """The estimate at the end of the record."""
-        return self.found.final if isinstance(self.found, FrequencyTrack) else self.found

@@ -13,7 +13,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.drem import DremWindow
 from ctid_cli.frequency.esprit import Esprit
 from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve

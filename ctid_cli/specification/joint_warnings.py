@@ -196,5 +196,5 @@ def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
 
 
 def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    for note in options.start(clock.interval).notes if options.online else ():
-        yield (*at, "h"), note
+    for name, note in options.warnings(clock.interval, 0.0) if hasattr(options, "warnings") else ():
+        yield (*at, name), note

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ctid_cli.frequency.tracking import FrequencyTrack
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.job import DataCell, EstimatorCell
@@ -69,7 +69,7 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
         for estimator in (member for member in members if member in parts):
             track = track_of(cell, 0, parts[estimator], DRAWN_INTERVAL)
             true = source.signal.frequencies_at(track.t)
-            curves.append(Curve(members[estimator], track.t, track.omega, true, track.valid))
+            curves.append(Curve(members[estimator], track.t, track.frequencies, true, track.valid))
         groups.append(Group(name, curves))
     options = next(part.estimator.options for part in plan.estimators if part.name == "finite_time")
     exact_from = options.tones * (2 * options.h + options.d)
@@ -82,7 +82,7 @@ def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: floa
     record = cell.dataset(replicate).record
     track = part.estimator.prepare(record).fit().found
     every = max(1, round(interval / record.interval))
-    return FrequencyTrack(track.t[::every], track.omega[::every], track.flags[::every], track.uncertainty[::every])
+    return FrequencyTrack(track.t[::every], track.frequencies[::every], track.flags[::every])
 
 
 def _whole_record_error(results: Results) -> float:

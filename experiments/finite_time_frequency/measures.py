@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.tracking import FrequencyTrack
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_measures import SignalSource
@@ -81,7 +81,7 @@ def by_tone(found: list[Row], name: str) -> Array:
 
 def larger_error(source: SignalSource, track: FrequencyTrack) -> Array:
     """Larger one of the errors of all tones [rad/s]."""
-    return np.asarray(np.abs(track.omega - source.signal.frequencies_at(track.t)).max(axis=1))
+    return np.asarray(np.abs(track.frequencies - source.signal.frequencies_at(track.t)).max(axis=1))
 
 
 def settle(t: Array, error: Array, band: float, since: float = 0.0, until: float = np.inf) -> float:
