@@ -65,13 +65,13 @@ def load_plans(
 ) -> list[tuple[Path, Plan]]:
     """Read and check experiment files; warnings go to stderr."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.specification.load import load_spec
+    from ctid_cli.running.trial import load_tried
 
     problems: list[Problem] = []
     plans: list[tuple[Path, Plan]] = []
     for config in configs:
         try:
-            spec = load_spec(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
+            spec = load_tried(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
             plans.append((config, build_plan(spec, runs)))
         except SpecError as error:
             problems += error.problems
@@ -220,11 +220,7 @@ def validate(
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    from ctid_cli.running.custom_check import check_components
-    from ctid_cli.running.limits import Limits
-
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
-        check_components(plan, Limits(), lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

@@ -19,7 +19,7 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
+from ctid_cli.running.trial import load_tried
 from ctid_cli.storage.estimates import read_stored
 from ctid_cli.storage.manifest import planned_count
 
@@ -223,7 +223,7 @@ def run_experiment(
     >>> results.estimates.groupby("estimator").delay.std()  # doctest: +SKIP
     """
     given = spec if isinstance(spec, Mapping) else Path(spec)
-    plan = build_plan(load_spec(given, overrides, allow_code=allow_code), runs)
+    plan = build_plan(load_tried(given, overrides, allow_code=allow_code), runs)
     for warning in plan.spec.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) / plan.experiment

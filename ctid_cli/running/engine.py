@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 from ctid_cli.errors import MachineError, RefusedError, StorageError
 from ctid_cli.processors import usable_processors
-from ctid_cli.running.first_data import check_first_data, compile_kernels
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits, advice
 from ctid_cli.running.plan import Plan, current_origin
@@ -129,6 +128,26 @@ class RunSummary:
         return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
 
 
+def compile_kernels(plan: Plan) -> None:
+    """Compile the kernels that a plan needs, or load them from the cache on disk, so that no two workers do."""
+    from ctid_cli.estimation import compilation
+    from ctid_cli.signals.sampling import RegularSampling
+    from ctid_cli.simulation.components import CustomEstimation
+    from ctid_cli.simulation.frequency_measures import FrequencyEstimation, SignalSource
+
+    source, estimators = plan.data_cells[0].source, [cell.estimator for cell in plan.estimators]
+    if isinstance(source, SignalSource):
+        for estimator in estimators:
+            if isinstance(estimator, FrequencyEstimation):
+                estimator.compile(source.sampling.interval)
+        return
+    ours = [estimator for estimator in estimators if not isinstance(estimator, CustomEstimation)]
+    clocks = [(getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells]
+    # A clock that is not known before the data are read is taken as regular.
+    for regular, closed in {(isinstance(clock, RegularSampling | None), loop is not None) for clock, loop in clocks}:
+        compilation.compile_kernels(ours, regular=regular, closed=closed)
+
+
 def run_experiment(
     plan: Plan,
     folder: Path,
@@ -158,7 +177,6 @@ def run_experiment(
     if any(lacking.any() for lacking in missing):
         # Until workers are at work, a signal ends the process as it ends any other.
         warm(plan)
-        check_first_data(plan, found.states.jobs(found.plan, missing, {}), limits, warn)
     with ExitStack() as stack:
         workers: Any
         if dask is None:

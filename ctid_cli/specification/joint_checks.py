@@ -1,9 +1,7 @@
 """What is wrong with a specification although every section is right by itself."""
 
-import itertools
 import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -19,10 +17,9 @@ from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
-from ctid_cli.simulation.dataset import SimulatedSource, additive_form
+from ctid_cli.simulation.dataset import additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
@@ -47,9 +44,8 @@ from ctid_cli.specification.yaml_source import KeyPath
 MAX_SAMPLES = 10_000_000
 #: Data cells times estimators with each of their settings that an experiment may have.
 MAX_SETTINGS = 1_000_000
-#: Data sets that are simulated when a specification is checked, and samples of all of them.
+#: Settings whose first data sets are tried.
 MAX_TRIALS = 64
-MAX_TRIAL_SAMPLES = 20_000_000
 
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
@@ -159,8 +155,24 @@ def too_many_cases(spec: Spec) -> str:
     return ""
 
 
-def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
-    """Say what the sections of a specification have against each other."""
+def joint_complaints(
+    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
+) -> list[Complaint]:
+    """Return what the sections of a specification have against each other, and what a trial of them shows."""
+    found = list(_static_complaints(spec, broken, files_are_good=files_are_good))
+    places = {path[0] for path, _ in found if path}
+    of_data = {"data", *OF_DATA}
+    # A wrong level of the noise, or a wrong estimator, leaves the rest to be tried.
+    if files_are_good and not places & of_data - {"noise"}:
+        faulty = {path[1] for path, _ in found if path[:1] == ("estimators",)}
+        right = {name: section for name, section in spec.estimators.items() if name not in faulty}
+        # Estimators would refuse a record for what is wrong with its sections.
+        rest = replaced(spec, ("estimators",), {} if (places | broken) & of_data else right)
+        found += trial(replaced(rest, ("noise",), None) if "noise" in places else rest)
+    return found
+
+
+def _static_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
     yield from _precision_complaints(spec, broken)
     yield from _same_estimators(spec)
     yield from _world_complaints(spec, broken)
@@ -177,11 +189,7 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
-    of_data = list(_data_complaints(spec, [] if too_long else records))
-    yield from of_data
-    # A wrong level of the noise leaves the rest to be tried.
-    if not (too_long or spec.data) and files_are_good and {path[0] for path, _ in of_data} <= {"noise"}:
-        yield from _trial_complaints(replaced(spec, ("noise",), None) if of_data else spec)
+    yield from _data_complaints(spec, [] if too_long else records)
 
 
 def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
@@ -453,50 +461,6 @@ def _of_ratio(noise: Any) -> Iterator[Complaint]:
     if noise.snr_db is not None:
         other = ", or its innovation_variance" if hasattr(noise, "innovation_variance") else ""
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
-
-
-def _trial_complaints(spec: Spec) -> Iterator[Complaint]:
-    """Say what only a simulation shows: the first data set of each distinct setting is made.
-
-    Sections that are missing because they are wrong by themselves have a stand-in, so that the others are tried. Custom
-    components are tried in a process of their own, before a run.
-    """
-    driven = spec.loop is not None if spec.generator is None else not spec.generator[1].custom
-    if spec.sampling is None or spec.sampling.custom or not driven:
-        return
-    sections = {name: section for name in OF_DATA if (section := getattr(spec, name)) is not None}
-    parts: dict[KeyPath, Sequence[Variant]]
-    parts = {(name,): variants(section) for name, section in sections.items() if not section.custom}
-    parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
-    # Levels of noise, and losses, decide on nothing else: they take turns.
-    turns = {at: parts.pop(at) for at in (("noise",), ("recorder",)) if at in parts}
-    failures: list[Failure] = []
-    tried: list[Mapping[KeyPath, Any]] = []
-    samples = 0
-    for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
-        case = dict(zip(parts, point, strict=True))
-        others = {at: found[k % len(found)] for at, found in turns.items()}
-        options = {str(at[0]): variant.options for at, variant in (case | others).items()}
-        samples += options["sampling"].samples
-        if samples > MAX_TRIAL_SAMPLES and tried:
-            break
-        tried.append(swept_in(case))
-        for place, message in trial(spec.simulated_source(options, spec.folder)):
-            failures.append((place, message, tried[-1]))
-    yield from grouped(failures, tried)
-
-
-def trial(source: SimulatedSource) -> Iterator[Complaint]:
-    """Say why the first data set of a source cannot be made, if its sections are to blame."""
-    try:
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            source.require_stable()
-            source.dataset(0)
-    except DataError as error:
-        yield tuple(error.section.split(".")) if error.section else (), str(error)
-    except Exception:  # of which a run says more: it is stored with every estimate
-        return
 
 
 # --------------------------------------------------------------------------------------------------------------------

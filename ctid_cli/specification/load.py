@@ -1,6 +1,6 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,11 +34,12 @@ def load_spec(
     *,
     allow_code: bool = False,
     allow_outside: bool = False,
+    trial: Callable[[Spec], Any] | None = None,
 ) -> Spec:
     """Read and check a specification, of a file or as a mapping.
 
     Code that it names is run, and data files outside its folder are read, only if that is allowed; whoever gives a
-    mapping names the files himself.
+    mapping names the files himself. A trial is given what is right, and returns what is wrong and odd about it.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
@@ -56,10 +57,17 @@ def load_spec(
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
-    joint = joint_complaints(spec, broken, files_are_good=not about_files)
+    odd: list[Complaint] = []
+
+    def tried(part: Spec) -> Sequence[Complaint]:
+        found = trial(part) if trial is not None else None
+        odd.extend(found.odd if found is not None else ())
+        return found.wrong if found is not None else ()
+
+    joint = joint_complaints(spec, broken, tried, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
     _require_none(source, complaints)
-    spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
+    spec._warnings = tuple(str(source.problem(where, message)) for where, message in (*joint_warnings(spec), *odd))
     return spec
 
 

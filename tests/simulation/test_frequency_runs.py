@@ -9,7 +9,6 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.job import Job
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.frequency_measures import (
@@ -84,8 +83,7 @@ def test_results_are_sealed_and_read_back(tmp_path):
     assert (summary.computed, summary.failed) == (4, 0)
     stored = read_stored(folder)
     (cell,) = plan.data_cells
-    wanted = tuple(plan.keys(plan.tasks()[0]))
-    outcomes = outcomes_of(Job(cell, 0, 1, wanted))
+    outcomes = outcomes_of(plan.job(0, 0))
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
         assert stored.results[outcome.key]["measures"] == outcome.result["measures"]

@@ -51,7 +51,7 @@ def test_files_that_hold_no_mapping(tmp_path, name, text, message):
 
 def test_nothing_random_needs_no_monte_carlo(tmp_path):
     changes = [
-        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n"),
+        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n  time: 1.0\n"),
         ("monte_carlo: {runs: 10, seed: 1}\n", ""),
         (", {uniform: [0, 9]}]", "]"),
     ]
