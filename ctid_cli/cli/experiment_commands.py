@@ -138,7 +138,7 @@ def run(
     the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
     from ctid_cli.running.engine import preview, run_experiment
-    from ctid_cli.running.stopping import StopAt
+    from ctid_cli.running.stopping import StopRequest
     from ctid_cli.storage.manifest import Shard
 
     if keep_readable and not fresh:
@@ -160,9 +160,9 @@ def run(
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
-        stop = StopAt(failures=max_failures, seconds=left)
+        stop = StopRequest(failures=max_failures, seconds=left)
         with Reporter(plan.experiment, quiet=quiet) as reporter:
-            how |= {"progress": reporter, "warn": reporter.warn, "dask": dask}
+            how |= {"progress": reporter, "dask": dask}
             summary = run_experiment(plan, folder, jobs=jobs, stop=stop, keep_readable=keep_readable, **how)
         if not quiet:
             typer.echo(_conclusion(summary, out, part))

@@ -22,10 +22,11 @@ def status(
 
     Counts estimates: done, planned, failed, and those that the latest settings set aside.
     """
+    from ctid_cli.inference.monte_carlo import CellPrecision
     from ctid_cli.reporting.exporting import with_list
     from ctid_cli.reporting.overview import OF_STATUS, overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
-    from ctid_cli.running.precision import CellPrecision, cell_precisions
+    from ctid_cli.running.precision import cell_precisions
     from ctid_cli.storage.status import experiment_status
 
     if experiment is None:

@@ -227,11 +227,7 @@ def run_experiment(
     for warning in plan.spec.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) / plan.experiment
-
-    def warn(text: str) -> None:
-        warnings.warn(text, stacklevel=5)
-
-    summary = engine.run_experiment(plan, folder, jobs=jobs, warn=warn, fresh=fresh, allow_mixed=allow_mixed)
+    summary = engine.run_experiment(plan, folder, jobs=jobs, fresh=fresh, allow_mixed=allow_mixed)
     if summary.exit_code == MachineError.exit_code:
         raise summary.machine_error()
     return read_results(folder)

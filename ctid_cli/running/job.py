@@ -78,6 +78,10 @@ class Job:
         """The estimates wanted."""
         return tuple(key for key, _, _ in self.wanted)
 
+    def names(self, keys: Collection[Key]) -> list[str]:
+        """Return what some of the estimates are called in messages."""
+        return [f"{cell.name} on replicate {key.replicate}" for key, cell, _ in self.wanted if key in keys]
+
     def only(self, keys: Collection[Key]) -> Job:
         """Return the job of some of the estimates."""
         return replace(self, wanted=tuple(one for one in self.wanted if one[0] in keys))

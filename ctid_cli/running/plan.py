@@ -21,7 +21,7 @@ from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.job import DataCell, EstimatorCell, Job, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import NO_START, DataSet, SimulatedSource, Source, StartPoint, located
+from ctid_cli.simulation.dataset import NO_START, DataSet, SimulatedSource, Source, StartPoint, joined, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
@@ -97,6 +97,14 @@ class Plan:
             )
         return dataclasses.replace(self, shard=shard)
 
+    @property
+    def file(self) -> tuple[str, str] | None:
+        """Path and SHA-256 of the file that data sets are made from; None where they need none."""
+        section: Any = self.spec.data or (self.spec.generator or ((), None))[1]
+        if getattr(section, "sha256", None) is None or section.custom:
+            return None
+        return joined(self.spec.folder.resolve(), section.file), section.sha256
+
     def keys(self, cell: int, replicate: int) -> list[Wanted]:
         """Return the estimates wanted of a data set."""
         data_hash = self.data_cells[cell].hash
@@ -155,7 +163,7 @@ def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPo
 
 
 def structure(source: Source | SignalSource, estimators: Iterable[Any]) -> tuple[Term, ...] | None:
-    """Return the submodels of the simulated system by rising natural frequency, or else of the first estimator of any."""
+    """Return the submodels of the simulated system by rising frequency, or else of the first estimator."""
     if isinstance(source, SimulatedSource) and isinstance(source.system, AdditiveModel):
         return source.system.sorted().terms
     found = (getattr(estimator, "terms", None) for estimator in estimators)

@@ -202,8 +202,8 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
             source.require_stable()
         first, second = _twice(partial(source.dataset, 0)) if custom else (source.dataset(0),) * 2
     except DataError as error:
-        place = tuple(error.section.split(".")) if error.section else ()
-        return None, [((*place, "kind") if error.section in custom else place, str(error))]
+        at = tuple(error.section.split(".")) if error.section else ()
+        return None, [((*at, "kind") if error.section in custom else at, str(error))]
     except Exception:  # of which a run says more: it is stored with every estimate
         return None, []
     made: dict[str, Callable[[Any], Any]] = {
@@ -214,7 +214,7 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
         "noise": lambda r: r.y,
     }
     for place in custom:
-        one, other = (np.asarray(made[place](data.record), dtype=float) for data in (first, second))
+        one, other = (np.asarray(made[place](data.record), dtype=np.float64) for data in (first, second))
         if not np.array_equal(one, other, equal_nan=True):
             return None, [((*place.split("."), "kind"), f"{GLOBAL} the rng that it is given")]
     return first, []

@@ -25,7 +25,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
 from ctid_cli.signals.excitation import Excitation, InputFile
-from ctid_cli.signals.files import require_file
+from ctid_cli.signals.files import COPIES, require_file
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Enters, Loop, Record
@@ -224,7 +224,7 @@ class SimulatedSource:
         if generator is None:  # a relay needs no reference
             return HeldSignal(times[:1], np.zeros(1))
         if isinstance(generator, InputFile) and generator.sha256 is not None:
-            require_content(generator.file, generator.sha256)
+            generator = replace(generator, file=require_content(generator.file, generator.sha256))
         found = made(generator, "generate", times, stream(self.seed, "input", replicate))
         if not isinstance(found, HeldSignal):
             text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
@@ -355,9 +355,8 @@ class MeasuredSource:
         """Read the record."""
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
-        if self.sha256 is not None:
-            require_content(self.file, self.sha256)
-        whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
+        file = self.file if self.sha256 is None else require_content(self.file, self.sha256)
+        whole = read_record(file, time=self.time, input=self.input, output=self.output, hold=self.hold)
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
         used = f"the {count} samples used for estimation"
@@ -370,7 +369,7 @@ class MeasuredSource:
             raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
         loop = None
         if self.reference is not None:
-            r = read_held_signal(self.file, time=self.time, input=self.reference).values[:count]
+            r = read_held_signal(file, time=self.time, input=self.reference).values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
                 # A record of a loop is refused where its clock is not regular.
@@ -437,13 +436,16 @@ def file_sha256(path: str) -> str:
         raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
 
 
-def require_content(path: str, sha256: str) -> None:
-    """Refuse a file that is not the one that an experiment was planned with."""
+def require_content(path: str, sha256: str) -> str:
+    """Return where a file can be read; refuse one that is not that which an experiment was planned with."""
+    if sha256 in COPIES:
+        return COPIES[sha256]
     found = file_sha256(path)
     if found != sha256:
         planned = f"is not that which the experiment was planned with ({sha256[:12]}…)"
         restore = "restore the file, or run the changed one as an experiment of its own"
         raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")
+    return path
 
 
 # --------------------------------------------------------------------------------------------------------------------

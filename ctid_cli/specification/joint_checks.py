@@ -24,16 +24,13 @@ from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     MAX_COMBINATIONS,
-    Failure,
     Section,
     Variant,
     case_count,
-    grouped,
     known_variants,
     over,
     place_of,
     replaced,
-    swept_in,
     variants,
 )
 from ctid_cli.specification.spec import OF_DATA, Spec

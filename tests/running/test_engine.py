@@ -22,7 +22,7 @@ from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
 from ctid_cli.running.plan import build_plan, current_origin
 from ctid_cli.running.states import States
-from ctid_cli.running.stopping import StopAt
+from ctid_cli.running.stopping import StopRequest
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder
 from ctid_cli.storage.estimates import read_estimates
@@ -331,7 +331,7 @@ def test_the_callers_event_stops_a_run(tmp_path: Path) -> None:
         if progress.stored:
             stop.set()
 
-    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopAt(stop))
+    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopRequest(stop))
     assert summary.stopped_by == "stop"
     assert summary.exit_code == 5
     assert 0 < summary.computed < summary.planned
