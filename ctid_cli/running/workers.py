@@ -37,8 +37,8 @@ from ctid_cli.temporary import TemporaryFolder
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: File beside the records that tells workers to begin nothing more.
-_STOP = "stop"
+#: Files beside the records that tell workers to begin nothing more, and that nothing is left to be done.
+_STOP, _DONE = "stop", "done"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
@@ -135,9 +135,9 @@ def _compute_named(record: Path, task: Task, limits: Limits) -> tuple[Path, list
     return record, [] if record.with_name(_STOP).exists() else compute(task, record, limits)
 
 
-def _wait(stop: Path) -> None:
-    """Keep a worker from taking jobs until nothing more is to be begun."""
-    while not stop.exists():
+def _wait(done: Path) -> None:
+    """Keep a worker from taking jobs until nothing is left to be done."""
+    while not done.exists():
         time.sleep(TICK)
 
 
@@ -276,10 +276,11 @@ class LocalWorkers:
         #: Why the last workers ended before all was done.
         self.trouble = ""
         self._folder = TemporaryFolder()
-        self._stop = self._folder.path / _STOP
+        self._stop, self._done = self._folder.path / _STOP, self._folder.path / _DONE
         self._numbers = itertools.count()
-        #: What is in work, by the place of its record.
+        #: What is in work, by the place of its record, and whether nothing follows.
         self._at_work: dict[Path, Job] = {}
+        self._last = False
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
@@ -288,6 +289,8 @@ class LocalWorkers:
         job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
         self._stop.unlink(missing_ok=True)
+        self._done.unlink(missing_ok=True)
+        self._last = False
         news: queue.SimpleQueue[Any] = queue.SimpleQueue()
         working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
         working.add_done_callback(news.put)
@@ -315,7 +318,7 @@ class LocalWorkers:
                 ending = _remains(record, how)
                 yield self._over(record), ending
         finally:
-            self._stop.touch()
+            self._done.touch()
             self._abandon(working.done)
 
     def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
@@ -338,7 +341,7 @@ class LocalWorkers:
 
         try:
             if self.count == 1:
-                yield delayed(_wait)(self._stop)
+                yield delayed(_wait)(self._done)
             for job in jobs:
                 record, task = self._folder.path / str(next(self._numbers)), task_of(job)
                 self._at_work[record] = job
@@ -350,15 +353,21 @@ class LocalWorkers:
             # joblib would wait for ever.
             news.put(error)
         finally:
-            if self.count == 1:
-                self._stop.touch()
+            self._last = True
+            self._note_end()
 
     def _over(self, record: Path) -> Job:
         """Forget a job that is over."""
         for path in (record, _late(record)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
-        return self._at_work.pop(record)
+        job = self._at_work.pop(record)
+        self._note_end()
+        return job
+
+    def _note_end(self) -> None:
+        if self._last and not self._at_work:
+            self._done.touch()
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
