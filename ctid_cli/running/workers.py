@@ -37,8 +37,8 @@ from ctid_cli.temporary import TemporaryFolder
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: Files beside the records that tell workers to begin nothing more, and that nothing is left to be done.
-_STOP, _DONE = "stop", "done"
+#: Files beside the records: one tells workers to begin nothing more, the other is there while anything is to be done.
+_STOP, _GOING = "stop", "going"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
@@ -135,9 +135,9 @@ def _compute_named(record: Path, task: Task, limits: Limits) -> tuple[Path, list
     return record, [] if record.with_name(_STOP).exists() else compute(task, record, limits)
 
 
-def _wait(done: Path) -> None:
+def _wait(going: Path) -> None:
     """Keep a worker from taking jobs until nothing is left to be done."""
-    while not done.exists():
+    while going.exists():
         time.sleep(TICK)
 
 
@@ -276,7 +276,7 @@ class LocalWorkers:
         #: Why the last workers ended before all was done.
         self.trouble = ""
         self._folder = TemporaryFolder()
-        self._stop, self._done = self._folder.path / _STOP, self._folder.path / _DONE
+        self._stop, self._going = self._folder.path / _STOP, self._folder.path / _GOING
         self._numbers = itertools.count()
         #: What is in work, by the place of its record, and whether nothing follows.
         self._at_work: dict[Path, Job] = {}
@@ -289,8 +289,10 @@ class LocalWorkers:
         job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
         self._stop.unlink(missing_ok=True)
-        self._done.unlink(missing_ok=True)
         self._last = False
+        # Without it both workers of a single job take turns, which is slower and no worse.
+        with suppress(OSError):
+            self._going.touch()
         news: queue.SimpleQueue[Any] = queue.SimpleQueue()
         working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
         working.add_done_callback(news.put)
@@ -318,7 +320,7 @@ class LocalWorkers:
                 ending = _remains(record, how)
                 yield self._over(record), ending
         finally:
-            self._done.touch()
+            self._going.unlink(missing_ok=True)
             self._abandon(working.done)
 
     def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
@@ -341,7 +343,7 @@ class LocalWorkers:
 
         try:
             if self.count == 1:
-                yield delayed(_wait)(self._done)
+                yield delayed(_wait)(self._going)
             for job in jobs:
                 record, task = self._folder.path / str(next(self._numbers)), task_of(job)
                 self._at_work[record] = job
@@ -367,7 +369,7 @@ class LocalWorkers:
 
     def _note_end(self) -> None:
         if self._last and not self._at_work:
-            self._done.touch()
+            self._going.unlink(missing_ok=True)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""

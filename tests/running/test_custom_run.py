@@ -154,7 +154,7 @@ RULE = ("seed: 5}", "seed: 5}\nsuccess: {delay_relative_error: 0.1}")
         (
             (("[raise, die, nan]", "fail"),),
             "estimators.",
-            ["fails on the first data set: LookupError: never (", "true"],
+            ["true", "fails on the first data set: LookupError: never ("],
         ),
     ],
 )

@@ -82,7 +82,6 @@ def test_results_are_sealed_and_read_back(tmp_path):
     summary = run_experiment(plan, folder, jobs=1)
     assert (summary.computed, summary.failed) == (4, 0)
     stored = read_stored(folder)
-    (cell,) = plan.data_cells
     outcomes = outcomes_of(plan.job(0, 0))
     assert {outcome.key for outcome in outcomes} < stored.results.keys()
     for outcome in outcomes:
