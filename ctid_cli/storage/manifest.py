@@ -231,14 +231,6 @@ def whole(manifest: Manifest) -> Manifest:
     return {name: value for name, value in manifest.items() if name != "shard"}
 
 
-def assemble(
-    slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
-) -> dict[str, Any]:
-    """Return an estimate row."""
-    values = {**result, **plan_values(slot, manifest), "seconds": seconds, "cpu_seconds": cpu_seconds}
-    return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
-
-
 def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
     """Return what the plan says of an estimate, apart from swept fields."""
     return {

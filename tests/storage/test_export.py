@@ -16,6 +16,7 @@ import pytest
 
 from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.storage.columns import failed, no_result
+from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.export import open_export, seal, sha256_of
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import slots
@@ -35,7 +36,7 @@ def path(tmp_path: Path) -> Path:
 def read(path: Path) -> dict[Any, Any]:
     export = open_export(path)
     export.verify()
-    return dict(zip(export.keys(), export.results(0, export.count), strict=True))
+    return Estimates(export).results
 
 
 def test_it_holds_what_was_computed_and_explains_itself(path: Path) -> None:
