@@ -47,18 +47,25 @@ class ColumnWriter:
         #: Bytes of the longest text, or coefficients of the longest list.
         self._longest = 1
         self._names: dict[str, None] = {}
+        self._datasets: dict[str, h5py.Dataset] = {}
+
+    @property
+    def is_fixed(self) -> bool:
+        """Return whether the arrays need the same room whatever the values are."""
+        return self._column.type not in ("str", "coefficients", "by name")
 
     def include(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Measure the values of some rows."""
-        values = [row.get(self._column.name) for row in rows]
+        name = self._column.name
+        values = [value for row in rows if (value := row.get(name))]
         match self._column.type:
             case "str":
-                self._longest = max(self._longest, *(len(text.encode()) for text in set(values) if text), 0)
+                self._longest = max(self._longest, *(len(text.encode()) for text in set(values)), 0)
             case "coefficients":
-                self._longest = max(self._longest, *(len(value) for value in values if value), 0)
+                self._longest = max(self._longest, *map(len, values), 0)
             case "by name":
                 for value in values:
-                    if value and not value.keys() <= self._names.keys():
+                    if not value.keys() <= self._names.keys():
                         self._names.update(dict.fromkeys(value))
 
     def create(self, group: h5py.Group, count: int) -> None:
@@ -75,13 +82,13 @@ class ColumnWriter:
         for name, empty in self._arrays([]).items():
             if column.type == "by name" and name == column.name:
                 _write_texts(group, names_of(name), list(self._names))
-            dataset = _dataset(group, name, (count, *empty.shape[1:]), empty.dtype)
-        dataset.attrs.update({key: value for key, value in about.items() if value not in (None, "")})
+            self._datasets[name] = _dataset(group, name, (count, *empty.shape[1:]), empty.dtype)
+        self._datasets[column.name].attrs.update({key: value for key, value in about.items() if value not in (None, "")})
 
-    def write(self, group: h5py.Group, start: int, rows: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, start: int, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the values of some rows, from a place on."""
         for name, array in self._arrays([row.get(self._column.name) for row in rows]).items():
-            group[name][start : start + len(rows)] = array
+            self._datasets[name][start : start + len(rows)] = array
 
     def _arrays(self, values: Sequence[Any]) -> dict[str, AnyArray]:
         """Return values as arrays by name, that with the values last."""

@@ -42,7 +42,6 @@ from ctid_cli.storage.journal import EXPORT, Journal, JournalReader, require_for
 from ctid_cli.storage.manifest import (
     Manifest,
     Slot,
-    plan_values,
     planned_count,
     read_json,
     require_manifest,
@@ -142,9 +141,10 @@ def write_export(target: Any, manifest: Manifest, origins: Callable[[], Sequence
     """Write the file of some estimates; returns their number."""
     stored = _stored_columns(manifest)
     writers, count = [ColumnWriter(column) for column in stored], 0
-    for rows in _rows(results(), manifest, stored):
+    measured = [writer for writer in writers if not writer.is_fixed]
+    for rows in _rows(results(), manifest, stored, 100):
         count += len(rows)
-        for writer in writers:
+        for writer in measured:
             writer.include(rows)
     try:
         with h5py.File(target, "w", libver=_VERSION) as file:
@@ -152,9 +152,9 @@ def write_export(target: Any, manifest: Manifest, origins: Callable[[], Sequence
             group = file.create_group("estimates")
             for writer in writers:
                 writer.create(group, count)
-            for number, rows in enumerate(_rows(results(), manifest, stored)):
+            for number, rows in enumerate(_rows(results(), manifest, stored, ROWS)):
                 for writer in writers:
-                    writer.write(group, number * ROWS, rows)
+                    writer.write(number * ROWS, rows)
     except (OSError, RuntimeError) as error:
         if isinstance(target, _Recorder) and target.error is not None:
             raise target.error from error
@@ -175,19 +175,28 @@ def _stored_columns(manifest: Manifest) -> list[Column]:
 
 
 def _rows(
-    results: Iterable[tuple[Slot, Mapping[str, Any]]], manifest: Manifest, stored: Sequence[Column]
+    results: Iterable[tuple[Slot, Mapping[str, Any]]], manifest: Manifest, stored: Sequence[Column], size: int
 ) -> Iterator[list[dict[str, Any]]]:
     """Yield what belongs into the columns, some rows at a time."""
     texts = {column.name for column in stored if column.type == "str"}
+    known: dict[tuple[str, str, str], dict[str, Any]] = {}
     waiting = iter(results)
-    while some := list(islice(waiting, ROWS)):
+    while some := list(islice(waiting, size)):
         rows = []
-        for slot, result in some:
-            row = {**result, **plan_values(slot, manifest), "estimator_hash": slot.key.estimator_hash}
-            for name, value in slot.swept.items():
-                of = f"swept/{name}"
-                row[of] = canonical_json(value) if of in texts else value
-            rows.append(row)
+        for (key, cell, estimator), result in some:
+            part = key.data_hash, key.estimator_hash, estimator["name"]
+            if part not in known:
+                swept = {f"swept/{name}": value for name, value in {**cell["swept"], **estimator["swept"]}.items()}
+                known[part] = {
+                    "estimator_hash": key.estimator_hash,
+                    "estimator": estimator["name"],
+                    "kind": estimator["kind"],
+                    "cell": key.data_hash,
+                    **{name: canonical_json(value) if name in texts else value for name, value in swept.items()},
+                }
+            delay = manifest["starts"].get(key.start)
+            own = {"id": key.id, "replicate": key.replicate, "start": key.start, "initial_delay": delay}
+            rows.append({**result, **known[part], **own})
         yield rows
 
 
