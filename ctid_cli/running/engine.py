@@ -1,4 +1,4 @@
-"""Running an experiment: compute what is missing, store it as it comes, seal it at the end.
+"""Running an experiment: compute what is missing, store it as it comes, export it at the end.
 
 The same call starts, resumes and re-verifies an experiment. Only this process writes; workers return results. An
 estimate is reported as done after the journal has it safely.
@@ -26,13 +26,15 @@ from ctid_cli.running.states import States
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
 from ctid_cli.running.suspects import Course, GivenUp, Slow, Suspected
 from ctid_cli.running.workers import LocalWorkers
+from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import FILE_NAME, Journal, open_journal
+from ctid_cli.storage.journal import Journal, open_journal
+from ctid_cli.storage.keeping import keep_readable as keep_readable_of
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.merge import keep_readable as keep_readable_of
+from ctid_cli.storage.sqlite_file import FILE_NAME
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
@@ -144,7 +146,7 @@ def run_experiment(
     dask: str | None = None,
     warm: Callable[[Plan], object] = compile_kernels,
 ) -> RunSummary:
-    """Compute the missing estimates of a plan and seal all of them.
+    """Compute the missing estimates of a plan and export all of them.
 
     They are computed by `jobs` processes of this machine, or by the workers of the dask scheduler at an address. Stored
     failures of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
@@ -185,7 +187,7 @@ def run_experiment(
         if found.state is None or log.state() != found.state:
             found = _Found(as_needed(plan, log), States.read(log, retry, limits))
         run = _Run(found, folder, log, origin, progress)
-        stack.callback(place.retract, folder)
+        stack.callback(announcement.retract, folder)
         run.start({"jobs": workers.count, "limits": asdict(limits)})
         run.compute(workers, limits, stopping)
         while not stopping() and run.needs_more():
@@ -194,7 +196,7 @@ def run_experiment(
 
 
 class _Run:
-    """One run, from the first entry in the journal to the sealed file."""
+    """One run, from the first entry in the journal to ``runs.h5``."""
 
     def __init__(
         self,
@@ -321,11 +323,12 @@ class _Run:
         return []
 
     def _tell(self, **what: Any) -> None:
-        place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
+        counts = self.done, self.total, self.states.stored
+        announcement.announce(self.folder, self.plan.experiment, self.started, *counts)
         self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        seal(self.folder, self.log)
+        write_runs(self.folder, self.log)
         counts = self.states.counts(self.plan)
         missing = counts.planned - counts.reused
         reason = reason or (MACHINE if self.given_up else None)

@@ -83,7 +83,8 @@ class ColumnWriter:
             if column.type == "by name" and name == column.name:
                 _write_texts(group, names_of(name), list(self._names))
             self._datasets[name] = _dataset(group, name, (count, *empty.shape[1:]), empty.dtype)
-        self._datasets[column.name].attrs.update({key: value for key, value in about.items() if value not in (None, "")})
+        given = {key: value for key, value in about.items() if value not in (None, "")}
+        self._datasets[column.name].attrs.update(given)
 
     def write(self, start: int, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the values of some rows, from a place on."""

@@ -33,7 +33,6 @@ from ctid_cli.storage import folder as place
 from ctid_cli.storage.column_arrays import ROWS, AnyArray
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal import EXPORT
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -44,6 +43,7 @@ from ctid_cli.storage.manifest import (
     swept_names,
     true_values,
 )
+from ctid_cli.storage.sqlite_file import EXPORT
 
 if TYPE_CHECKING:
     import pandas as pd

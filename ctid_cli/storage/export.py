@@ -38,7 +38,7 @@ from ctid_cli.storage.column_arrays import (
 )
 from ctid_cli.storage.columns import Column
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal import EXPORT, Journal, JournalReader, require_format
+from ctid_cli.storage.journal import Journal, JournalReader
 from ctid_cli.storage.manifest import (
     Manifest,
     Slot,
@@ -48,6 +48,7 @@ from ctid_cli.storage.manifest import (
     row_columns,
     swept_names,
 )
+from ctid_cli.storage.sqlite_file import EXPORT, require_format
 from ctid_cli.written_files import replace_file
 
 KIND, FORMAT = "ctid runs", 2
@@ -65,7 +66,7 @@ Results = Callable[[], Iterable[tuple[Slot, Mapping[str, Any]]]]
 # --- writing --------------------------------------------------------------------------------------------------------
 
 
-def seal(folder: Path, log: Journal) -> tuple[int, str]:
+def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
     """Write the estimates of the journal's plan to ``runs.h5``; returns their number and the SHA-256 of the file."""
     path, noted = folder / EXPORT, log.exported()
     if noted is not None and sha256_of(path) == noted:
