@@ -155,7 +155,7 @@ def run(
         for plan, folder in zip(plans, folders, strict=True):
             typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **how), folder)}")
         return
-    # What was imported stays: looking for garbage in it again and again would be a tenth of sealing many estimates.
+    # What was imported stays: looking for garbage in it again and again would be a tenth of exporting many estimates.
     gc.freeze()
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):

@@ -1,4 +1,4 @@
-"""Running an experiment: compute what is missing, store it as it comes, seal it at the end.
+"""Running an experiment: compute what is missing, store it as it comes, export it at the end.
 
 The same call starts, resumes and re-verifies an experiment. Only this process writes; workers return results. An
 estimate is reported as done after the journal has it safely.
@@ -26,13 +26,15 @@ from ctid_cli.running.states import States
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopRequest
 from ctid_cli.running.suspects import NAMED, Course
 from ctid_cli.running.workers import LocalWorkers
+from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import FILE_NAME, Journal, JournalReader, open_journal
+from ctid_cli.storage.journal import Journal, JournalReader, open_journal
+from ctid_cli.storage.keeping import keep_readable as keep_readable_of
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.merge import keep_readable as keep_readable_of
+from ctid_cli.storage.sqlite_file import FILE_NAME
 from ctid_cli.text import count
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
@@ -158,7 +160,7 @@ def run_experiment(
     dask: str | None = None,
     warm: Callable[[Plan], object] = compile_kernels,
 ) -> RunSummary:
-    """Compute the missing estimates of a plan and seal all of them.
+    """Compute the missing estimates of a plan and export all of them.
 
     They are computed by `jobs` processes of this machine, or by the workers of the dask scheduler at an address. Stored
     failures of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
@@ -197,7 +199,7 @@ def run_experiment(
         if found.state is None or log.state() != found.state:
             found = _found(plan, log, retry, limits)
         run = _Run(found, folder, log, progress)
-        stack.callback(place.retract, folder)
+        stack.callback(announcement.retract, folder)
         run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
         run.compute(workers, limits, stopping)
         while not stopping() and run.needs_more():
@@ -206,7 +208,7 @@ def run_experiment(
 
 
 class _Run:
-    """One run, from the first entry in the journal to the sealed file."""
+    """One run, from the first entry in the journal to ``runs.h5``."""
 
     def __init__(self, found: _Found, folder: Path, log: Journal, progress: Callable[[Progress], object]) -> None:
         self.plan, self.states, self.missing, self.work, _ = found
@@ -300,12 +302,13 @@ class _Run:
         return []
 
     def _tell(self, **what: Any) -> None:
-        place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
+        counts = self.done, self.total, self.states.stored
+        announcement.announce(self.folder, self.plan.experiment, self.started, *counts)
         self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        """Seal what is stored, and note how the run ended."""
-        seal(self.folder, self.log)
+        """Write ``runs.h5``, and note how the run ended."""
+        write_runs(self.folder, self.log)
         counts = self.states.counts(self.plan)
         missing = counts.planned - counts.reused
         reason = reason or (MACHINE if self.given_up else None)

@@ -1,4 +1,4 @@
-"""The columns of stored estimates: the one list that journal, sealed file, tables, export, JSON and documentation read.
+"""The columns of stored estimates: the one list that journal, runs.h5, tables, export, JSON and documentation read.
 
 A column that is added here, and given a value where estimates are made, appears in all of them; in results that were
 stored before, it is missing.

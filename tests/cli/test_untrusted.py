@@ -14,7 +14,7 @@ from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.journal import open_journal
 from tests.storage.made_results import ORIGIN, SPEC, outcomes_of, plan_of
 
@@ -203,7 +203,7 @@ def stored(inside):
     place.mkdir(parents=True)
     manifest, log = plan_of(1).manifest(), open_journal(place / "journal.sqlite")
     log.add(outcomes_of(manifest), log.begin(manifest, ORIGIN, "now", {}))
-    seal(place, log)
+    write_runs(place, log)
     log.close()
     return place
 
