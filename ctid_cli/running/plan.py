@@ -234,7 +234,7 @@ def simulate_dataset(
         A specification: the path of a YAML file, or its content.
     key : tuple of int
         Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
-        fastest, in the order of the sections system, excitation, loop, sampling, noise, recorder, signal, disturbance.
+        fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance.
     overrides : sequence of str, default ()
         Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
     allow_code : bool, default False
@@ -258,8 +258,8 @@ def simulate_dataset(
 
     Notes
     -----
-    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input, the
-    noise and the recorder come from streams of their own, so that cases which differ in the noise have the same input.
+    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input and
+    the noise come from streams of their own, so that cases which differ in the noise have the same input.
 
     Examples
     --------

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
-from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.regularity import REGULARITY, regular_interval
+from ctid_cli.signals.held import REGULARITY, HeldSignal, Hold, regular_interval
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]

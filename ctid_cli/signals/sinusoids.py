@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_choice, require_finite, require_positive
-from ctid_cli.signals.drifts import ContinuousNoise, noise_at
 from ctid_cli.signals.held import COINCIDENCE
 from ctid_cli.signals.noise import Noise
 
@@ -205,7 +204,7 @@ class SineDisturbance:
         return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
 
 
-Disturbance = UniformDisturbance | SineDisturbance | Noise | ContinuousNoise
+Disturbance = UniformDisturbance | SineDisturbance | Noise
 
 
 def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
@@ -214,7 +213,7 @@ def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: n
         return signal
     if isinstance(disturbance, SineDisturbance):
         return signal + disturbance.at(times)
-    return signal + noise_at(disturbance, times, signal, rng)
+    return signal + disturbance.generate(signal, rng)
 
 
 def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> None:

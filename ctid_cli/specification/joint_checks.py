@@ -53,7 +53,7 @@ MAX_TRIAL_SAMPLES = 20_000_000
 
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -81,7 +81,7 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
 
 
 def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise", "recorder"):
+    for name in (*_SIMULATED, "noise"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
     if _reference(raw, "loop") is not None:
@@ -126,8 +126,7 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
     for name, (content, section) in parts.items():
         if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
             return name
-    recorder = raw.get("recorder")
-    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""
+    return ""
 
 
 def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
@@ -164,7 +163,7 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     yield from _precision_complaints(spec, broken)
     yield from _same_estimators(spec)
     yield from _world_complaints(spec, broken)
-    samplings = known_variants(spec.sampling)
+    samplings = spec.samplings if files_are_good else []
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
     too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
     yield from too_long
@@ -269,11 +268,11 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
     # Random intervals stand for themselves at their mean.
     plans = [(case, case.options) for case in samplings]
-    return [Variant({}, case.swept, Extent(options.mean_interval, options.samples)) for case, options in plans]
+    return [Variant({}, case.swept, Extent(options.mean_interval, options.length)) for case, options in plans]
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
-    if sampling.samples > MAX_SAMPLES:
+    if sampling.length > MAX_SAMPLES:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
@@ -468,8 +467,8 @@ def _trial_complaints(spec: Spec) -> Iterator[Complaint]:
     parts: dict[KeyPath, Sequence[Variant]]
     parts = {(name,): variants(section) for name, section in sections.items() if not section.custom}
     parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
-    # Levels of noise, and losses, decide on nothing else: they take turns.
-    turns = {at: parts.pop(at) for at in (("noise",), ("recorder",)) if at in parts}
+    # Levels of noise decide on nothing else: they take turns.
+    turns = {at: parts.pop(at) for at in (("noise",),) if at in parts}
     failures: list[Failure] = []
     tried: list[Mapping[KeyPath, Any]] = []
     samples = 0
@@ -477,11 +476,12 @@ def _trial_complaints(spec: Spec) -> Iterator[Complaint]:
         case = dict(zip(parts, point, strict=True))
         others = {at: found[k % len(found)] for at, found in turns.items()}
         options = {str(at[0]): variant.options for at, variant in (case | others).items()}
-        samples += options["sampling"].samples
+        source = spec.simulated_source(options, spec.folder)
+        samples += source.sampling.length
         if samples > MAX_TRIAL_SAMPLES and tried:
             break
         tried.append(swept_in(case))
-        for place, message in trial(spec.simulated_source(options, spec.folder)):
+        for place, message in trial(source):
             failures.append((place, message, tried[-1]))
     yield from grouped(failures, tried)
 
