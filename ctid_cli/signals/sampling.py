@@ -167,7 +167,7 @@ class IrregularSampling(OfInterval):
     Parameters
     ----------
     interval : float
-        Mean interval [s].
+        Mean interval [s]; in place of interval and samples, ``times`` may list the instants, or ``file`` name a file.
     samples : int
         Number of samples, at least 2.
     spread : float, default 0.5
@@ -236,8 +236,16 @@ class JitteredSampling(OfInterval):
         return ticks
 
 
+class GivenInstants(Sampling):
+    """Samples at instants that are known before any data are made; the record begins at the first of them."""
+
+    kind: ClassVar[str] = "irregular"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
+
+
 @dataclass(frozen=True)
-class ListedInstants(Sampling):
+class ListedInstants(GivenInstants):
     """Samples at instants that are listed.
 
     Parameters
@@ -248,10 +256,6 @@ class ListedInstants(Sampling):
         What the estimator is told of the input: its samples at the output's instants, or its true edges.
     """
 
-    kind: ClassVar[str] = "irregular"
-    #: No random number is drawn.
-    deterministic: ClassVar[bool] = True
-
     instants: tuple[float, ...]
     input_record: InputRecord = "exact"
 
@@ -261,7 +265,7 @@ class ListedInstants(Sampling):
 
 
 @dataclass(frozen=True)
-class InstantsFile(Sampling):
+class InstantsFile(GivenInstants):
     """Samples at instants from a comma-separated file.
 
     Parameters
@@ -274,15 +278,7 @@ class InstantsFile(Sampling):
         SHA-256 of the file, to make sure of its content; a specification fills it in from the file.
     input_record : {"sampled", "exact"}, default "exact"
         What the estimator is told of the input: its samples at the output's instants, or its true edges.
-
-    Notes
-    -----
-    The record begins at the first instant of the file, whatever it is.
     """
-
-    kind: ClassVar[str] = "irregular"
-    #: No random number is drawn.
-    deterministic: ClassVar[bool] = True
 
     file: str
     time: str = "t"

@@ -20,7 +20,7 @@ from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.dataset import SimulatedSource, additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
@@ -245,7 +245,7 @@ class Extent:
 
     interval: float
     samples: int
-    #: Instants of the samples of a measured record [s].
+    #: Instants of the samples from the first one on, where they are known [s].
     times: Array | None = None
 
     @property
@@ -266,9 +266,15 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
-    # Random intervals stand for themselves at their mean.
-    plans = [(case, case.options) for case in samplings]
-    return [Variant({}, case.swept, Extent(options.mean_interval, options.length)) for case, options in plans]
+    return [Variant({}, case.swept, _extent_of(case.options)) for case in samplings]
+
+
+def _extent_of(sampling: Any) -> Extent:
+    """Return how long the records of a sampling scheme are; random intervals stand for themselves at their mean."""
+    if not isinstance(sampling, GivenInstants):
+        return Extent(sampling.mean_interval, sampling.length)
+    times = sampling.times(np.random.default_rng(0))
+    return Extent(float(np.ptp(times)) / (times.size - 1), times.size, times - times[0])
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:

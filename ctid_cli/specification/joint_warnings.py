@@ -65,9 +65,8 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     fastest = float(np.abs(systems[0].options.poles).max(initial=0.0))
     warnings += over({(): samplings}, partial(_of_slow_sampling, fastest))
     lengths: dict[KeyPath, list[Variant]] = {("system",): systems, ("sampling",): extents(spec, samplings)}
-    warnings += over(
-        lengths, partial(_of_short_record, "duration" if hasattr(spec.sampling, "duration") else "samples")
-    )
+    key = next((name for name in ("duration", "times", "file") if hasattr(spec.sampling, name)), "samples")
+    warnings += over(lengths, partial(_of_short_record, key))
     for at, section in estimators.items():
         cases = known_variants(section)
         warnings += over({("system",): systems, at: cases}, partial(_of_delay, at, in_loop=spec.loop is not None))
@@ -98,8 +97,11 @@ def _of_short_record(key: str, system: Any, extent: Extent) -> Iterator[Complain
             f"a record of {extent.duration:.4g} s{delayed} shows little of the slowest pole, whose time constant is "
         )
         short += f"{slowest:.4g} s"
-        enough = f"{needed:.3g}" if key == "duration" else math.ceil(needed / extent.interval) + 1
-        yield ("sampling", key), f"{short}; write {key}: {enough} or more"
+        cures = {
+            "duration": f"write duration: {needed:.3g} or more",
+            "samples": f"write samples: {math.ceil(needed / extent.interval) + 1} or more",
+        }
+        yield ("sampling", key), f"{short}; {cures.get(key, f'it must last {needed:.3g} s or more')}"
 
 
 def _of_sampled_input(spec: Spec, excitation: Any, sampling: Any) -> Iterator[Complaint]:
