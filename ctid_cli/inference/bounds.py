@@ -160,8 +160,6 @@ def _record_covariance(
         u = simulate_loop(system, loop.controller, loop.reference, 0.0, interval, loop.enters).u
         signal = HeldSignal(record.t, u)
     psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
-    # Nothing is learnt from outputs that are missing; the others keep their distances.
-    psi = psi * record.valid[:, None]
     if form.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + form.delay_from]
     lags = np.arange(psi.shape[0] if noise.coloured else 1)
