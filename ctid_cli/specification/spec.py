@@ -126,16 +126,9 @@ class ListedTimesSection(Section):
         return ListedInstants(tuple(self.times), self.part("input_record"))
 
 
-class TimesFileSection(section_for(InstantsFile, "irregular")):  # type: ignore[misc]
-    """Samples at instants from a comma-separated file."""
-
-    elsewhere = dict.fromkeys(
-        ("interval", "samples", "spread"), "gives the instants a second time, they are read from 'file'"
-    )
-
-
 _DrawnSection = Annotated[Section, Kinds("sampling", custom="sampling")]
-_FileOrDrawn = Annotated[Section, WithKey("file", TimesFileSection, _DrawnSection, kind="irregular")]
+_OfFile = section_for(InstantsFile, "irregular")
+_FileOrDrawn = Annotated[Section, WithKey("file", _OfFile, _DrawnSection, kind="irregular")]
 _IrregularSection = Annotated[Section, WithKey("times", ListedTimesSection, _FileOrDrawn, kind="irregular")]
 AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, _IrregularSection, kind="regular")]
 NoiseSection = Annotated[Section, Kinds("noise", custom="noise")]

@@ -13,10 +13,11 @@ from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
+from ctid_cli.signals.sampling import InstantsFile
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.messages import option_docs
-from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSection, TimesFileSection
+from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSection
 from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
 
 if TYPE_CHECKING:
@@ -30,7 +31,11 @@ _SECTIONS = {
     "data": MeasuredSource,
 }
 #: Forms of the sampling that a key tells apart from others of the same kind.
-_SAMPLING_FORMS = {"duration": RegularDurationSection, "times": ListedTimesSection, "file": TimesFileSection}
+_SAMPLING_FORMS: dict[str, type] = {
+    "duration": RegularDurationSection,
+    "times": ListedTimesSection,
+    "file": InstantsFile,
+}
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]
 
