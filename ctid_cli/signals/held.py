@@ -89,7 +89,7 @@ class HeldSignal:
 
     @cached_property
     def periodic_lines(self) -> HeldSignal:
-        """The same of a signal that repeats itself one interval after its last sample."""
+        """Lines of a signal that repeats itself one interval after its last sample."""
         return self._in_lines(periodic=True)
 
     def _in_lines(self, *, periodic: bool) -> HeldSignal:
@@ -109,7 +109,7 @@ class HeldSignal:
         return float(self.values.mean())
 
     def at(self, times: ArrayLike) -> Array:
-        """Value of the signal at given instants, from the right at a jump.
+        """Return the signal at given instants, from the right at a jump.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class HeldSignal:
         return np.where(index < 0, 0.0, held)
 
     def delayed(self, delay: float) -> HeldSignal:
-        """The same signal, later by ``delay``.
+        """Return the signal delayed by ``delay``.
 
         Parameters
         ----------

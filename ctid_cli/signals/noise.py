@@ -73,7 +73,7 @@ class Noise:
         return None if deviation is None else deviation**2
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the innovations.
+        """Return the variance of the innovations.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Noise:
         return variance / self._unit_variance
 
     def variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the noise: that for unit innovations times theirs.
+        """Return the variance of the noise: that for unit innovations times theirs.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class Noise:
         return self._unit_variance * self.innovation_variance_of(noise_free)
 
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """Covariance of samples at a distance, from the first state's stationary covariance on.
+        """Return the covariance of samples at a distance.
 
         Parameters
         ----------
@@ -141,7 +141,7 @@ class Noise:
         return np.asarray(self.innovation_variance_of(noise_free) * covariances[distances], dtype=float)
 
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record: filtered innovations; the first state is drawn from its stationary distribution.
+        """Draw the noise of one record: filtered innovations, the first state from its stationary distribution.
 
         Parameters
         ----------
