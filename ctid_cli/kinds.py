@@ -9,9 +9,6 @@ from typing import Any
 _NOISES = {
     "white": "ctid_cli.signals.noise:WhiteNoise",
     "arma": "ctid_cli.signals.noise:ArmaNoise",
-    "random_walk": "ctid_cli.signals.drifts:RandomWalk",
-    "one_over_f": "ctid_cli.signals.drifts:OneOverFNoise",
-    "outliers": "ctid_cli.signals.noise:OutlierNoise",
 }
 #: Section, or what stands in it, to the kinds that it may have, to where the class of each is: ``module:Class``.
 KINDS: dict[str, dict[str, str]] = {
@@ -19,21 +16,16 @@ KINDS: dict[str, dict[str, str]] = {
         "prbs": "ctid_cli.signals.excitation:Prbs",
         "gbn": "ctid_cli.signals.excitation:Gbn",
         "multisine": "ctid_cli.signals.multisine:Multisine",
-        "chirp": "ctid_cli.signals.chirp:Chirp",
         "gaussian": "ctid_cli.signals.excitation:Gaussian",
         "step": "ctid_cli.signals.excitation:Step",
-        "steps": "ctid_cli.signals.steps:Steps",
-        "doublets": "ctid_cli.signals.steps:Doublets",
+        "steps": "ctid_cli.signals.excitation:Steps",
         "file": "ctid_cli.signals.excitation:InputFile",
     },
     "sampling": {
         "regular": "ctid_cli.signals.sampling:RegularSampling",
-        "irregular": "ctid_cli.signals.irregular:IrregularSampling",
+        "irregular": "ctid_cli.signals.sampling:IrregularSampling",
         "uniform_intervals": "ctid_cli.signals.sampling:UniformIntervals",
-        "jitter": "ctid_cli.signals.irregular:JitteredSampling",
-        "missing_samples": "ctid_cli.signals.irregular:MissingSamples",
-        "poisson": "ctid_cli.signals.irregular:PoissonSampling",
-        "send_on_delta": "ctid_cli.signals.send_on_delta:SendOnDelta",
+        "jitter": "ctid_cli.signals.sampling:JitteredSampling",
     },
     "noise": _NOISES,
     "disturbance": {

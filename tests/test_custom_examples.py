@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import chirp
 from typer.testing import CliRunner
+
+from ctid_cli import simulate_dataset
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 
@@ -22,7 +25,7 @@ def ctid(*arguments, code=0, env=None):
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
-    files = [EXAMPLES / "custom_study.yaml", EXAMPLES / "tank.yaml"]
+    files = [EXAMPLES / "custom_study.yaml", EXAMPLES / "tank.yaml", EXAMPLES / "robust.yaml"]
     assert ctid("run", *files, "--allow-code", "--quiet", "--jobs", "2", "--out", folder).stdout == ""
     return folder
 
@@ -45,6 +48,23 @@ def test_the_tank_is_nearly_linear(out):
     rows = json.loads(ctid("export", "tank", "--format", "json", "--out", out).stdout)
     found = np.array([[row["numerator"][0], row["denominator"][1]] for row in rows])
     np.testing.assert_allclose(found, [[0.5, 0.25]] * 4, rtol=0.03)
+
+
+def test_a_robust_loss_sees_less_of_a_faulty_sensor(out):
+    record = simulate_dataset(EXAMPLES / "robust.yaml", (0, 0), allow_code=True).record
+    ends = np.array([0.1, 10.0]) / (2 * np.pi)
+    expected = chirp(record.t, ends[0], record.t[-1], ends[1], "logarithmic", phi=-90)
+    np.testing.assert_allclose(record.input.values, expected, atol=1e-9)
+    errors = np.abs(record.y - record.noise_free)[record.valid]
+    assert 0.05 < np.mean(~record.valid) < 0.15
+    assert 0.02 < np.mean(errors > 4 * 0.05) < 0.08
+    rows = json.loads(ctid("export", "robust", "--format", "json", "--out", out).stdout)
+    assert {row["status"] for row in rows} == {"CONVERGED"}
+    squares, tukey = (
+        np.mean([(row["delay"] - 0.35) ** 2 for row in rows if row["estimator"] == name])
+        for name in ("squares", "tukey")
+    )
+    assert tukey < squares
 
 
 def test_one_estimate_is_computed_once_more_with_permission_only(out):
@@ -83,6 +103,7 @@ def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
 def test_the_documentation_names_what_there_is():
     text = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))
-    assert {"output_error.py", "external_fit.py", "bursts.py", "tank.py"} <= names
+    examples = {"output_error.py", "external_fit.py", "bursts.py", "tank.py", "chirp.py", "faulty_sensor.py"}
+    assert examples <= names
     for name in names:
         assert (EXAMPLES / name).is_file(), name

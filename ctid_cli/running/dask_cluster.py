@@ -43,7 +43,7 @@ class DaskWorkers:
         except ImportError:
             raise UsageError("--dask needs dask.distributed; install it with: pip install 'ctid[dask]'") from None
         self._address, self._limits = address, limits
-        content = _content(plan)
+        contents = _contents(plan)
         try:
             self._client = Client(address, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
         except (OSError, ValueError, TimeoutError) as error:
@@ -51,7 +51,7 @@ class DaskWorkers:
             raise UsageError(f"no scheduler of dask answers at {address} ({error}); {advice}") from None
         self._expected = packed(origin, computing_parts(plan))
         # A task, because what is scattered to workers is lost with them.
-        self._file = self._client.submit(tuple, content, pure=False)
+        self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
         #: What is in work, and since when [s].
         self._at_work: dict[Job, float] = {}
@@ -86,7 +86,7 @@ class DaskWorkers:
         def submit(job: Job, task: Task) -> Future[Ending]:
             self._at_work[job] = time.monotonic()
             future: Future[Ending] = self._executor.submit(
-                on_worker, function, task, self._limits, self._expected, self._file
+                on_worker, function, task, self._limits, self._expected, self._files
             )
             return future
 
@@ -118,15 +118,15 @@ def _died(job: Job, error: Exception) -> Ending:
     return Ending([Begun(job.keys)], f"{type(error).__name__}: the workers that had it died or were lost")
 
 
-def _content(plan: Plan) -> tuple[Any, ...]:
-    """Return SHA-256, name and content of the file that data sets are made from; nothing where they need none."""
-    if plan.file is None:
-        return ()
-    path, sha256 = Path(plan.file[0]), plan.file[1]
-    try:
-        return sha256, path.name, path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: the file cannot be read: {error.strerror}") from error
+def _contents(plan: Plan) -> dict[str, bytes]:
+    """Return the content of each file that data sets are made from, by its SHA-256."""
+    contents = {}
+    for path, sha256 in plan.files:
+        try:
+            contents[sha256] = Path(path).read_bytes()
+        except OSError as error:
+            raise DataError(f"{path}: the file cannot be read: {error.strerror}") from error
+    return contents
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -134,14 +134,13 @@ def _content(plan: Plan) -> tuple[Any, ...]:
 
 
 def on_worker(
-    function: Callable[..., Ending], task: Task, limits: Limits, expected: bytes, file: tuple[Any, ...]
+    function: Callable[..., Ending], task: Task, limits: Limits, expected: bytes, files: dict[str, bytes]
 ) -> Ending:
     """Compute a job on a worker that is as the process of the run."""
     _require_same(expected)
-    if file and file[0] not in COPIES:
-        sha256, name, content = file
-        copy = _kept().path / name
-        copy.write_bytes(content)
+    for sha256 in files.keys() - COPIES.keys():
+        copy = _kept().path / sha256
+        copy.write_bytes(files[sha256])
         COPIES[sha256] = str(copy)
     with TemporaryFolder() as folder:
         return function(task, limits, folder)
@@ -154,7 +153,7 @@ def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
 
 @cache
 def _kept() -> TemporaryFolder:
-    """Return the folder of the file that was sent, for as long as this worker lives."""
+    """Return the folder of the files that were sent, for as long as this worker lives."""
     return TemporaryFolder()
 
 

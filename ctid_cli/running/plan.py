@@ -98,12 +98,11 @@ class Plan:
         return dataclasses.replace(self, shard=shard)
 
     @property
-    def file(self) -> tuple[str, str] | None:
-        """Path and SHA-256 of the file that data sets are made from; None where they need none."""
-        section: Any = self.spec.data or (self.spec.generator or ((), None))[1]
-        if getattr(section, "sha256", None) is None or section.custom:
-            return None
-        return joined(self.spec.folder.resolve(), section.file), section.sha256
+    def files(self) -> list[tuple[str, str]]:
+        """Path and SHA-256 of each file that data sets are made from."""
+        sections: list[Any] = [self.spec.data, self.spec.sampling, (self.spec.generator or ((), None))[1]]
+        read = [one for one in sections if getattr(one, "sha256", None) is not None and not one.custom]
+        return [(joined(self.spec.folder.resolve(), section.file), section.sha256) for section in read]
 
     def keys(self, cell: int, replicate: int) -> list[Wanted]:
         """Return the estimates wanted of a data set."""
@@ -210,7 +209,7 @@ def simulate_dataset(
         A specification: the path of a YAML file, or its content.
     key : tuple of int
         Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
-        fastest, in the order of the sections system, excitation, loop, sampling, noise, recorder, signal, disturbance.
+        fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance.
     overrides : sequence of str, default ()
         Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
     allow_code : bool, default False
@@ -234,8 +233,8 @@ def simulate_dataset(
 
     Notes
     -----
-    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input, the
-    noise and the recorder come from streams of their own, so that cases which differ in the noise have the same input.
+    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input and
+    the noise come from streams of their own, so that cases which differ in the noise have the same input.
 
     Examples
     --------

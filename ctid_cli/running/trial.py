@@ -111,7 +111,7 @@ def try_out(spec: Spec) -> Found:
 
 
 def _settings(spec: Spec) -> list[Setting]:
-    """Return the distinct settings; levels of noise, and losses, decide on nothing else and take turns."""
+    """Return the distinct settings; levels of noise decide on nothing else and take turns."""
     parts: dict[KeyPath, Sequence[Variant]]
     parts = {(name,): variants(section) for name in OF_DATA if (section := getattr(spec, name)) is not None}
     if spec.signal is None and spec.data is None:
@@ -121,14 +121,14 @@ def _settings(spec: Spec) -> list[Setting]:
         parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
     if spec.data is None and spec.sampling is None:
         return []
-    turns = {at: parts.pop(at) for at in (("noise",), ("recorder",)) if at in parts}
+    turns = {at: parts.pop(at) for at in (("noise",),) if at in parts}
     settings: list[Setting] = []
     samples = 0
     for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
         case = dict(zip(parts, point, strict=True))
         chosen = case | {at: found[k % len(found)] for at, found in turns.items()}
         options = {str(at[0]): variant.options for at, variant in chosen.items()}
-        samples += getattr(options.get("sampling"), "samples", 0)
+        samples += 0 if spec.sampling is None or spec.sampling.custom else options["sampling"].length
         if samples > MAX_TRIAL_SAMPLES and settings:
             break
         system = chosen.get(("system",))

@@ -20,7 +20,7 @@ from ctid_cli.inference.criteria import fit_percent
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals import drifts, noise
+from ctid_cli.signals import noise
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.text import did_you_mean
@@ -173,7 +173,6 @@ class Estimator(ABC):
 System.register(TransferFunction)
 System.register(AdditiveModel)
 Noise.register(noise.Noise)
-Noise.register(drifts.ContinuousNoise)  # type: ignore[type-abstract]
 Estimator.register(common.Estimator)
 
 

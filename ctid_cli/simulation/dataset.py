@@ -24,16 +24,13 @@ from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
-from ctid_cli.signals.excitation import Excitation, InputFile
+from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.files import COPIES, require_file
-from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.record import Enters, Loop, Record
-from ctid_cli.signals.recorder import Recorder
-from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.sampling import Sampling
-from ctid_cli.signals.send_on_delta import SendOnDelta
-from ctid_cli.signals.streams import stream
 from ctid_cli.signals.table import split_header
 from ctid_cli.simulation.components import ComponentError, Noise, System, is_custom
 
@@ -155,7 +152,6 @@ class SimulatedSource:
     noise: Noise | None
     seed: int
     loop: LoopOptions | None = None
-    recorder: Recorder = field(default_factory=Recorder)
     #: Whether models are tried on a data set besides the one that they are estimated from.
     fresh: bool = False
 
@@ -191,7 +187,7 @@ class SimulatedSource:
 
     def _realised(self, replicate: int) -> DataSet:
         with at("sampling"):
-            times = samples_of(self.sampling, "times", stream(self.seed, "sampling", replicate))
+            times = samples_of(_as_planned(self.sampling), "times", stream(self.seed, "sampling", replicate))
             if times.size < 2 or not (np.diff(times) > 0).all():
                 wanted = "must return two or more instants that increase"
                 raise ComponentError(f"{_called(self.sampling, 'times')} {wanted}")
@@ -207,24 +203,18 @@ class SimulatedSource:
                 output = samples_of(self.system, "simulate", applied, times, size=times.size)
             else:
                 output = _simulated(true_model, applied, times)
-        y = self.recorder.rounded(output + self._drawn(times, output, replicate))
-        if isinstance(self.sampling, SendOnDelta):
-            with at("sampling"):
-                sent = self.sampling.sent(y)
-            times, output, y = times[sent], output[sent], y[sent]
+        y = output + self._drawn(times, output, replicate)
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
-        record = Record(times, self._with_losses(y, replicate), known, noise_free=output)
-        return DataSet(record, true_model=true_model)
+        return DataSet(Record(times, y, known, noise_free=output), true_model=true_model)
 
     def _applied(self, times: Array, replicate: int) -> HeldSignal:
         """Return what drives the simulation: the input, or the reference of the loop."""
         generator = self.excitation if self.loop is None else self.loop.reference
         if generator is None:  # a relay needs no reference
             return HeldSignal(times[:1], np.zeros(1))
-        if isinstance(generator, InputFile) and generator.sha256 is not None:
-            generator = replace(generator, file=require_content(generator.file, generator.sha256))
+        generator = _as_planned(generator)
         found = made(generator, "generate", times, stream(self.seed, "input", replicate))
         if not isinstance(found, HeldSignal):
             text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
@@ -246,8 +236,7 @@ class SimulatedSource:
             u, x = simulate_loop(system, controller, r, noise, interval, loop.enters)
         # Estimators know the loops of linear controllers only.
         closed = None if isinstance(controller, Relay) else Loop(r, controller, loop.enters)
-        y = self._with_losses(self.recorder.rounded(x + noise), replicate)
-        return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
+        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
 
     def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:
@@ -257,9 +246,6 @@ class SimulatedSource:
             if getattr(type(self.noise), "generate_at", Noise.generate_at) is not Noise.generate_at:
                 return samples_of(self.noise, "generate_at", times, output, rng, size=output.size, missing=True)
             return samples_of(self.noise, "generate", output, rng, size=output.size, missing=True)
-
-    def _with_losses(self, y: Array, replicate: int) -> Array:
-        return self.recorder.with_losses(y, stream(self.seed, "recorder", replicate))
 
 
 @contextmanager
@@ -446,6 +432,12 @@ def require_content(path: str, sha256: str) -> str:
         restore = "restore the file, or run the changed one as an experiment of its own"
         raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")
     return path
+
+
+def _as_planned(options: Any) -> Any:
+    """Return options that read a file with the path at which the planned file can be read."""
+    sha256 = None if is_custom(options) else getattr(options, "sha256", None)
+    return options if sha256 is None else replace(options, file=require_content(options.file, sha256))
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -26,9 +26,9 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.tracking import FrequencyEstimate, FrequencyTrack
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb
-from ctid_cli.signals.streams import stream
 
 #: Units of the measures, in the order of columns.
 MEASURE_UNITS = {

@@ -17,7 +17,7 @@ from ctid_cli.inference.monte_carlo import requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.dataset import additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
@@ -46,7 +46,7 @@ MAX_TRIALS = 64
 
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -74,7 +74,7 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
 
 
 def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise", "recorder"):
+    for name in (*_SIMULATED, "noise"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
     if _reference(raw, "loop") is not None:
@@ -119,8 +119,7 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
     for name, (content, section) in parts.items():
         if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
             return name
-    recorder = raw.get("recorder")
-    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""
+    return ""
 
 
 def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
@@ -173,7 +172,8 @@ def _static_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bo
     yield from _precision_complaints(spec, broken)
     yield from _same_estimators(spec)
     yield from _world_complaints(spec, broken)
-    samplings = known_variants(spec.sampling)
+    # A file of instants is read only once it is known to be good.
+    samplings = spec.samplings if files_are_good or not hasattr(spec.sampling, "sha256") else []
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
     too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
     yield from too_long
@@ -251,7 +251,7 @@ class Extent:
 
     interval: float
     samples: int
-    #: Instants of the samples of a measured record [s].
+    #: Instants of the samples from the first one on, where they are known [s].
     times: Array | None = None
 
     @property
@@ -272,13 +272,19 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
-    # Random intervals stand for themselves at their mean.
-    plans = [(case, case.options) for case in samplings]
-    return [Variant({}, case.swept, Extent(options.mean_interval, options.samples)) for case, options in plans]
+    return [Variant({}, case.swept, _extent_of(case.options)) for case in samplings]
+
+
+def _extent_of(sampling: Any) -> Extent:
+    """Return how long the records of a sampling scheme are; random intervals stand for themselves at their mean."""
+    if not isinstance(sampling, GivenInstants):
+        return Extent(sampling.mean_interval, sampling.length)
+    times = sampling.times(np.random.default_rng(0))
+    return Extent(float(np.ptp(times)) / (times.size - 1), times.size, times - times[0])
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
-    if sampling.samples > MAX_SAMPLES:
+    if sampling.length > MAX_SAMPLES:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 

@@ -188,15 +188,25 @@ def _about(key: str, error: str, value: Any) -> ErrorDetails:
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """Return the specification with the content hash of its file filled in, and what is wrong with the file.
+    """Return the specification with the content hashes of its files filled in, and what is wrong with the files."""
+    sections: dict[tuple[str, ...], Any] = {("data",): spec.data, ("sampling",): spec.sampling}
+    if spec.data is None and spec.generator is not None:
+        sections |= dict([spec.generator])
+    complaints: list[Complaint] = []
+    for place, section in sections.items():
+        if hasattr(section, "sha256") and not section.custom:
+            spec, found = _with_file(spec, place, section, own=own, anywhere=anywhere)
+            complaints += found
+    return spec, complaints
+
+
+def _with_file(
+    spec: Spec, place: tuple[str, ...], section: Any, *, own: bool, anywhere: bool
+) -> tuple[Spec, list[Complaint]]:
+    """Return the specification with the content hash of one file filled in, and what is wrong with the file.
 
     Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
     """
-    place: tuple[str, ...]
-    section: Any
-    place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
-    if not hasattr(section, "sha256") or section.custom:
-        return spec, []
     file = joined(spec.folder, section.file)
     open_to_all = own or is_inside(file, spec.folder)
     if not (anywhere or open_to_all):
@@ -209,8 +219,10 @@ def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Co
         if section.sha256 not in (None, content):
             return spec, [((*place, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?")]
         spec = replaced(spec, (*place, "sha256"), content)
-        if spec.measured is not None:
+        if place == ("data",) and spec.measured is not None:
             spec.measured.dataset(0)
+        elif place == ("sampling",):
+            spec.samplings[0].options.times(None)
         else:
             source = located(variants(section)[0].options, spec.folder)
             read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)

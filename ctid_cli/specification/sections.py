@@ -16,6 +16,7 @@ import re
 import types
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -322,8 +323,9 @@ class WithKey(OneOf):
 
     def __init__(self, key: str, form: Any, otherwise: Any, **also: Any) -> None:
         def choose(value: Any) -> str:
-            given = isinstance(value, Mapping) and key in value and all(value.get(k) == v for k, v in also.items())
-            return key if given or key in getattr(type(value), "model_fields", {}) else "otherwise"
+            read = value.get if isinstance(value, Mapping) else partial(getattr, value)
+            keys = value if isinstance(value, Mapping) else getattr(type(value), "model_fields", {})
+            return key if key in keys and all(read(k, None) == v for k, v in also.items()) else "otherwise"
 
         super().__init__(choose, {key: form, "otherwise": otherwise})
 

@@ -100,6 +100,20 @@ def test_nothing_of_a_file_elsewhere_is_repeated(inside):
     assert asked("validate", inside / ("x" * 300)) == 2
 
 
+def test_instants_from_a_file_elsewhere(inside):
+    file = specification(inside, "none.csv")
+    sampled = "sampling: {kind: irregular, file: ../outside.csv}"
+    simulated = f"system: {{numerator: [1], denominator: [1, 1]}}\nexcitation: {{kind: step}}\n{sampled}\n"
+    file.write_text("\n".join(simulated if "data:" in line else line for line in MEASURED.splitlines()))
+    with pytest.raises(SpecError, match=r"sampling.file: lies outside the folder.*--allow-outside"):
+        load_spec(file)
+    assert load_spec(file, allow_outside=True).sampling.sha256
+    (inside.parent / "outside.csv").write_text("t,rooster\n0,1\nsecret,2\n")
+    with pytest.raises(SpecError, match="'ctid check' says what is wrong") as refused:
+        load_spec(file, allow_outside=True)
+    assert "secret" not in str(refused.value)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_name_that_no_file_can_have(command, inside, monkeypatch):
     monkeypatch.chdir(inside)
