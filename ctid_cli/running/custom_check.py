@@ -14,7 +14,7 @@ import numpy as np
 from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import SpecError
-from ctid_cli.running.job import EstimatorCell, Job
+from ctid_cli.running.job import MEASURE, EstimatorCell, Job, with_measures
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan, Task
 from ctid_cli.running.workers import call_alone
@@ -53,7 +53,9 @@ def check_components(plan: Plan, limits: Limits, warn: Callable[[str], object]) 
     but a worker should make them.
     """
     cell = plan.data_cells[0]
-    wanted = [entry for entry in plan.keys(Task(0, 0)) if isinstance(entry[1].estimator, CustomEstimation)]
+    wanted = [
+        entry for entry in plan.keys(Task(0, 0)) if cell.measures or isinstance(entry[1].estimator, CustomEstimation)
+    ]
     makes_data = bool(_parts(cell.source))
     if not wanted and not makes_data:
         return False
@@ -163,8 +165,9 @@ def _of_estimators(job: Job, found: Look) -> None:
         path = ("estimators", cell.name, "kind")
         try:
             drawn = start.draw(job.seed, job.replicate, data.true_model)
-            first, second = _twice(partial(_estimated, cell.estimator, data, drawn, job.terms))
-            if canonical_json(first) != canonical_json(second):
+            first, second = _twice(partial(_estimated, job, cell.estimator, data, drawn))
+            found.wrong.extend(_of_measures(first.pop("custom_measures") or {}, second.pop("custom_measures") or {}))
+            if not found.wrong and canonical_json(first) != canonical_json(second):
                 raise ComponentError(f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options")
         except ComponentError as error:
             found.wrong.append((path, str(error)))
@@ -175,11 +178,29 @@ def _of_estimators(job: Job, found: Look) -> None:
             text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
             found.odd.append((path, text))
         else:
-            if first["status"] not in FAILURES:
+            found.odd.extend(_without_measures(cell.name, first["message"]))
+            if first["status"] not in FAILURES and isinstance(cell.estimator, CustomEstimation):
                 found.returned[cell.name] = first
 
 
-def _estimated(estimator: Any, data: Any, start: Any, terms: Any) -> dict[str, Any]:
+def _of_measures(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[Complaint]:
+    """Say which custom measures have another value the second time."""
+    for name in first:
+        if first[name] != second[name]:
+            yield ("measures", name), f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
+
+
+def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
+    """Say which custom measures raised an exception, which the message of the estimate tells."""
+    for line in message.splitlines():
+        name, colon, why = line.removeprefix(MEASURE).partition(": ")
+        if line.startswith(MEASURE) and colon:
+            text = f"fails on the first data set, with the estimator {estimator!r}: {why}; the estimate is kept without it"
+            yield ("measures", name), text
+
+
+def _estimated(job: Job, estimator: Any, data: Any, start: Any) -> dict[str, Any]:
     """Return an estimate as it would be stored."""
-    found: dict[str, Any] = plain(data.result_of(estimator.prepare(data.record).fit(start), start, terms))
-    return found
+    fit = estimator.prepare(data.record).fit(start)
+    result = plain(data.result_of(fit, start, job.terms))
+    return with_measures(result, job.cell.measures, fit, data, Limits())

@@ -296,6 +296,7 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     # Absolute, because worker processes may have been started in another working directory.
     folder = spec.folder.resolve()
+    measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
     ways = [list(found) for found in parts.values()]
 
     def make(number: int) -> DataCell:
@@ -330,8 +331,13 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
             source = spec.simulated_source(options, folder)
+        if measures:
+            content["custom_measures"] = {
+                name: {**variant.values, "unit": variant.options.unit} for name, variant in measures.items()
+            }
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
-        return DataCell(content, content_hash(content), swept, source)
+        custom = tuple((name, variant.options) for name, variant in measures.items())
+        return DataCell(content, content_hash(content), swept, source, custom)
 
     return DataCells(math.prod(map(len, ways)), make)
 
@@ -394,6 +400,7 @@ def current_version(plan: Plan) -> str:
 
 
 def computing_parts(plan: Plan) -> list[Any]:
-    """Return what computes the estimates of a plan: the source of its data sets, and its estimators."""
+    """Return what computes the estimates of a plan: the source of its data sets, its estimators and custom measures."""
     # All data cells are made by the same classes; only the values of their fields differ.
-    return [plan.data_cells[0].source, *(cell.estimator for cell in plan.estimators)]
+    first = plan.data_cells[0]
+    return [first.source, first.measures, *(cell.estimator for cell in plan.estimators)]

@@ -42,7 +42,7 @@ from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling, geometric_sizes
-from ctid_cli.simulation.components import Estimator, Noise, System
+from ctid_cli.simulation.components import Estimator, Measure, Noise, System
 from ctid_cli.specification.messages import HINT, TAG, Complaint, explained, option_docs, several_wrong, shown, wrong
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.text import did_you_mean
@@ -87,6 +87,10 @@ def matching(pattern: str, rule: str) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+#: Name of an estimator or of a custom measure.
+Name = Annotated[str, matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")]
 
 
 class OneOf:
@@ -272,11 +276,17 @@ class Geometric(Section):
 
 
 def section_for(
-    target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
+    target: type,
+    kind: str = "",
+    *,
+    sweeping: bool = True,
+    without: str = "",
+    base: type[Section] = Section,
+    **more: tuple[Any, Any],
 ) -> type[Section]:
-    """Return the section of an option dataclass."""
+    """Return the section of an option dataclass, with more keys and their defaults."""
     hints = get_type_hints(target)
-    fields: dict[str, Any] = {}
+    fields: dict[str, Any] = dict(more)
     if kind:
         fields["kind"] = (Literal[kind], ...)
     for option in dataclasses.fields(target):
@@ -298,7 +308,7 @@ class Kinds(OneOf):
 
     def __init__(self, *names: str, custom: str = "") -> None:
         forms: dict[str, Any] = {k: section_for(target, k) for name in names for k, target in classes(name).items()}
-        allowed = ", ".join(forms)
+        allowed = ", ".join(forms) or "./file.py:Class, package.module:Class"
         forms |= {"custom": custom_form(custom)} if custom else {}
 
         def choose(value: Any) -> str | None:
@@ -383,6 +393,7 @@ def _default(option: dataclasses.Field[Any]) -> Any:
 #: The base class of custom components, and the methods of which it needs one, with what they are given.
 CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
     "estimator": (Estimator, {"fit": ("record", "start")}),
+    "measure": (Measure, {"value": ("fit", "data")}),
     "excitation": (Excitation, {"generate": ("times", "rng")}),
     "noise": (Noise, {"generate": ("output", "rng"), "generate_at": ("times", "output", "rng")}),
     "sampling": (Sampling, {"times": ("rng",)}),
@@ -439,11 +450,13 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
+    named = {"name": (Name, name)} if part == "measure" else {}
     for option in target.__dataclass_fields__:
-        if option in {"kind", *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
+        if option in {"kind", *named, *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
-        return section_for(target, kind, base=CustomSystemSection if part == "system" else CustomSection)
+        base = CustomSystemSection if part == "system" else CustomSection
+        return section_for(target, kind, base=base, sweeping=part != "measure", **named)
     # Whatever is wrong with the annotations of a class that somebody wrote.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
