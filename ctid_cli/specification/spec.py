@@ -100,7 +100,9 @@ DisturbanceOrNone = Annotated[
     BeforeValidator(lambda value: None if value == "none" else value),
 ]
 #: The name of a measure, or a custom one.
-MeasureName = Annotated[Any, ByShape(Text, mapping=Annotated[Section, Kinds(custom="measure")])]
+MeasureName = Annotated[
+    Any, ByShape(Text, "a mapping with a kind is allowed too", mapping=Annotated[Section, Kinds(custom="measure")])
+]
 EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
 
 

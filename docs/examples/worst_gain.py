@@ -9,7 +9,7 @@ from ctid_cli import Measure
 
 @dataclass(frozen=True)
 class WorstGain(Measure):
-    """Largest error of the frequency response up to a frequency, as a fraction of the gain there.
+    """Largest error of the frequency response up to a frequency, relative to the gain there.
 
     Parameters
     ----------
