@@ -50,12 +50,8 @@ def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table
         body.append(cells + ([str(some["without_value"])] if lacking else []))
     titles = {"initial_delay": "initial delay", "parameter": "status" if "failures" in names else "parameter"}
     header = [titles.get(key) or setting_title(key) for key in keys]
-    header += [
-        *(_title(name, measure_of(name, results)) for name in names),
-        "n",
-        "failed",
-        *(["no value"] if lacking else []),
-    ]
+    header += [_title(name, measure_of(name, results)) for name in names]
+    header += ["n", "failed", *(["no value"] if lacking else [])]
     return Table(header, body, "l" * len(keys) + "r" * (len(header) - len(keys)))
 
 

@@ -195,10 +195,8 @@ def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
     for line in message.splitlines():
         name, colon, why = line.removeprefix(MEASURE).partition(": ")
         if line.startswith(MEASURE) and colon:
-            text = (
-                f"fails on the first data set, with the estimator {estimator!r}: {why}; the estimate is kept without it"
-            )
-            yield ("measures", name), text
+            text = f"fails on the first data set, with the estimator {estimator!r}: {why}"
+            yield ("measures", name), f"{text}; such estimates are stored without it"
 
 
 def _estimated(job: Job, estimator: Any, data: Any, start: Any) -> dict[str, Any]:

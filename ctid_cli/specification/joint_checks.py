@@ -27,6 +27,7 @@ from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     MAX_COMBINATIONS,
+    CustomMeasureSection,
     Failure,
     Section,
     Variant,
@@ -188,7 +189,7 @@ def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Compla
     """Say which measures there are not, and which precision cannot be had."""
     seen: set[str] = set()
     for k, one in enumerate(spec.measures or ()):
-        if isinstance(one, Section):
+        if isinstance(one, CustomMeasureSection):
             if one.name in seen | MEASURES.keys():
                 yield ("measures", k), f"another measure is called {one.name!r}; give this one another name"
             seen.add(one.name)

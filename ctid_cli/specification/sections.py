@@ -276,17 +276,11 @@ class Geometric(Section):
 
 
 def section_for(
-    target: type,
-    kind: str = "",
-    *,
-    sweeping: bool = True,
-    without: str = "",
-    base: type[Section] = Section,
-    **more: tuple[Any, Any],
+    target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
 ) -> type[Section]:
-    """Return the section of an option dataclass, with more keys and their defaults."""
+    """Return the section of an option dataclass."""
     hints = get_type_hints(target)
-    fields: dict[str, Any] = dict(more)
+    fields: dict[str, Any] = {}
     if kind:
         fields["kind"] = (Literal[kind], ...)
     for option in dataclasses.fields(target):
@@ -417,7 +411,8 @@ def custom_form(part: str) -> Any:
             form = _custom_section(target, part, value["kind"])
         except CustomCodeError as error:
             raise several_wrong("custom", [(("kind",), str(error), False)]) from None
-        return form.model_validate(value, context=info.context)
+        given = {"name": target.__name__, **value} if part == "measure" else value
+        return form.model_validate(given, context=info.context)
 
     schema = {
         "type": "object",
@@ -450,13 +445,16 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
-    named = {"name": (Name, name)} if part == "measure" else {}
+    unit = getattr(target, "unit", None)
+    if part == "measure" and not isinstance(unit, str):
+        raise CustomCodeError(f"{name}.unit must be a text, such as '%' or 'rad/s', not {unit!r}")
+    forms: dict[str, type[CustomSection]] = {"system": CustomSystemSection, "measure": CustomMeasureSection}
+    form = forms.get(part, CustomSection)
     for option in target.__dataclass_fields__:
-        if option in {"kind", *named, *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
+        if option in {"kind", *form.model_fields, *dir(CustomSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
-        base = CustomSystemSection if part == "system" else CustomSection
-        return section_for(target, kind, base=base, sweeping=part != "measure", **named)
+        return section_for(target, kind, base=form, sweeping=part != "measure")
     # Whatever is wrong with the annotations of a class that somebody wrote.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
@@ -475,6 +473,18 @@ class CustomSection(Section):
             dumps(variants(self)[0].options)
         except Exception as error:
             yield ("kind",), f"cannot be sent to worker processes: {reason(error)}; keep only plain data in options"
+
+
+class CustomMeasureSection(CustomSection):
+    """Options of a custom measure, and what it is called.
+
+    Parameters
+    ----------
+    name : str, optional
+        what tables call it; by default like its class
+    """
+
+    name: Name
 
 
 class CustomSystemSection(CustomSection):

@@ -22,6 +22,7 @@ from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import (
     MAX_WHOLE,
     ByShape,
+    CustomMeasureSection,
     Kinds,
     Name,
     NotNegative,
@@ -99,10 +100,9 @@ DisturbanceOrNone = Annotated[
     Annotated[Section, Kinds("disturbance")] | None,
     BeforeValidator(lambda value: None if value == "none" else value),
 ]
+_CustomMeasure = Annotated[CustomMeasureSection, Kinds(custom="measure")]
 #: The name of a measure, or a custom one.
-MeasureName = Annotated[
-    Any, ByShape(Text, "a mapping with a kind is allowed too", mapping=Annotated[Section, Kinds(custom="measure")])
-]
+MeasureName = Annotated[Any, ByShape(Text, "a mapping with a kind is allowed too", mapping=_CustomMeasure)]
 EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
 
 
@@ -326,9 +326,9 @@ class Spec(Section):
         return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, recorder, fresh)
 
     @property
-    def custom_measures(self) -> dict[str, Section]:
+    def custom_measures(self) -> dict[str, CustomMeasureSection]:
         """Sections of the custom measures, by their names."""
-        return {section.name: section for section in self.measures or () if isinstance(section, Section)}
+        return {section.name: section for section in self.measures or () if isinstance(section, CustomMeasureSection)}
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -129,10 +129,7 @@ def test_a_measure_of_a_signal(tmp_path):
 @pytest.mark.parametrize(
     ("measures", "said"),
     [
-        (
-            "{kind: './measures.py:Slowest', scale: [1, 2]}",
-            "measures[0].scale: must be a number, not a list of 2; this",
-        ),
+        ("{kind: './measures.py:Slowest', scale: [1, 2]}", "measures[0].scale: must be a number, not a list of 2;"),
         ("{kind: './measures.py:Slowest', size: 1}", "measures[0].size: there is no such key here"),
         ("{kind: rmse}", "measures[0].kind: must be one of ./file.py:Class, package.module:Class, not the text 'rmse'"),
         ("{name: x}", "measures[0].kind: is missing; allowed: ./file.py:Class, package.module:Class"),
