@@ -28,8 +28,9 @@ from ctid_cli.storage.manifest import Key, Outcome
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
     from ctid_cli.simulation.components import Measure
-    from ctid_cli.simulation.dataset import Source, StartPoint
+    from ctid_cli.simulation.dataset import Source
     from ctid_cli.simulation.frequency_measures import SignalSource
+    from ctid_cli.simulation.starts import StartPoint
 
 #: Frames of a traceback that are kept, the innermost ones, and characters of a message.
 TRACEBACK_FRAMES = 6
