@@ -20,7 +20,7 @@ from ctid_cli.running.plan import Plan, Task
 from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
-from ctid_cli.simulation.starts import StartPoint
+from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS, trial
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.storage.columns import FAILURES

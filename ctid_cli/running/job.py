@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ctid_cli.simulation.components import Measure
     from ctid_cli.simulation.dataset import Source
     from ctid_cli.simulation.frequency_measures import SignalSource
-    from ctid_cli.simulation.starts import StartPoint
+    from ctid_cli.simulation.start_points import StartPoint
 
 #: Frames of a traceback that are kept, the innermost ones, and characters of a message.
 TRACEBACK_FRAMES = 6

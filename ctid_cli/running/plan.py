@@ -22,7 +22,7 @@ from ctid_cli.running.job import DataCell, EstimatorCell, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import DataSet, SimulatedSource, Source, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
-from ctid_cli.simulation.starts import NO_START, StartPoint
+from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec

@@ -24,7 +24,7 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.frequency_measures import true_frequencies
-from ctid_cli.simulation.starts import additive_form
+from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     MAX_COMBINATIONS,

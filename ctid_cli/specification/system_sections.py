@@ -15,7 +15,7 @@ from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.dataset import LoopOptions
-from ctid_cli.simulation.starts import StartPoint
+from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     ByShape,
