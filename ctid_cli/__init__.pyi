@@ -62,7 +62,7 @@ from .reporting.saved_fit import save_fit as save_fit
 # Custom components: the classes that they derive from
 from .signals.excitation import Excitation as Excitation
 from .signals.sampling import Sampling as Sampling
-from .simulation.components import Estimator as Estimator, Noise as Noise, System as System
+from .simulation.components import Estimator as Estimator, Measure as Measure, Noise as Noise, System as System
 
 # Experiments: what ctid run, table and export do
 from .reporting.experiment import ExperimentResults as ExperimentResults

@@ -41,7 +41,9 @@ def test_the_study(out):
         assert mine["delay"] == pytest.approx(ours["delay"], abs=2 * ours["standard_errors"]["delay"])
         assert mine["standard_errors"]["delay"] == pytest.approx(ours["standard_errors"]["delay"], rel=0.2)
         assert mine["parameters"]["b0"] == mine["numerator"][0]
-    assert "mine: %" in ctid("table", "custom-study", "--out", out).stdout
+    worst = {name: [row["custom_measures"]["WorstGain"] for row in own] for name, own in by_name.items()}
+    assert 0.0 < max(worst["mine"] + worst["srivc"]) < min(worst["external"])
+    assert re.search(r"mine +\d+\.\d \[.*\] +\d", ctid("table", "custom-study", "--out", out).stdout)
 
 
 def test_the_tank_is_nearly_linear(out):
@@ -103,7 +105,7 @@ def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
 def test_the_documentation_names_what_there_is():
     text = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))
-    examples = {"output_error.py", "external_fit.py", "bursts.py", "tank.py", "chirp.py", "faulty_sensor.py"}
-    assert examples <= names
+    examples = {"output_error.py", "external_fit.py", "bursts.py", "tank.py", "worst_gain.py"}
+    assert examples | {"chirp.py", "faulty_sensor.py"} <= names
     for name in names:
         assert (EXAMPLES / name).is_file(), name

@@ -242,25 +242,26 @@ class Measure:
     #: ``""`` stands for that of the parameter, ``^2`` for its square.
     unit: str
     #: What it is computed from: errors of parameters, a distance between models, or what an estimate has one of.
-    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent"]
+    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent", "custom_measures"]
     compute: Callable[..., Measured]
     #: Whether only estimates with a standard error count.
     of_widths: bool = False
 
 
-def requested(name: str) -> Measure:
+def requested(name: str, custom: Mapping[str, Measure] = MappingProxyType({})) -> Measure:
     """A measure by its name: ``rmse``, ``rmse:delay`` of one parameter, ``rmse:poles``, or ``response:1.5`` [rad/s]."""
     base, colon, argument = name.partition(":")
-    if base not in MEASURES:
-        hint = did_you_mean(base, MEASURES) or "."
-        raise UsageError(f"there is no measure {base!r}{hint} Known: {', '.join(MEASURES)}")
-    measure = MEASURES[base]
+    known = {**MEASURES, **custom}
+    if base not in known:
+        hint = did_you_mean(base, known) or "."
+        raise UsageError(f"there is no measure {base!r}{hint} Known: {', '.join(known)}")
+    measure = known[base]
     if base == "response":
         try:
-            known = 0.0 < float(argument) < math.inf
+            usable = 0.0 < float(argument) < math.inf
         except ValueError:
-            known = False
-        if not known:
+            usable = False
+        if not usable:
             raise UsageError(f"{name!r} needs a frequency [rad/s] above zero, such as response:1.5")
     elif colon and (measure.source != "errors" or not argument):
         raise UsageError(f"{name!r} is about the estimate as a whole; ask for {base}")

@@ -80,6 +80,7 @@ def _fitted(found: FoundEstimate) -> list[list[str]]:
     facts = [("fit", f"{number(row['fit_percent'])} % of the data it was estimated from")]
     if row.get("validation_fit_percent") is not None:
         facts.append(("", f"{number(row['validation_fit_percent'])} % of the validation part"))
+    facts += [(name, number(value)) for name, value in (row.get("custom_measures") or {}).items()]
     facts += [
         ("cost", f"{number(row['cost'])} (mean squared output error, output unit^2)"),
         ("iterations", number(row["iterations"])),

@@ -21,8 +21,9 @@ from ctid_cli.kinds import KINDS
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.job import DataCell, EstimatorCell, Job, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import NO_START, DataSet, SimulatedSource, Source, StartPoint, joined, located
+from ctid_cli.simulation.dataset import DataSet, SimulatedSource, Source, joined, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
+from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
@@ -272,6 +273,8 @@ def simulate_dataset(
 def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> Iterator[DataCell]:
     """Yield every combination of the variants of the sections that data are made from."""
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
+    measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
+    custom = tuple((name, variant.options) for name, variant in measures.items())
     for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
         content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
@@ -287,9 +290,13 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             content["system"] = system_content(chosen["system"])
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
+        if measures:
+            content["custom_measures"] = {
+                name: {**variant.values, "unit": variant.options.unit} for name, variant in measures.items()
+            }
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
         source = source_of(spec, {name: variant.options for name, variant in chosen.items()})
-        yield DataCell(content, content_hash(content), swept, source)
+        yield DataCell(content, content_hash(content), swept, source, custom)
 
 
 def system_content(system: Variant) -> dict[str, Any]:
@@ -377,6 +384,7 @@ def current_version(plan: Plan) -> str:
 
 
 def computing_parts(plan: Plan) -> list[Any]:
-    """Return what computes the estimates of a plan: the source of its data sets, and its estimators."""
+    """Return what computes the estimates of a plan: the source of its data sets, its estimators and custom measures."""
     # All data cells are made by the same classes; only the values of their fields differ.
-    return [plan.data_cells[0].source, *(cell.estimator for cell in plan.estimators)]
+    first = plan.data_cells[0]
+    return [first.source, first.measures, *(cell.estimator for cell in plan.estimators)]

@@ -25,11 +25,13 @@ from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.job import MEASURE, with_measures
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
 from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import SimulatedSource, StartPoint
+from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.messages import Complaint
@@ -70,6 +72,8 @@ class Setting(NamedTuple):
     swept: Mapping[KeyPath, Any]
     #: True values of the parameters by name.
     truth: Mapping[str, float]
+    #: Custom measures with their names.
+    measures: Sequence[tuple[str, Any]]
 
 
 class Candidate(NamedTuple):
@@ -97,12 +101,12 @@ def try_out(spec: Spec) -> Found:
         return Found()
     custom = [candidate for candidate in candidates if isinstance(candidate.estimator, CustomEstimation)]
     own = [candidate for candidate in candidates if candidate not in custom]
-    custom_data = any(_custom_parts(setting.source) for setting in settings)
+    all_apart = bool(spec.custom_measures) or any(_custom_parts(setting.source) for setting in settings)
     success = {} if spec.success is None else spec.success.model_dump()
-    found = Found() if custom_data else _try_all(settings, own, success)
-    if custom_data or custom:
+    found = Found() if all_apart else _try_all(settings, own, success)
+    if all_apart or custom:
         limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
-        given = (settings, candidates) if custom_data else (settings[:1], custom)
+        given = (settings, candidates) if all_apart else (settings[:1], custom)
         # What ends its process, or cannot be sent to one, is left to the run.
         with TemporaryFolder() as folder, suppress(Exception):
             more = call_alone(folder, _try_under_limits, limits, folder / "late", *given, success)[0]
@@ -122,6 +126,7 @@ def _settings(spec: Spec) -> list[Setting]:
     if spec.data is None and spec.sampling is None:
         return []
     turns = {at: parts.pop(at) for at in (("noise",),) if at in parts}
+    measures = [(name, variants(section)[0].options) for name, section in spec.custom_measures.items()]
     settings: list[Setting] = []
     samples = 0
     for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
@@ -133,7 +138,7 @@ def _settings(spec: Spec) -> list[Setting]:
             break
         system = chosen.get(("system",))
         truth = true_values({"content": {"system": system_content(system)}}) if system and system.values else {}
-        settings.append(Setting(source_of(spec, options), swept_in(case), truth))
+        settings.append(Setting(source_of(spec, options), swept_in(case), truth, measures))
     return settings
 
 
@@ -175,11 +180,13 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
             data, complaints = _first_data(setting.source)
             failures += [(path, text, setting.swept) for path, text in complaints]
             for candidate in candidates if data is not None else ():
-                if not isinstance(candidate.estimator, CustomEstimation):
+                custom, complaints = isinstance(candidate.estimator, CustomEstimation), []
+                if not custom:
                     its_failures, its_tried = of_estimators.setdefault(candidate.name, ([], []))
                     its_tried.append({**setting.swept, **candidate.swept})
-                    its_failures += [(path, text, its_tried[-1]) for path, text in _prepared(candidate, data)]
-                elif not tried and not failures:
+                    complaints = list(_prepared(candidate, data))
+                    its_failures += [(path, text, its_tried[-1]) for path, text in complaints]
+                if (custom or setting.measures) and not (tried or failures or complaints):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
             tried.append(setting.swept)
     found.wrong.extend(grouped(failures, tried))
@@ -250,20 +257,23 @@ def _fit(
     success: Mapping[str, Any],
     found: Found,
 ) -> None:
-    """Fit a custom estimator to the first data set, as a run does."""
+    """Fit an estimator to the first data set, with custom measures, as a run does."""
     path: KeyPath = ("estimators", candidate.name, "kind")
     terms = structure(setting.source, estimators)
 
     def fit() -> dict[str, Any]:
         start = candidate.start.draw(getattr(setting.source, "seed", 0), 0, data.true_model)
         fitted = candidate.estimator.prepare(data.record).fit(start)
-        row: dict[str, Any] = plain(data.result_of(fitted, start, terms))
-        return row
+        row = plain(data.result_of(fitted, start, terms))
+        return with_measures(row, setting.measures, fitted, data, Limits())
 
     try:
         first, second = _twice(fit)
+        one, other = (row.pop("custom_measures") or {} for row in (first, second))
+        text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
+        found.wrong.extend((("measures", name), text) for name in one if one[name] != other[name])
         if canonical_json(first) != canonical_json(second):
-            raise ComponentError(f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options")
+            raise ComponentError(text)
     except ComponentError as error:
         found.wrong.append((path, str(error)))
     except MISTAKES as error:
@@ -273,8 +283,18 @@ def _fit(
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
         found.odd.append((path, text))
     else:
-        if first["status"] not in FAILURES:
+        found.odd.extend(_without_measures(candidate.name, first["message"]))
+        if first["status"] not in FAILURES and isinstance(candidate.estimator, CustomEstimation):
             found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
+
+
+def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
+    """Say which custom measures raised an exception, which the message of the estimate tells."""
+    for line in message.splitlines():
+        name, colon, why = line.removeprefix(MEASURE).partition(": ")
+        if line.startswith(MEASURE) and colon:
+            text = f"fails on the first data set, with the estimator {estimator!r}: {why}"
+            yield ("measures", name), f"{text}; such estimates are stored without it"
 
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:

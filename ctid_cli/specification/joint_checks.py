@@ -13,17 +13,18 @@ from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.frequency.drem_window import DremWindow
 from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
-from ctid_cli.simulation.dataset import additive_form
 from ctid_cli.simulation.frequency_measures import true_frequencies
+from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     MAX_COMBINATIONS,
+    CustomMeasureSection,
     Section,
     Variant,
     case_count,
@@ -191,9 +192,15 @@ def _static_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bo
 
 def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     """Say which measures there are not, and which precision cannot be had."""
-    for k, name in enumerate(spec.measures or ()):
+    seen: set[str] = set()
+    for k, one in enumerate(spec.measures or ()):
+        if isinstance(one, CustomMeasureSection):
+            if one.name in seen | MEASURES.keys():
+                yield ("measures", k), f"another measure is called {one.name!r}; give this one another name"
+            seen.add(one.name)
+            continue
         try:
-            requested(name)
+            requested(one)
         except UsageError as error:
             yield ("measures", k), str(error)
     until = None if spec.monte_carlo is None else spec.monte_carlo.until

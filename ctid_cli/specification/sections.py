@@ -43,7 +43,7 @@ from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling, geometric_sizes
-from ctid_cli.simulation.components import Estimator, Noise, System
+from ctid_cli.simulation.components import Estimator, Measure, Noise, System
 from ctid_cli.specification.messages import HINT, TAG, Complaint, explained, option_docs, several_wrong, shown, wrong
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.text import did_you_mean
@@ -88,6 +88,10 @@ def matching(pattern: str, rule: str) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+#: Name of an estimator or of a custom measure.
+Name = Annotated[str, matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")]
 
 
 class OneOf:
@@ -299,7 +303,7 @@ class Kinds(OneOf):
 
     def __init__(self, *names: str, custom: str = "") -> None:
         forms: dict[str, Any] = {k: section_for(target, k) for name in names for k, target in classes(name).items()}
-        allowed = ", ".join(forms)
+        allowed = ", ".join(forms) or "./file.py:Class, package.module:Class"
         forms |= {"custom": custom_form(custom)} if custom else {}
 
         def choose(value: Any) -> str | None:
@@ -385,6 +389,7 @@ def _default(option: dataclasses.Field[Any]) -> Any:
 #: The base class of custom components, and the methods of which it needs one, with what they are given.
 CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
     "estimator": (Estimator, {"fit": ("record", "start")}),
+    "measure": (Measure, {"value": ("fit", "data")}),
     "excitation": (Excitation, {"generate": ("times", "rng")}),
     "noise": (Noise, {"generate": ("output", "rng"), "generate_at": ("times", "output", "rng")}),
     "sampling": (Sampling, {"times": ("rng",)}),
@@ -408,7 +413,8 @@ def custom_form(part: str) -> Any:
             form = _custom_section(target, part, value["kind"])
         except CustomCodeError as error:
             raise several_wrong("custom", [(("kind",), str(error), False)]) from None
-        return form.model_validate(value, context=info.context)
+        given = {"name": target.__name__, **value} if part == "measure" else value
+        return form.model_validate(given, context=info.context)
 
     schema = {
         "type": "object",
@@ -441,11 +447,16 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
+    unit = getattr(target, "unit", None)
+    if part == "measure" and not isinstance(unit, str):
+        raise CustomCodeError(f"{name}.unit must be a text, such as '%' or 'rad/s', not {unit!r}")
+    forms: dict[str, type[CustomSection]] = {"system": CustomSystemSection, "measure": CustomMeasureSection}
+    form = forms.get(part, CustomSection)
     for option in target.__dataclass_fields__:
-        if option in {"kind", *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
+        if option in {"kind", *form.model_fields, *dir(CustomSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
-        return section_for(target, kind, base=CustomSystemSection if part == "system" else CustomSection)
+        return section_for(target, kind, base=form, sweeping=part != "measure")
     # Whatever is wrong with the annotations of a class that somebody wrote.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
@@ -464,6 +475,18 @@ class CustomSection(Section):
             dumps(variants(self)[0].options)
         except Exception as error:
             yield ("kind",), f"cannot be sent to worker processes: {reason(error)}; keep only plain data in options"
+
+
+class CustomMeasureSection(CustomSection):
+    """Options of a custom measure, and what it is called.
+
+    Parameters
+    ----------
+    name : str, optional
+        what tables call it; by default like its class
+    """
+
+    name: Name
 
 
 class CustomSystemSection(CustomSection):

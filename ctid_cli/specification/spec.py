@@ -21,7 +21,10 @@ from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import (
     MAX_WHOLE,
+    ByShape,
+    CustomMeasureSection,
     Kinds,
+    Name,
     NotNegative,
     Number,
     Options,
@@ -44,8 +47,6 @@ _EXPERIMENT = matching(
     EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
-#: Name of an estimator.
-NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
 #: Sections that data are simulated from; their lists combine to data cells.
 OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
 
@@ -139,6 +140,9 @@ DisturbanceOrNone = Annotated[
     Annotated[Section, Kinds("disturbance")] | None,
     BeforeValidator(lambda value: None if value == "none" else value),
 ]
+_CustomMeasure = Annotated[CustomMeasureSection, Kinds(custom="measure")]
+#: The name of a measure, or a custom one.
+MeasureName = Annotated[Any, ByShape(Text, "a mapping with a kind is allowed too", mapping=_CustomMeasure)]
 EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
 
 
@@ -300,8 +304,9 @@ class Spec(Section):
         Number of data sets and their seed; needed where anything is random
     success : mapping, optional
         When an estimate counts as converged
-    measures : list of str, optional
-        What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
+    measures : list of str or mapping, optional
+        What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success; a
+        mapping with a kind is a custom measure
     limits : mapping, optional
         Time and memory that one estimate may take; no limits by default
     """
@@ -315,11 +320,11 @@ class Spec(Section):
     sampling: AnySamplingSection | None = None
     noise: NoiseSection | None = None
     data: MeasuredSection | None = None
-    estimators: Annotated[dict[Annotated[str, NAME], EstimatorSection], Field(min_length=1)]
+    estimators: Annotated[dict[Name, EstimatorSection], Field(min_length=1)]
     starts: StartsSection | None = None
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
-    measures: list[Text] | None = None
+    measures: list[MeasureName] | None = None
     limits: LimitsSection | None = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
@@ -362,6 +367,11 @@ class Spec(Section):
         fresh = "fresh_fit" in (self.measures or ())
         noise = options.get("noise")
         return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, fresh)
+
+    @property
+    def custom_measures(self) -> dict[str, CustomMeasureSection]:
+        """Sections of the custom measures, by their names."""
+        return {section.name: section for section in self.measures or () if isinstance(section, CustomMeasureSection)}
 
     @property
     def warnings(self) -> tuple[str, ...]:
