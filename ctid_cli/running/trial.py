@@ -30,7 +30,7 @@ from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
 from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
@@ -133,12 +133,14 @@ def _settings(spec: Spec) -> list[Setting]:
         case = dict(zip(parts, point, strict=True))
         chosen = case | {at: found[k % len(found)] for at, found in turns.items()}
         options = {str(at[0]): variant.options for at, variant in chosen.items()}
-        samples += 0 if spec.sampling is None or spec.sampling.custom else options["sampling"].length
+        source = source_of(spec, options)
+        if not isinstance(source, MeasuredSource) and not is_custom(source.sampling):
+            samples += source.sampling.length
         if samples > MAX_TRIAL_SAMPLES and settings:
             break
         system = chosen.get(("system",))
         truth = true_values({"content": {"system": system_content(system)}}) if system and system.values else {}
-        settings.append(Setting(source_of(spec, options), swept_in(case), truth, measures))
+        settings.append(Setting(source, swept_in(case), truth, measures))
     return settings
 
 

@@ -77,6 +77,7 @@ class FakeData:
 class FakeCell:
     content: dict[str, Any]
     swept: dict[str, Any]
+    measures: tuple[()] = ()
 
     @property
     def source(self) -> FakeCell:
@@ -194,7 +195,7 @@ class FakeSpec:
 class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
-    terms = file = None
+    terms, files = None, ()
     shard: Shard | None = None
     manifest, runs, job, asked = Plan.manifest, Plan.runs, Plan.job, Plan.asked
     data_sets, monte_carlo = Plan.data_sets, Plan.monte_carlo

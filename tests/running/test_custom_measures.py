@@ -6,7 +6,6 @@ import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.errors import RefusedError, SpecError
-from ctid_cli.running.job import Job
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.estimates import read_estimates
@@ -156,6 +155,5 @@ def test_fits_of_submodels_can_be_measured(tmp_path):
     (tmp_path / "measures.py").write_text(CODE, encoding="utf-8")
     (tmp_path / "spec.yaml").write_text(CLOSED_LOOP, encoding="utf-8")
     plan = build_plan(load_spec(tmp_path / "spec.yaml", [asked("Slowest")], allow_code=True))
-    wanted = tuple(plan.keys(plan.tasks()[0]))
-    for outcome in outcomes_of(Job(plan.data_cells[0], 0, 1, wanted)):
+    for outcome in outcomes_of(plan.job(0, 0)):
         assert outcome.result["custom_measures"]["Slowest"] > 0, outcome.result["message"]
