@@ -11,8 +11,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
 from ctid_cli.signals.clock import check_clock, clock_instants
-from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.measurement import read_held_signal
 
 #: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
 #: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.

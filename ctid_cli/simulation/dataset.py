@@ -23,11 +23,10 @@ from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
 from ctid_cli.signals.excitation import Excitation, InputFile
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.measurement import Measurement, Offset, read_measurement
 from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.recorder import Recorder
 from ctid_cli.signals.regularity import regular_interval
@@ -313,7 +312,7 @@ class MeasuredSource:
     Parameters
     ----------
     file : str
-        Comma-separated file, relative to the folder of the specification.
+        File with the record, relative to the folder of the specification.
     sha256 : str, optional
         SHA-256 of the file.
     time : str, default "t"
@@ -357,7 +356,9 @@ class MeasuredSource:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         if self.sha256 is not None:
             require_content(self.file, self.sha256)
-        whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
+        columns = {"time": self.time, "input": self.input, "output": self.output, "reference": self.reference}
+        measured = read_measurement(self.file, **columns, hold=self.hold, in_seconds=True)
+        whole = measured.record
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
         used = f"the {count} samples used for estimation"
@@ -369,8 +370,8 @@ class MeasuredSource:
             constant = f"the input {self.input!r} is constant ({u[0]:g}) over {used}"
             raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
         loop = None
-        if self.reference is not None:
-            r = read_held_signal(self.file, time=self.time, input=self.reference).values[:count]
+        if measured.reference_values is not None:
+            r = measured.reference_values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
                 # A record of a loop is refused where its clock is not regular.

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.csv_file import read_held_signal, read_record
+from ctid_cli.signals.measurement import read_held_signal, read_record
 
 
 @pytest.fixture

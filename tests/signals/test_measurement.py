@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.csv_file import read_record
-from ctid_cli.signals.measurement import read_measurement
+from ctid_cli.signals.measurement import read_measurement, read_record
 
 
 @pytest.fixture
