@@ -69,8 +69,10 @@ def frf(
             raise UsageError(f"{name} must be {least} or more, not {value}")
     if width is not None and method not in ("auto", "local-polynomial"):
         raise UsageError(f"--width belongs to --method local-polynomial, not to {method}")
-    columns = {"time": time, "input": input, "output": output}
-    measurements = [read_measurement(file, **columns, hold=hold, start=start, stop=stop) for file in files]
+    measurements = [
+        read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
+        for file in files
+    ]
     units = common_units(measurements)
     found = estimate_frequency_response(
         [item.record for item in measurements],

@@ -86,6 +86,7 @@ def record_for(
     stop: float | None = None,
 ) -> Measurement:
     """A record to look at models with: the columns of their own record where the file has them and none are named."""
+    names: dict[str, Any]
     own, names = models[0].columns, {"time": time, "input": input, "output": output}
     if not any(names.values()) and set(own.values()) <= set(open_table(file).names):
         names = {role: own[role] for role in names}

@@ -25,7 +25,7 @@ HEAD_LINES, HEAD_BYTES = 50, 1_000_000
 MAX_COLUMNS = 10_000
 #: Rows that are converted at a time: memory is needed for them and for the numbers of the columns that are used.
 ROWS = 1 << 16
-#: Separators in the order in which they are preferred if several fit; the blank stands for any number of blanks or tabs.
+#: Separators in the order in which they are preferred if several fit; the blank stands for all blanks and tabs in a row.
 SEPARATORS = ("\t", ";", ",", " ")
 #: How comments begin, which may stand before the data.
 COMMENTS = ("#", "%", "//")
@@ -73,9 +73,14 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
 def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     """Find out how a file is written."""
     text, encoding = _head(path, file)
-    numbered = [(k, line) for k, line in enumerate(io.StringIO(text, newline=None), start=1) if line.strip()]
-    comments = {k: line for k, line in numbered if line.lstrip().startswith(COMMENTS)}
-    content = [(k, line) for k, line in numbered if k not in comments][:HEAD_LINES]
+    comments, content = [], []
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if line.lstrip().startswith(COMMENTS):
+            comments.append((number, line))
+        elif line.strip():
+            content.append((number, line))
+        if len(content) == HEAD_LINES:
+            break
     if not content:
         raise DataError(f"{file}:{EMPTY}")
     separator = _separator([line for _, line in content])
@@ -85,8 +90,8 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
         raise DataError(f"{file}:{header}: the line names no columns; it must name them, as in t,u,y")
     if _all_numbers(names):
         # Some programs write the names of the columns as a comment.
-        before = max((k for k in comments if k < header), default=0)
-        named = _fields(comments[before].strip().lstrip("#%/"), separator) if before else []
+        before, comment = next(((k, line) for k, line in reversed(comments) if k < header), (0, ""))
+        named = _fields(comment.lstrip().lstrip("#%/"), separator)
         if len(named) != len(names) or _all_numbers(named):
             raise DataError(
                 f"{file}:{header}: the first line holds numbers; it must name the columns, for example t,u,y"
@@ -163,7 +168,8 @@ def _separator(lines: Sequence[str]) -> str:
     if agreeing[best]:
         return best
     # A file of one column has no separator; what fits none is refused where its fields are counted.
-    return single[0] if single else max(SEPARATORS, key=lambda separator: sizes[separator])
+    marked = [separator for separator in SEPARATORS if separator in lines[0] and separator != " "]
+    return single[0] if single and not marked else max(marked or SEPARATORS, key=lambda separator: sizes[separator])
 
 
 def _decimal(fields: Iterable[str]) -> str:
@@ -261,7 +267,7 @@ class _Widened:
 def _opened(path: str | os.PathLike[str], layout: Layout) -> io.TextIOBase:
     """Open a file at its first sample."""
     # What cannot be decoded there can be no number, and need not be one where it is not used.
-    text = open(path, encoding=layout.encoding, errors="replace", newline="")
+    text = open(path, encoding=layout.encoding, errors="replace", newline="")  # noqa: SIM115
     for _ in range(layout.first - 1):
         text.readline()
     return text
@@ -276,8 +282,9 @@ def _chunks(path: str | os.PathLike[str], layout: Layout, places: Sequence[int],
     options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
     options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
     options |= {"skipinitialspace": True, "dtype": dtype, "chunksize": ROWS, "engine": "c"}
-    with _opened(path, layout) as text, pd.read_csv(_Widened(text, layout), **options) as frames:
-        for k, frame in enumerate(frames):
+    with _opened(path, layout) as text:
+        widened: Any = _Widened(text, layout)
+        for k, frame in enumerate(pd.read_csv(widened, **options)):
             yield frame if k else frame.iloc[1:]
 
 
@@ -306,9 +313,9 @@ def _refuse_fields(path: str | os.PathLike[str], file: str, layout: Layout, plac
                 raise DataError(f"{file}:{line}: {found}, which is {_instead_of_number(text, layout)}")
             row += len(frame)
     except ValueError as error:
-        row = re.search(r"inside string starting at row (\d+)", str(error))
-        where = "" if row is None else f":{layout.first + int(row[1]) - 1}"
-        why = "a quotation mark is opened and never closed" if row else f"not a table of text ({error})"
+        opened = re.search(r"inside string starting at row (\d+)", str(error))
+        where = "" if opened is None else f":{layout.first + int(opened[1]) - 1}"
+        why = "a quotation mark is opened and never closed" if opened else f"not a table of text ({error})"
         raise DataError(f"{file}{where}: {why}; export the file anew, or correct the line") from None
     raise DataError(f"{file}: the columns cannot be read as numbers; write them with digits and one decimal sign")
 

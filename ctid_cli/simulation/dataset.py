@@ -356,7 +356,12 @@ class MeasuredSource:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         if self.sha256 is not None:
             require_content(self.file, self.sha256)
-        columns = {"time": self.time, "input": self.input, "output": self.output, "reference": self.reference}
+        columns: dict[str, Any] = {
+            "time": self.time,
+            "input": self.input,
+            "output": self.output,
+            "reference": self.reference,
+        }
         measured = read_measurement(self.file, **columns, hold=self.hold, in_seconds=True)
         whole = measured.record
         t, u, y = whole.t, whole.input.values, whole.y

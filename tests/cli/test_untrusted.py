@@ -142,7 +142,7 @@ def test_messages_do_not_steer_the_terminal(inside):
 @pytest.mark.parametrize("header", ["," * 20_000, "x" * 2_000_000, "t\0,u,y"])
 def test_first_lines_that_name_no_columns(header, inside):
     (inside / "record.csv").write_text(header + "\n" + ROWS)
-    with pytest.raises(DataError, match=r"first line has|not a text file"):
+    with pytest.raises(DataError, match=r"names no columns|more than 1000000 bytes|not a text file"):
         read_measurement(inside / "record.csv")
 
 
