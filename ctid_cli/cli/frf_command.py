@@ -25,7 +25,8 @@ from ctid_cli.signals.treatment import ResponseMethod
 @guarded
 def frf(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Record (.csv, .mat); several: realisations of one input.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Record (.csv, .mat, .h5); several: realisations of one input."),
     ],
     method: Annotated[ResponseMethod, typer.Option("--method", help="How the response is estimated.")] = "auto",
     period: Annotated[
