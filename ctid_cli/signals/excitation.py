@@ -242,7 +242,7 @@ class Step(Excitation):
 
 @dataclass(frozen=True)
 class InputFile(Excitation):
-    """The user's own input, from a comma-separated file.
+    """The user's own input, from a text (.csv), MATLAB or HDF5 file.
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ HEAD_LINES, HEAD_BYTES = 50, 1_000_000
 #: Columns of the widest file.
 MAX_COLUMNS = 10_000
 #: Rows that are converted at a time: memory is needed for them and for the numbers of the columns that are used.
-ROWS = 1 << 16
+ROWS = 1 << 17
 #: Separators in the order in which they are preferred if several fit; the blank stands for any blanks and tabs.
 SEPARATORS = ("\t", ";", ",", " ")
 #: How comments begin, which may stand before the data.
