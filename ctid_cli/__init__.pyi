@@ -7,7 +7,7 @@ __version__: str
 # Records and the signals that excite and disturb them
 from .signals.held import HeldSignal as HeldSignal
 from .signals.record import Loop as Loop, Record as Record
-from .signals.csv_file import read_record as read_record
+from .signals.measurement import read_record as read_record
 from .signals.excitation import Gaussian as Gaussian, Prbs as Prbs, Step as Step
 from .signals.multisine import Multisine as Multisine
 from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals

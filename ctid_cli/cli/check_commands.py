@@ -33,7 +33,7 @@ further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_name
 
 @guarded
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat).")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat, .h5).")],
     time: TimeColumn = None,
     input: InputColumn = None,
     output: OutputColumn = None,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
-from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+from ctid_cli.signals.measurement import read_held_signal
 
 #: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
 #: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.
@@ -318,7 +318,7 @@ def _staircase(sample_times: Array, times: tuple[float, ...], levels: tuple[floa
 
 @dataclass(frozen=True)
 class InputFile(Excitation):
-    """The user's own input, from a comma-separated file.
+    """The user's own input, from a text (.csv), MATLAB or HDF5 file.
 
     Parameters
     ----------

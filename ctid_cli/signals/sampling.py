@@ -9,7 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
-from ctid_cli.signals.csv_file import read_csv_table
+from ctid_cli.signals.measurement import read_instants
 
 InputRecord = Literal["sampled", "exact"]
 
@@ -266,7 +266,7 @@ class ListedInstants(GivenInstants):
 
 @dataclass(frozen=True)
 class InstantsFile(GivenInstants):
-    """Samples at instants from a comma-separated file.
+    """Samples at instants from a text (.csv), MATLAB or HDF5 file.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ class InstantsFile(GivenInstants):
 
     def times(self, rng: np.random.Generator) -> Array:
         """Return the instants of the file; nothing is drawn."""
-        instants = read_csv_table(self.file).times(self.time)
+        instants = read_instants(self.file, self.time)
         if instants.size < 2:
             raise DataError(f"{self.file}: there is one instant, and a record has two or more")
         return instants

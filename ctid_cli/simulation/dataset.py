@@ -22,10 +22,10 @@ from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.files import COPIES, require_file
 from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
+from ctid_cli.signals.measurement import Offset, read_measurement
 from ctid_cli.signals.noise import stream
 from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.sampling import Sampling
@@ -296,7 +296,7 @@ class MeasuredSource:
     Parameters
     ----------
     file : str
-        Comma-separated file, relative to the folder of the specification.
+        File with the record, relative to the folder of the specification.
     sha256 : str, optional
         SHA-256 of the file.
     time : str, default "t"
@@ -339,7 +339,14 @@ class MeasuredSource:
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         file = self.file if self.sha256 is None else require_content(self.file, self.sha256)
-        whole = read_record(file, time=self.time, input=self.input, output=self.output, hold=self.hold)
+        columns: dict[str, Any] = {
+            "time": self.time,
+            "input": self.input,
+            "output": self.output,
+            "reference": self.reference,
+        }
+        measured = read_measurement(file, **columns, hold=self.hold, in_seconds=True)
+        whole = measured.record
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
         used = f"the {count} samples used for estimation"
@@ -351,8 +358,8 @@ class MeasuredSource:
             constant = f"the input {self.input!r} is constant ({u[0]:g}) over {used}"
             raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
         loop = None
-        if self.reference is not None:
-            r = read_held_signal(file, time=self.time, input=self.reference).values[:count]
+        if measured.reference_values is not None:
+            r = measured.reference_values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
                 # A record of a loop is refused where its clock is not regular.

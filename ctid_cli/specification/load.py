@@ -10,8 +10,8 @@ from pydantic_core import ErrorDetails
 
 from ctid_cli.errors import DataError, RefusedError, SpecError
 from ctid_cli.kinds import KINDS
-from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.files import is_inside
+from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings

@@ -9,8 +9,7 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DataError, RefusedError, SpecError, UsageError
-from ctid_cli.signals.csv_file import read_csv_table
-from ctid_cli.signals.mat_file import read_mat_table
+from ctid_cli.signals.array_file import read_array_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
@@ -129,7 +128,7 @@ def test_what_is_no_ordinary_file(name, inside, monkeypatch):
     monkeypatch.chdir(inside)
     os.mkfifo("pipe.csv")
     (inside / "link.csv").symlink_to("/dev/zero")
-    for read in (read_csv_table, read_mat_table, read_measurement):
+    for read in (read_array_table, read_measurement):
         with pytest.raises(DataError, match=r"is not a file|are not read"):
             read(name)
     with pytest.raises(UsageError, match=r"is not a file|is a folder"):
@@ -157,8 +156,8 @@ def test_messages_do_not_steer_the_terminal(inside):
 @pytest.mark.parametrize("header", ["," * 20_000, "x" * 2_000_000, "t\0,u,y"])
 def test_first_lines_that_name_no_columns(header, inside):
     (inside / "record.csv").write_text(header + "\n" + ROWS)
-    with pytest.raises(DataError, match=r"first line has|not a text file"):
-        read_csv_table(inside / "record.csv")
+    with pytest.raises(DataError, match=r"names no columns|more than 1000000 bytes|not a text file"):
+        read_measurement(inside / "record.csv")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.csv_file import read_record
+from ctid_cli.signals.measurement import read_record
 from ctid_cli.signals.noise import stream
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.load import load_spec, spec_from_canonical
