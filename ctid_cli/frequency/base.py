@@ -7,6 +7,7 @@ A plugin is a frozen dataclass of options derived from :class:`FrequencyEstimato
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import ClassVar
@@ -118,6 +119,10 @@ class FrequencyEstimator(ABC):
     """
 
     kind: ClassVar[str]
+    #: Whether one estimate stands for the whole record: its track has one row, at the last sample.
+    whole_record: ClassVar[bool] = False
+    #: Whether the flag CHANGED is an alarm, so that false alarms are counted.
+    raises_alarms: ClassVar[bool] = False
 
     tones: int
 
@@ -147,6 +152,39 @@ class FrequencyEstimator(ABC):
         ValueError
             If the options do not fit to the sampling interval.
         """
+
+    def check(self, count: int, interval: float) -> None:  # noqa: B027 - most estimators take any record
+        """Refuse records that the options do not fit to, before there are any.
+
+        Parameters
+        ----------
+        count : int
+            Number of samples.
+        interval : float
+            Sampling interval [s].
+
+        Raises
+        ------
+        DataError
+            If the options do not fit, or the samples are too few; ``DataError(message, "h")`` blames the option h.
+        """
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say what is allowed but unwise on a signal: the name of an option, and a sentence about it.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s].
+        highest : float
+            Highest frequency of the signal [rad/s].
+
+        Yields
+        ------
+        tuple of str
+            The option and the sentence.
+        """
+        yield from ()
 
     def keep_one_for_each(self, name: str, unit: str) -> None:
         """Check an option that holds one positive number for each tone, and keep it as a tuple."""

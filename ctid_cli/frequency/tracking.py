@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, ClassVar, NamedTuple
@@ -142,6 +142,7 @@ class BatchEstimator(FrequencyEstimator):
     """
 
     online: ClassVar[bool] = False
+    whole_record: ClassVar[bool] = True
 
     def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
         """Return the one estimate of the record, at its last instant."""
@@ -183,6 +184,31 @@ class OnlineEstimator(FrequencyEstimator):
         """Return the estimate at every sample of the record."""
         found = self.start(interval).run(samples)
         return base.FrequencyTrack(found.t, found.omega, found.flags)
+
+    def check(self, count: int, interval: float) -> None:
+        """Refuse delays and memories that are longer than the record, and options that the clock cannot have."""
+        duration = interval * count
+        # First of all, since the estimator would keep all the samples of such a time.
+        for name in ("prefilter", "difference", "d", "hold", "memory"):
+            value = getattr(self, name, 0.0)
+            if value > duration and (name != "memory" or self.kind == "drem_window"):
+                raise OptionError(name, f"{name} = {value:g} s is longer than the record, {duration:g} s")
+        rows = getattr(self, "first_row", 0) + self.tones - 1 if hasattr(self, "d") else 0
+        filled = 2 * self.tones * getattr(self, "h", 0.0) + rows * getattr(self, "d", 0.0)
+        filled += getattr(self, "prefilter", 0.0) + getattr(self, "difference", 0.0)
+        if filled >= duration:
+            ends = f"the record ends at {duration:g} s; take a smaller h"
+            raise OptionError("h", f"its delays are filled after {filled:g} s, {ends}")
+        self.start(interval)
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say that a frequency has an alias at the delay, or that the clock does not have the delay."""
+        delay = getattr(self, "h", 0.0)
+        if highest * delay > np.pi:
+            limit = f"with h = {delay:g} s, frequencies above pi/h = {np.pi / delay:.4g} rad/s"
+            yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+        for note in self.start(interval).notes:
+            yield "h", note
 
     @abstractmethod
     def _recursion(self, interval: float) -> Recursion:
