@@ -189,9 +189,9 @@ class OnlineEstimator(FrequencyEstimator):
         """Refuse delays and memories that are longer than the record, and options that the clock cannot have."""
         duration = interval * count
         # First of all, since the estimator would keep all the samples of such a time.
-        for name in ("prefilter", "difference", "d", "hold", "memory"):
+        for name in ("prefilter", "difference", "d", "hold", *(("memory",) if self.kind == "drem_window" else ())):
             value = getattr(self, name, 0.0)
-            if value > duration and (name != "memory" or self.kind == "drem_window"):
+            if value > duration:
                 raise OptionError(name, f"{name} = {value:g} s is longer than the record, {duration:g} s")
         rows = getattr(self, "first_row", 0) + self.tones - 1 if hasattr(self, "d") else 0
         filled = 2 * self.tones * getattr(self, "h", 0.0) + rows * getattr(self, "d", 0.0)

@@ -18,7 +18,7 @@ from ctid_cli.running.job import EstimatorCell, Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan, Task
 from ctid_cli.running.workers import call_alone
-from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
+from ctid_cli.simulation.components import ComponentError, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource, StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS, trial
 from ctid_cli.specification.messages import Complaint
@@ -53,7 +53,7 @@ def check_components(plan: Plan, limits: Limits, warn: Callable[[str], object]) 
     but a worker should make them.
     """
     cell = plan.data_cells[0]
-    wanted = [entry for entry in plan.keys(Task(0, 0)) if isinstance(entry[1].estimator, CustomEstimation)]
+    wanted = [entry for entry in plan.keys(Task(0, 0)) if is_custom(getattr(entry[1].estimator, "options", None))]
     makes_data = bool(_parts(cell.source))
     if not wanted and not makes_data:
         return False

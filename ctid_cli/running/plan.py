@@ -16,7 +16,7 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import KINDS
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.job import DataCell, EstimatorCell, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
@@ -348,10 +348,10 @@ def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
     estimator = variant.options
-    if is_custom(estimator):
-        estimator = CustomEstimation(estimator)
-    elif content["kind"] in KINDS["frequency_estimator"]:
+    if isinstance(estimator, FrequencyEstimator):
         estimator = FrequencyEstimation(estimator)
+    elif is_custom(estimator):
+        estimator = CustomEstimation(estimator)
     return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
 
 
