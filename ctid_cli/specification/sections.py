@@ -444,7 +444,7 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
-    for option in target.__dataclass_fields__:
+    for option in (option.name for option in dataclasses.fields(target)):
         if option in {"kind", *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
