@@ -191,9 +191,7 @@ class SignalDataSet:
         signal, times, options = self.source.signal, self.record.times, fit.options
         true = true_frequencies(signal, self.source.disturbance, options.tones, times)
         reasons = " ".join(fit.track.reasons(-1))
-        measures = measure_track(
-            fit.track, times, true, signal, self.source.measuring, alarms=options.raises_alarms
-        )
+        measures = measure_track(fit.track, times, true, signal, self.source.measuring, alarms=options.raises_alarms)
         status, message = ("INVALID", reasons) if reasons else ("VALID", "The last estimate is valid.")
         return {"status": status, "message": message, "measures": measures}
 

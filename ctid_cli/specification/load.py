@@ -112,9 +112,9 @@ def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
         path, node = waiting.pop()
         items = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
         waiting += (((*path, key), value) for key, value in items)
-        if path and path[-1] == "kind" and isinstance(node, str) and names_code(node):
-            if not is_shipped(node, folder):
-                yield path
+        named = path and path[-1] == "kind" and isinstance(node, str) and names_code(node)
+        if named and not is_shipped(node, folder):
+            yield path
 
 
 def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Located]]:

@@ -202,7 +202,7 @@ def root_derivatives(roots):
 
 @njit(cache=True, nogil=True)
 def descend(rows, gains, initial):
-    """Return the coefficients after each row: implicit steps ``a += K phi e/(1 + phi' K phi)``, no gain is too large."""
+    """Return the coefficients after each row: implicit steps ``a += K phi e/(1 + phi' K phi)``."""
     count, n = rows.shape[0], initial.size
     found, coefficients = np.empty((count, n)), initial.copy()
     for k in range(count):
