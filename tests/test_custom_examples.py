@@ -47,6 +47,17 @@ def test_the_tank_is_nearly_linear(out):
     np.testing.assert_allclose(found, [[0.5, 0.25]] * 4, rtol=0.03)
 
 
+def test_an_estimator_of_frequencies(tmp_path):
+    ctid("run", EXAMPLES / "zero_crossings.yaml", "--allow-code", "--quiet", "--jobs", "1", "--out", tmp_path)
+    rows = json.loads(ctid("export", "zero-crossings", "--format", "json", "--out", tmp_path).stdout)
+    mine = [row["measures"] for row in rows if row["estimator"] == "mine"]
+    assert len(mine) == 2
+    for measures in mine:
+        assert measures["omega_1"] == pytest.approx(2.0, abs=1e-3)
+        assert (measures["valid_share"], "settling_time_1" in measures) == (100.0, False)
+    assert all(row["converged"] for row in rows)
+
+
 def test_one_estimate_is_computed_once_more_with_permission_only(out):
     row = json.loads(ctid("export", "custom-study", "--format", "json", "--out", out).stdout)[0]
     assert "mine (./output_error.py:OutputError)" in ctid("show", row["id"], "--out", out).stdout

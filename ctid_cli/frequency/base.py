@@ -99,7 +99,18 @@ class FrequencyTrack(ShownAsTable):
         return np.asarray(self.flags == 0)
 
     def reasons(self, row: int) -> tuple[str, ...]:
-        """Say why a row must not be trusted: one sentence for each flag."""
+        """Say why a row must not be trusted.
+
+        Parameters
+        ----------
+        row : int
+            Number of the row.
+
+        Returns
+        -------
+        tuple of str
+            One sentence for each flag.
+        """
         return Flag(int(self.flags[row])).sentences
 
 
@@ -187,7 +198,15 @@ class FrequencyEstimator(ABC):
         yield from ()
 
     def keep_one_for_each(self, name: str, unit: str) -> None:
-        """Check an option that holds one positive number for each tone, and keep it as a tuple."""
+        """Check an option that holds one positive number for each tone, and keep it as a tuple.
+
+        Parameters
+        ----------
+        name : str
+            The option.
+        unit : str
+            Its unit.
+        """
         values = getattr(self, name)
         if values is None:
             return

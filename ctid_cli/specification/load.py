@@ -127,8 +127,9 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     found: dict[str, Any] = {"experiment": "", "estimators": {}}
     complaints: list[Located] = []
+    given = {name for name, value in tree.items() if value is not None}
     for name, value in _pieces(tree):
-        right, wrong = _piece(name, value, folder, tree.keys())
+        right, wrong = _piece(name, value, folder, given)
         complaints += wrong
         if not wrong:
             found[name] = found[name] | right if name == "estimators" else right
