@@ -55,19 +55,7 @@ class FrequencyEstimate:
 
 @dataclass(frozen=True, eq=False)
 class FrequencyTrack(ShownAsTable):
-    """Frequencies over time.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Instants since the first sample that the tracker ever saw [s].
-    omega : ndarray, shape (N, n)
-        Frequencies [rad/s], ascending in each row.
-    flags : ndarray of uint16, shape (N,)
-        Bit field of :class:`~ctid_cli.frequency.flags.Flag`.
-    uncertainty : ndarray, shape (N, n)
-        Error that the misfit of the equations could make in its worst direction [rad/s]; NaN if unknown.
-    """
+    """Frequencies over time."""
 
     t: Array
     omega: Array

@@ -1,20 +1,28 @@
 """The comparators of the frequency study: against SciPy and plain formulas, their convergence, and what they refuse."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from ctid_cli import DataError, Flag
+from ctid_cli.custom_code import STUDIES, find_class
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.studies.catalogue import find_study
 from tests.frequency.signals import INTERVAL, OMEGA, tones
 
 STUDY = find_study("finite-time-frequency")
-observer, regression, whole = (
-    STUDY.module(f"comparators.{name}") for name in ("adaptive_observer", "filter_regression", "whole_record")
+COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
+#: Loaded as specifications load them: Numba's caches know the modules by the names that they have then.
+Observer, Filter, Esprit, Nonlinear = (
+    find_class(f"./{kind}", COMPARATORS)
+    for kind in (
+        *("adaptive_observer.py:AdaptiveObserver", "filter_regression.py:FilterRegression"),
+        *("whole_record.py:Esprit", "whole_record.py:NonlinearLeastSquares"),
+    )
 )
-Observer, Filter, Esprit = observer.AdaptiveObserver, regression.FilterRegression, whole.Esprit
-Nonlinear = whole.NonlinearLeastSquares
+observer, regression, whole = (sys.modules[each.__module__] for each in (Observer, Filter, Esprit))
 T = INTERVAL * np.arange(4000)
 NOISE = np.random.default_rng(0).standard_normal(T.size)
 
@@ -140,7 +148,9 @@ NO_TWO_TONES = {
 
 
 @pytest.mark.parametrize("name", NO_TWO_TONES)
-@pytest.mark.parametrize("options", [Filter(tones=2, pole=4.0), Esprit(tones=2, averaging=0.05)], ids=["filter", "whole"])
+@pytest.mark.parametrize(
+    "options", [Filter(tones=2, pole=4.0), Esprit(tones=2, averaging=0.05)], ids=["filter", "whole"]
+)
 def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
     assert not options.track(NO_TWO_TONES[name], INTERVAL).valid.any()
 
@@ -166,7 +176,7 @@ def test_too_few_iterations_are_reported():
     ],
 )
 def test_impossible_options_are_refused(kind, options, field):
-    with pytest.raises((DataError, ValueError), match=field) as error:
+    with pytest.raises((DataError, ValueError)) as error:
         kind(tones=2, **options)
     assert error.value.field == field
 
@@ -194,6 +204,8 @@ def test_a_missing_sample_is_refused():
 
 
 def test_a_step_within_a_whole_record_is_unwise():
-    spec = STUDY.plan("two-tones", ["signal.tones.0.frequency=[{until: 30, value: 2}, {value: 2.1}]"]).spec
+    spec = STUDY.plan(
+        "two-tones", ["signal.tones=[{frequency: [{until: 30, value: 2}, {value: 2.1}]}, {frequency: 3}]"]
+    ).spec
     assert sum("gives one estimate of the whole record" in warning for warning in spec.warnings) == 2
     assert spec_from_canonical(spec.canonical(), spec.folder).canonical() == spec.canonical()
