@@ -75,18 +75,13 @@ from .filtering.filter_set import FilterSet as FilterSet, check_filters as check
 from .estimation.redundancy import RedundantMinimum as RedundantMinimum, minimise_redundantly as minimise_redundantly
 
 # Frequencies of signals
+from .frequency.base import Flag as Flag, FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
 from .frequency.drem_gradient import DremGradient as DremGradient
 from .frequency.drem_finite_time import DremFiniteTime as DremFiniteTime
 from .frequency.drem_window import DremWindow as DremWindow
 from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
-from .frequency.adaptive_observer import AdaptiveObserver as AdaptiveObserver
-from .frequency.filter_regression import FilterRegression as FilterRegression
-from .frequency.esprit import Esprit as Esprit
-from .frequency.nonlinear_least_squares import NonlinearLeastSquares as NonlinearLeastSquares
 from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
-from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, FrequencyTrack as FrequencyTrack
-from .frequency.tracking import Tracker as Tracker
-from .frequency.flags import Flag as Flag
+from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, Tracker as Tracker
 
 # Synchrophasors of mains signals
 from .frequency.synchrophasor import SynchrophasorTrack as SynchrophasorTrack

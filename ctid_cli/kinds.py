@@ -46,15 +46,11 @@ KINDS: dict[str, dict[str, str]] = {
         "drem_finite_time": "ctid_cli.frequency.drem_finite_time:DremFiniteTime",
         "drem_window": "ctid_cli.frequency.drem_window:DremWindow",
         "restarting_least_squares": "ctid_cli.frequency.restarting_least_squares:RestartingLeastSquares",
-        "adaptive_observer": "ctid_cli.frequency.adaptive_observer:AdaptiveObserver",
-        "filter_regression": "ctid_cli.frequency.filter_regression:FilterRegression",
-        "esprit": "ctid_cli.frequency.esprit:Esprit",
-        "nonlinear_least_squares": "ctid_cli.frequency.nonlinear_least_squares:NonlinearLeastSquares",
     },
 }
 
-#: Estimators of frequencies that take one sample after the other; the others take whole records.
-ONLINE = tuple(kind for kind in KINDS["frequency_estimator"] if kind not in ("esprit", "nonlinear_least_squares"))
+#: Estimators of frequencies that take one sample after the other.
+ONLINE = tuple(KINDS["frequency_estimator"])
 
 
 def resolve(section: str, kind: str) -> type[Any]:

@@ -69,6 +69,17 @@ def test_a_robust_loss_sees_less_of_a_faulty_sensor(out):
     assert tukey < squares
 
 
+def test_an_estimator_of_frequencies(tmp_path):
+    ctid("run", EXAMPLES / "zero_crossings.yaml", "--allow-code", "--quiet", "--jobs", "1", "--out", tmp_path)
+    rows = json.loads(ctid("export", "zero-crossings", "--format", "json", "--out", tmp_path).stdout)
+    mine = [row["measures"] for row in rows if row["estimator"] == "mine"]
+    assert len(mine) == 2
+    for measures in mine:
+        assert measures["omega_1"] == pytest.approx(2.0, abs=1e-3)
+        assert (measures["valid_share"], "settling_time_1" in measures) == (100.0, False)
+    assert all(row["converged"] for row in rows)
+
+
 def test_one_estimate_is_computed_once_more_with_permission_only(out):
     row = json.loads(ctid("export", "custom-study", "--format", "json", "--out", out).stdout)[0]
     assert "mine (./output_error.py:OutputError)" in ctid("show", row["id"], "--out", out).stdout

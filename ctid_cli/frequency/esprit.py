@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,24 +24,7 @@ RANK_TOLERANCE = 1e-11
 
 @dataclass(frozen=True, kw_only=True)
 class Esprit(BatchEstimator):
-    r"""Frequencies of a whole record by ESPRIT, a reference for the online estimators.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    averaging : float, default 0.0
-        Blocks of this length are averaged first [s], so that some hundred samples are left; 0 for none. Frequencies
-        must lie below pi over this time.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi over the interval of the averages.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
+    r"""Frequencies of a whole record by ESPRIT, for the tracker of recordings.
 
     Notes
     -----
@@ -53,18 +35,7 @@ class Esprit(BatchEstimator):
     ----------
     R. Roy and T. Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques", *IEEE Trans.
     Acoustics, Speech, and Signal Processing* 37 (1989) 984-995. doi:10.1109/29.32276
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ctid_cli.frequency.esprit import Esprit
-    >>> t = 0.01 * np.arange(1000)
-    >>> estimate = Esprit(tones=2, averaging=0.05).estimate(np.sin(2 * t) + np.cos(3 * t), 0.01)
-    >>> estimate.omega.round(9), estimate.valid
-    (array([2., 3.]), True)
     """
-
-    kind: ClassVar[str] = "esprit"
 
     averaging: float = 0.0
     lowest_frequency: float = 0.0
@@ -76,31 +47,7 @@ class Esprit(BatchEstimator):
         require_bounds(self.lowest_frequency, self.highest_frequency)
 
     def blocks(self, count: int, interval: float) -> tuple[int, int, float]:
-        """How a record is averaged and arranged.
-
-        Parameters
-        ----------
-        count : int
-            Number of samples.
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        block : int
-            Samples that are averaged.
-        rows : int
-            Rows of the Hankel matrix.
-        highest : float
-            Upper bound of the frequencies [rad/s].
-
-        Raises
-        ------
-        DataError
-            If the samples are too few or too many.
-        ValueError
-            If the bounds do not fit to the averaging.
-        """
+        """How a record is averaged and arranged."""
         block = max(1, round(min(self.averaging / interval, float(count))))
         highest = np.pi / (block * interval)
         if self.highest_frequency is not None:

@@ -78,6 +78,7 @@ class RestartingLeastSquares(DelayRegression):
     """
 
     kind: ClassVar[str] = "restarting_least_squares"
+    raises_alarms: ClassVar[bool] = True
 
     memory: float | None = None
     solution: Solution = "least_squares"

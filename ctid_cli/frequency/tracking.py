@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, ClassVar, NamedTuple
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.frequency import base
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.frequency_kernels import Output
 from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
@@ -54,19 +55,7 @@ class FrequencyEstimate:
 
 @dataclass(frozen=True, eq=False)
 class FrequencyTrack(ShownAsTable):
-    """Frequencies over time.
-
-    Parameters
-    ----------
-    t : ndarray, shape (N,)
-        Instants since the first sample that the tracker ever saw [s].
-    omega : ndarray, shape (N, n)
-        Frequencies [rad/s], ascending in each row.
-    flags : ndarray of uint16, shape (N,)
-        Bit field of :class:`~ctid_cli.frequency.flags.Flag`.
-    uncertainty : ndarray, shape (N, n)
-        Error that the misfit of the equations could make in its worst direction [rad/s]; NaN if unknown.
-    """
+    """Frequencies over time."""
 
     t: Array
     omega: Array
@@ -107,7 +96,7 @@ class Recursion(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrequencyEstimator(ABC):
+class FrequencyEstimator(base.FrequencyEstimator):
     """Options of an estimator of frequencies."""
 
     kind: ClassVar[str]
@@ -141,6 +130,13 @@ class BatchEstimator(FrequencyEstimator):
     """
 
     online: ClassVar[bool] = False
+    whole_record: ClassVar[bool] = True
+
+    def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
+        """Return the one estimate of the record, at its last instant."""
+        found = self.estimate(samples, interval)
+        last = np.array([(np.size(samples) - 1) * interval])
+        return base.FrequencyTrack(last, found.omega[None, :], np.array([int(found.flags)], np.uint16))
 
     @abstractmethod
     def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
@@ -171,6 +167,36 @@ class OnlineEstimator(FrequencyEstimator):
     """Options of an estimator that takes sample after sample."""
 
     online: ClassVar[bool] = True
+
+    def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
+        """Return the estimate at every sample of the record."""
+        found = self.start(interval).run(samples)
+        return base.FrequencyTrack(found.t, found.omega, found.flags)
+
+    def check(self, count: int, interval: float) -> None:
+        """Refuse delays and memories that are longer than the record, and options that the clock cannot have."""
+        duration = interval * count
+        # First of all, since the estimator would keep all the samples of such a time.
+        for name in ("prefilter", "difference", "d", "hold", *(("memory",) if self.kind == "drem_window" else ())):
+            value = getattr(self, name, 0.0)
+            if value > duration:
+                raise OptionError(name, f"{name} = {value:g} s is longer than the record, {duration:g} s")
+        rows = getattr(self, "first_row", 0) + self.tones - 1 if hasattr(self, "d") else 0
+        filled = 2 * self.tones * getattr(self, "h", 0.0) + rows * getattr(self, "d", 0.0)
+        filled += getattr(self, "prefilter", 0.0) + getattr(self, "difference", 0.0)
+        if filled >= duration:
+            ends = f"the record ends at {duration:g} s; take a smaller h"
+            raise OptionError("h", f"its delays are filled after {filled:g} s, {ends}")
+        self.start(interval)
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say that a frequency has an alias at the delay, or that the clock does not have the delay."""
+        delay = getattr(self, "h", 0.0)
+        if highest * delay > np.pi:
+            limit = f"with h = {delay:g} s, frequencies above pi/h = {np.pi / delay:.4g} rad/s"
+            yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+        for note in self.start(interval).notes:
+            yield "h", note
 
     @abstractmethod
     def _recursion(self, interval: float) -> Recursion:

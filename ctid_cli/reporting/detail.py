@@ -116,7 +116,7 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
 def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.simulation.frequency_measures import FrequencyFit, SignalDataSet
+    from ctid_cli.simulation.frequency_measures import SignalDataSet
     from ctid_cli.specification.load import spec_from_canonical
 
     row = found.row
@@ -130,7 +130,7 @@ def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     data = plan.data_cells[cells[0]].dataset(key.replicate)
     drawn = start.draw(found.stored.manifest["seed"], key.replicate, data.true_model)
     fit = cell.estimator.prepare(data.record).fit(drawn)
-    if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
+    if isinstance(data, SignalDataSet):
         sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])
         then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
         return Repeated([], _difference(then, now))

@@ -17,7 +17,7 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import KINDS
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.job import DataCell, EstimatorCell, Job, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
@@ -338,11 +338,9 @@ def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -
 
 def estimation(variant: Variant) -> Any:
     """Return what prepares a record and fits to it."""
-    if is_custom(variant.options):
-        return CustomEstimation(variant.options)
-    if variant.values["kind"] in KINDS["frequency_estimator"]:
+    if isinstance(variant.options, FrequencyEstimator):
         return FrequencyEstimation(variant.options)
-    return variant.options
+    return CustomEstimation(variant.options) if is_custom(variant.options) else variant.options
 
 
 def _column_names(parts: Mapping[str, Iterable[Variant]]) -> dict[KeyPath, str]:

@@ -29,7 +29,7 @@ from ctid_cli.running.job import MEASURE, with_measures
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
 from ctid_cli.running.workers import call_alone
-from ctid_cli.simulation.components import ComponentError, CustomEstimation, is_custom
+from ctid_cli.simulation.components import ComponentError, is_custom
 from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
@@ -84,6 +84,11 @@ class Candidate(NamedTuple):
     swept: Mapping[KeyPath, Any]
     start: StartPoint
 
+    @property
+    def is_custom(self) -> bool:
+        """Whether its class is not one of ctid's."""
+        return is_custom(getattr(self.estimator, "options", None))
+
 
 @dataclass(frozen=True)
 class Found:
@@ -99,7 +104,7 @@ def try_out(spec: Spec) -> Found:
     settings, candidates = _settings(spec), list(_candidates(spec))
     if not settings:
         return Found()
-    custom = [candidate for candidate in candidates if isinstance(candidate.estimator, CustomEstimation)]
+    custom = [candidate for candidate in candidates if candidate.is_custom]
     own = [candidate for candidate in candidates if candidate not in custom]
     all_apart = bool(spec.custom_measures) or any(_custom_parts(setting.source) for setting in settings)
     success = {} if spec.success is None else spec.success.model_dump()
@@ -182,7 +187,7 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
             data, complaints = _first_data(setting.source)
             failures += [(path, text, setting.swept) for path, text in complaints]
             for candidate in candidates if data is not None else ():
-                custom, complaints = isinstance(candidate.estimator, CustomEstimation), []
+                custom, complaints = candidate.is_custom, []
                 if not custom:
                     its_failures, its_tried = of_estimators.setdefault(candidate.name, ([], []))
                     its_tried.append({**setting.swept, **candidate.swept})
@@ -286,7 +291,7 @@ def _fit(
         found.odd.append((path, text))
     else:
         found.odd.extend(_without_measures(candidate.name, first["message"]))
-        if first["status"] not in FAILURES and isinstance(candidate.estimator, CustomEstimation):
+        if first["status"] not in FAILURES and candidate.is_custom:
             found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
 
 

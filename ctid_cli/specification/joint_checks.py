@@ -10,15 +10,16 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json
+from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.frequency.drem_window import DremWindow
-from ctid_cli.frequency.esprit import Esprit
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
+from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification.messages import Complaint
@@ -239,7 +240,7 @@ def _world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]
     if not on_signal:
         here, does = "a system; give signal, or one of", "estimates the frequencies of a signal"
     for name, section in spec.estimators.items():
-        if section.kind not in KINDS[wanted] and (on_signal or not section.custom):
+        if issubclass(section.target, FrequencyEstimator) is not on_signal:
             message = f"{section.kind} {does}, and this experiment has {here} {', '.join(KINDS[wanted])}"
             yield ("estimators", name, "kind"), message
     for name in _RULES_OF_SYSTEMS if on_signal else _RULES_OF_SIGNALS:
@@ -314,7 +315,7 @@ def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
     """Say what each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"] or section.custom:
+        if section.custom or issubclass(section.target, FrequencyEstimator):
             continue
         at, cases = ("estimators", name), variants(section)
         yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
@@ -487,8 +488,8 @@ def _signal_complaints(spec: Spec) -> Iterator[Complaint]:
     yield from over({("signal",): signals, ("sampling",): clocks}, partial(_of_tone_clock, spec))
     disturbances = [case.options for case in variants(spec.disturbance)] or [None]
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"]:
-            at, cases = ("estimators", name), variants(section)
+        at, cases = ("estimators", name), variants(section)
+        if isinstance(cases[0].options, FrequencyEstimator):
             yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
             yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
 
@@ -521,42 +522,14 @@ def _of_tone_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -
 
 
 def _of_estimator(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    for path, message in (_of_online if options.online else _of_batch)(options, clock):
-        yield (*at, *path), message
-
-
-def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    duration = clock.interval * clock.samples
-    # First of all, since the estimator would keep all the samples of such a time.
-    for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
-        value = getattr(options, name, 0.0)
-        if value > duration:
-            yield (name,), f"{name} = {value:g} s is longer than the record, {duration:g} s"
-            return
-    rows = options.first_row + options.tones - 1 if hasattr(options, "d") else 0
-    filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
-    filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
-    if filled >= duration:
-        yield ("h",), f"its delays are filled after {filled:g} s, the record ends at {duration:g} s; take a smaller h"
-        return
     try:
         with np.errstate(all="ignore"):
-            options.start(clock.interval)
+            options.check(clock.samples, clock.interval)
     except ArithmeticError:
-        yield (), "these values are too large or too small to compute with"
-    except ValueError as error:
-        yield place_of(error, vars(options)), str(error)
-
-
-def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    initial = getattr(options, "initial_frequencies", None)
-    if initial is not None:
-        highest = math.pi / clock.interval
-        if max(initial) >= highest:
-            yield ("initial_frequencies",), f"must be below {highest:.4g} rad/s, pi over the sampling interval"
-        return
-    start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
-    try:
-        start.blocks(clock.samples, clock.interval)
+        yield at, "these values are too large or too small to compute with"
     except (ValueError, DataError) as error:
-        yield place_of(error, vars(options)), str(error)
+        yield (*at, *place_of(error, vars(options))), str(error)
+    except Exception as error:
+        if not is_custom(options):
+            raise
+        yield (*at, "kind"), f"cannot check these options: {reason(error)}"

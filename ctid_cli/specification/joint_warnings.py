@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import Term
 from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
@@ -175,23 +176,16 @@ def _fraction_degrees(terms: Sequence[Term]) -> tuple[int, int]:
 
 def _signal_warnings(spec: Spec) -> list[Complaint]:
     """Say what is allowed but unwise in an experiment on a signal."""
-    signal = variants(spec.signal)[0].options
+    signal, clocks = variants(spec.signal)[0].options, variants(spec.sampling)
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():
         at, cases = ("estimators", name), variants(section)
-        warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
-        warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
-        if not cases[0].options.online and signal.frequency_steps:
+        warnings += over({(): cases, ("sampling",): clocks}, partial(_unwise, at, signal.highest_frequency))
+        if cases[0].options.whole_record and signal.frequency_steps:
             warnings.append(((*at, "kind"), "gives one estimate of the whole record, in which a frequency steps"))
     return warnings
 
 
-def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
-    if hasattr(options, "h") and highest > math.pi / options.h:
-        limit = f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s"
-        yield (*at, "h"), f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
-
-
-def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    for note in options.start(clock.interval).notes if options.online else ():
-        yield (*at, "h"), note
+def _unwise(at: KeyPath, highest: float, options: FrequencyEstimator, clock: RegularSampling) -> Iterator[Complaint]:
+    for name, text in options.warnings(clock.interval, highest):
+        yield (*at, name), text

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from ctid_cli.custom_code import is_shipped
 from ctid_cli.errors import DataError, RefusedError, SpecError
 from ctid_cli.kinds import KINDS
 from ctid_cli.signals.files import is_inside
@@ -112,14 +113,15 @@ def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
         raise SpecError(in_order)
 
 
-def _code_in(tree: Any) -> Iterator[KeyPath]:
-    """Return where kinds name code, anywhere in a tree, however deep."""
+def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
+    """Return where kinds name code that is not the program's own, anywhere in a tree, however deep."""
     waiting: list[tuple[KeyPath, Any]] = [((), tree)]
     while waiting:
         path, node = waiting.pop()
         items = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
         waiting += (((*path, key), value) for key, value in items)
-        if path and path[-1] == "kind" and isinstance(node, str) and names_code(node):
+        named = path and path[-1] == "kind" and isinstance(node, str) and names_code(node)
+        if named and not is_shipped(node, folder):
             yield path
 
 
@@ -128,13 +130,14 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     tree = source.tree
     # A specification may come from anywhere.
     ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
-    code = [source.problem(path, ask) for path in _code_in(tree)]
+    code = [source.problem(path, ask) for path in _code_in(tree, folder)]
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     found: dict[str, Any] = {"experiment": "", "estimators": {}}
     complaints: list[Located] = []
+    given = {name for name, value in tree.items() if value is not None}
     for name, value in _pieces(tree):
-        right, wrong = _piece(name, value, folder, tree.keys())
+        right, wrong = _piece(name, value, folder, given)
         complaints += wrong
         if not wrong:
             found[name] = found[name] | right if name == "estimators" else right
@@ -166,7 +169,8 @@ def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _piece(name: str, value: Any, folder: Path, given: Set[str] = frozenset()) -> tuple[Any, list[Located]]:
     """Return a section, or some estimators, of a specification that has some sections, and what is wrong with it."""
     try:
-        return _adapter(name).validate_python(value, strict=True, context={"folder": folder}), []
+        context = {"folder": folder, "of_signal": "signal" in given}
+        return _adapter(name).validate_python(value, strict=True, context=context), []
     except ValidationError as error:
         details = error.errors(include_url=False)
     for detail in details:

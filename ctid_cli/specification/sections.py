@@ -40,6 +40,7 @@ from pydantic_core import CoreSchema
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import CustomCodeError, find_class, reason
 from ctid_cli.errors import CtidError, OptionError
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling, geometric_sizes
@@ -391,6 +392,7 @@ CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
     "estimator": (Estimator, {"fit": ("record", "start")}),
     "measure": (Measure, {"value": ("fit", "data")}),
     "excitation": (Excitation, {"generate": ("times", "rng")}),
+    "frequency_estimator": (FrequencyEstimator, {"track": ("samples", "interval")}),
     "noise": (Noise, {"generate": ("output", "rng"), "generate_at": ("times", "output", "rng")}),
     "sampling": (Sampling, {"times": ("rng",)}),
     "system": (System, {"simulate": ("input", "times")}),
@@ -408,9 +410,11 @@ def custom_form(part: str) -> Any:
     def validated(value: Any, info: ValidationInfo) -> Section:
         if isinstance(value, Section):
             return value
+        context = info.context or {}
+        wanted = "frequency_estimator" if part == "estimator" and context.get("of_signal") else part
         try:
-            target = find_class(str(value["kind"]), (info.context or {}).get("folder", Path()))
-            form = _custom_section(target, part, value["kind"])
+            target = find_class(str(value["kind"]), context.get("folder", Path()))
+            form = _custom_section(target, wanted, value["kind"])
         except CustomCodeError as error:
             raise several_wrong("custom", [(("kind",), str(error), False)]) from None
         given = {"name": target.__name__, **value} if part == "measure" else value
@@ -440,10 +444,11 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
             inspect.signature(call).bind(None, *methods[method])  # type: ignore[arg-type]
         except (TypeError, ValueError):
             raise CustomCodeError(f"{name}.{method} cannot be called so; this kind needs {wanted}") from None
-    if not dataclasses.is_dataclass(target):
-        if vars(target).get("__annotations__") or target.__init__ is not object.__init__:
+    if "__dataclass_fields__" not in vars(target):
+        inherited = dataclasses.is_dataclass(target)
+        if vars(target).get("__annotations__") or (target.__init__ is not object.__init__ and not inherited):
             raise CustomCodeError(f"{name} is no dataclass; write @dataclass(frozen=True) above it")
-        target = dataclass(frozen=True)(target)
+        target = target if inherited else dataclass(frozen=True)(target)
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
@@ -452,7 +457,7 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
         raise CustomCodeError(f"{name}.unit must be a text, such as '%' or 'rad/s', not {unit!r}")
     forms: dict[str, type[CustomSection]] = {"system": CustomSystemSection, "measure": CustomMeasureSection}
     form = forms.get(part, CustomSection)
-    for option in target.__dataclass_fields__:
+    for option in (option.name for option in dataclasses.fields(target)):
         if option in {"kind", *form.model_fields, *dir(CustomSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:

@@ -53,8 +53,8 @@ def tones(name: str, duration: float = 60.0) -> Array:
 
 def settled(estimator: Any, name: str, samples: Array) -> str:
     """Time until both errors are below 0.05 rad/s to stay [s]."""
-    track = estimator.start(INTERVAL).run(samples)
-    time = settle(track.t, np.abs(track.omega - EXPERIMENTS[name][1]).max(axis=1), 0.05)
+    track = estimator.track(samples, INTERVAL)
+    time = settle(track.t, np.abs(track.frequencies - EXPERIMENTS[name][1]).max(axis=1), 0.05)
     return f"{time:.3g}" if np.isfinite(time) else "never"
 
 
@@ -111,7 +111,7 @@ def delay() -> Iterator[list[str]]:
     """A delay that satisfies the printed condition is useless in noise; the paper's own delays do not satisfy it."""
     samples = tones("A", 20.0).sum(axis=1)
     samples = samples + SIGMA * np.random.default_rng(0).standard_normal(samples.size)
-    tracks = [options(tuning).start(INTERVAL).run(samples) for tuning in ("A", "C")]
-    errors = [number(float(np.abs(track.omega[-1] - EXPERIMENTS["A"][1]).max()), 2) for track in tracks]
+    tracks = [options(tuning).track(samples, INTERVAL) for tuning in ("A", "C")]
+    errors = [number(float(np.abs(track.frequencies[-1] - EXPERIMENTS["A"][1]).max()), 2) for track in tracks]
     what = "h < pi/(2 w_max) = 0.52 s (remark 1), experiment A with noise"
     yield [what, "larger error at 20 s, h = 0.1 s and h = 0.6 s [rad/s]", *errors]

@@ -12,14 +12,10 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
-from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.studies.claim import Claim, near, within
@@ -248,31 +244,16 @@ def efficient(seeds: int = 100, first: int = 2000, interval: float = 0.001, dura
             .start(interval)
             .run(y)
             .omega[-1],
-            "ESPRIT": Esprit(tones=2, averaging=0.05).estimate(y, interval).omega,
-            "nonlinear least squares": NonlinearLeastSquares(tones=2, initial_frequencies=(2.0, 3.0))
-            .estimate(y, interval)
-            .omega,
         }
         for name, omega in estimates.items():
             errors.setdefault(name, []).append(omega - TRUTH)
     limits = {
         "least squares with prefilter": 2.6,
         "total least squares without": 4.0,
-        "ESPRIT": 1.35,
-        "nonlinear least squares": 1.35,
     }
     for name, limit in limits.items():
         ratio = np.sqrt(np.mean(np.square(errors[name]), axis=0)) / bound
         yield at_most(f"{name}: rms error / bound", ratio.max(), limit)
-
-
-def comparators(interval: float = 0.001) -> Iterator[Claim]:
-    """The derived comparators against their own baseline on signal A."""
-    y = signal("A", interval, 60.0)
-    track = AdaptiveObserver(tones=2, initial_frequencies=INITIAL).start(interval).run(y)
-    yield at_most("observer within 0.001 [s]", settle(track, TRUTH, 1e-3), 30.0)
-    track = FilterRegression(tones=2, pole=5.0, initial_frequencies=INITIAL).start(interval).run(y)
-    yield at_most("filter within 0.001 [s]", settle(track, TRUTH, 1e-3), 20.0)
 
 
 def coarse() -> Iterator[Claim]:
@@ -291,5 +272,4 @@ ITEMS: dict[str, Callable[[], Iterator[Claim]]] = {
     "quiet": quiet,
     "efficient": efficient,
     "coarse": coarse,
-    "comparators": comparators,
 }
