@@ -88,13 +88,5 @@ from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, Frequenc
 from .frequency.tracking import Tracker as Tracker
 from .frequency.flags import Flag as Flag
 
-# Synchrophasors of mains signals
-from .frequency.synchrophasor import SynchrophasorTrack as SynchrophasorTrack
-from .frequency.synchrophasor import measure_synchrophasors as measure_synchrophasors
-from .frequency.synchrophasor_check import SynchrophasorCheck as SynchrophasorCheck
-from .frequency.synchrophasor_check import check_synchrophasors as check_synchrophasors
-from .frequency.synchrophasor_check import CheckedLimit as CheckedLimit
-from .frequency.synchrophasor_limits import Limit as Limit
-
 # Errors
 from .errors import CtidError as CtidError, DataError as DataError, SpecError as SpecError

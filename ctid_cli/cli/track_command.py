@@ -10,7 +10,6 @@ import typer
 
 from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_command, guarded, write_files
 from ctid_cli.cli._progress import RecordProgress
-from ctid_cli.cli.track_mains import Mains, track_mains
 from ctid_cli.errors import UsageError
 from ctid_cli.kinds import ONLINE
 
@@ -51,17 +50,6 @@ def track(
             help="Rows with a larger standard error are not valid; .001 of the tone's frequency if not given.",
         ),
     ] = None,
-    pmu: Annotated[
-        int | None, typer.Option("--pmu", metavar="50|60", help="Synchrophasors of a mains signal, in place of tones.")
-    ] = None,
-    pmu_class: Annotated[
-        Literal["P", "M"] | None,
-        typer.Option("--pmu-class", help="Performance class of synchrophasors; P if not given."),
-    ] = None,
-    reporting_rate: Annotated[
-        int | None,
-        typer.Option("--reporting-rate", metavar="HERTZ", help="Synchrophasors a second; one a cycle if not given."),
-    ] = None,
     as_json: Json = False,
     style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
@@ -70,9 +58,7 @@ def track(
 
     Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
     trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
-    a page of. All the rest is chosen from the record, and said. With --pmu 50 or 60 it measures phasor, frequency and
-    rate of change of frequency of the mains instead, as IEC/IEEE 60255-118-1 has them, of one phase or, with
-    --signal A,B,C, of three.
+    a page of. All the rest is chosen from the record, and said.
     """
     from ctid_cli.storage.track_file import Reading
 
@@ -80,12 +66,6 @@ def track(
     for name, value in (("--from", start), ("--to", stop)):
         if value is not None and not math.isfinite(value):
             raise UsageError(f"{name} must be an instant, not {value:g}")
-    mains = Mains(pmu, pmu_class, reporting_rate)
-    others = {"--every": every, "--window": window, "--accuracy": accuracy}
-    given = {"--tones": tones != "auto", "--method": method != "automatic"}
-    if mains.wanted({**given, **{name: value is not None for name, value in others.items()}}):
-        track_mains(file, reading, mains, style, out, as_json)
-        return
     from concurrent.futures import ThreadPoolExecutor
 
     from ctid_cli.frequency.left_over import with_lines_left
