@@ -23,12 +23,19 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.record_tones import follow_tones
-from ctid_cli.frequency.record_track import USUAL_ACCURACY, RecordTrack
+from ctid_cli.tones.constants import USUAL_ACCURACY
+from ctid_cli.tones.track import Track, track
 
 ROWS = 60
 KINDS = ("steady", "steady", "steady", "drift", "decay", "phase step", "frequency step", "amplitude step")
 FAR, ERRORS, AMPLITUDES, BINS = 64, 3.3, 6.0, 3.0
+
+
+class Recorded(NamedTuple):
+    """A signal on a regular clock."""
+
+    samples: np.ndarray
+    interval: float
 
 
 class Tone(NamedTuple):
@@ -127,16 +134,16 @@ def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
     return possible
 
 
-def judged(signal: Signal, track: RecordTrack) -> tuple[int, int, int, int]:
+def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
     """Valid rows, wrong ones; rows that could be right, and how many of them are valid and right."""
-    places = np.minimum(np.round(track.t).astype(int), signal.samples.size - 1)
+    places = np.minimum(np.round(found.t).astype(int), signal.samples.size - 1)
     possible = could_be_right(signal, places)
     valid = wrong = 0
     hit = np.zeros_like(possible)
     for r, place in enumerate(places):
         truth = np.array([tone.frequency[place] for tone in signal.tones])
-        for k in np.flatnonzero(track.valid[r] & np.isfinite(track.omega[r])):
-            frequency, error = track.omega[r, k] / (2.0 * np.pi), track.error[r, k] / (2.0 * np.pi)
+        for k in np.flatnonzero(found.valid[r] & np.isfinite(found.omega[r])):
+            frequency, error = found.omega[r, k] / (2.0 * np.pi), found.error[r, k] / (2.0 * np.pi)
             right = np.abs(truth - frequency) <= max(ERRORS * error, USUAL_ACCURACY * frequency)
             valid += 1
             wrong += not right.any()
@@ -154,12 +161,12 @@ def honesty(signals: int, seed: int, show: bool) -> None:
             asked = None if more is None else max(0, len(signal.tones) + more)
             every = (signal.samples.size - 1.0) / (ROWS - 1)
             try:
-                track, _ = follow_tones(signal.samples, 1.0, asked, every=every)
+                found = track(Recorded(signal.samples, 1.0), asked, every=every)
             except DataError:
                 places = np.arange(0.0, signal.samples.size - 0.5, every).astype(int)
                 total[2] += int(could_be_right(signal, places).sum())
                 continue
-            one = judged(signal, track.of_accuracy(None))
+            one = judged(signal, found)
             total += one
             if show and one[1]:
                 print(f"   signal {k}: {one[1]} of {one[0]} valid rows are wrong")
@@ -179,11 +186,11 @@ def named_cases(records: int, seed: int) -> None:
             t = np.arange(int(seconds * RATE)) / RATE
             signal, truth = make(t, rng)
             try:
-                track, _ = follow_tones(signal, 1.0 / RATE, tones, every=seconds / ROWS)
+                found = track(Recorded(signal, 1.0 / RATE), tones, every=seconds / ROWS)
             except DataError:
                 continue
-            valid, error = track.of_accuracy(None).valid, track.error / (2.0 * np.pi)
-            off = np.abs(track.omega[:, :, None] / (2.0 * np.pi) - np.asarray(truth)).min(axis=2)
+            valid, error = found.valid, found.error / (2.0 * np.pi)
+            off = np.abs(found.omega[:, :, None] / (2.0 * np.pi) - np.asarray(truth)).min(axis=2)
             total += (valid.size, valid.sum(), (valid & (off > np.maximum(0.02, ERRORS * error))).sum())
         print(f"{name:34} {total[0]:6} {total[1]:7} {total[2]:6}", flush=True)
 
@@ -248,13 +255,13 @@ def efficiency(records: int, seed: int) -> None:
                 raw = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(size + 200))[200:]
                 phase = rng.uniform(0.0, 2.0 * np.pi, 3)
                 y = sum(np.cos(omega[j] * np.arange(size) + phase[j]) for j in range(tones)) + 0.0707 * raw
-                track, _ = follow_tones(y, 1.0, tones, every=size / 2.0)
-                if not np.isfinite(track.omega[1]).all():
+                found = track(Recorded(y, 1.0), tones, every=size / 2.0)
+                if not np.isfinite(found.omega[1]).all():
                     continue
                 density = 0.0707**2 * (1.0 - pole**2) / np.abs(1.0 - pole * np.exp(-1j * omega[:tones])) ** 2
                 bound = np.sqrt(24.0 * density / size**3)
-                error = track.omega[1] - omega[:tones]
-                off += list(zip(np.abs(error) < 1.96 * track.error[1], error / bound, strict=True))
+                error = found.omega[1] - omega[:tones]
+                off += list(zip(np.abs(error) < 1.96 * found.error[1], error / bound, strict=True))
             inside, ratio = np.array(off).T
             name = "AR .9" if pole else "white"
             print(f"{tones:5} {name:8} {100 * inside.mean():7.1f}% {np.sqrt(np.mean(ratio**2)):12.3f}", flush=True)

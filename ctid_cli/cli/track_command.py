@@ -11,16 +11,11 @@ import typer
 from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_command, guarded, write_files
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import ONLINE
 
 if TYPE_CHECKING:
-    from ctid_cli.frequency.record_track import Procedure, RecordTrack
     from ctid_cli.signals.sampled_signal import SampledSignal
     from ctid_cli.storage.track_file import Reading
-
-    Method = str
-else:
-    Method = Literal[("automatic", *ONLINE)]
+    from ctid_cli.tones.track import Track
 
 
 @guarded
@@ -28,9 +23,6 @@ def track(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
     tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
-    method: Annotated[
-        Method, typer.Option("--method", help="An online estimator in place of the windows.")
-    ] = "automatic",
     time: TimeColumn = None,
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
     interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None,
@@ -68,12 +60,12 @@ def track(
             raise UsageError(f"{name} must be an instant, not {value:g}")
     from concurrent.futures import ThreadPoolExecutor
 
-    from ctid_cli.frequency.left_over import with_lines_left
     from ctid_cli.reporting.figures.style import load_matplotlib
     from ctid_cli.reporting.track_columns import track_bytes, track_table
     from ctid_cli.reporting.track_plot import track_drawing
     from ctid_cli.reporting.track_report import track_object, track_text
     from ctid_cli.storage.track_file import track_file_text
+    from ctid_cli.tones.residual import with_lines_left
 
     data, figure, result = out / f"track.{style}", out / "track.svg", out / "track.json"
     if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure, result)):
@@ -85,23 +77,21 @@ def track(
         raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
     record = reading.read(file)
     _require_part(record, reading)
-    asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
     load_matplotlib()
-    found, procedure = _follow(record, asked)
-    track = found.of_accuracy(accuracy)
-    with ThreadPoolExecutor(1) as beside:
-        drawing = track_drawing(track, record.start, record.unit, f"{file.name}: {procedure.method}")
-        drawn = beside.submit(drawing.saved)
-        found = with_lines_left(track, record.samples, record.interval)
+    found = _follow(record, Asked(_tones(tones), accuracy, every, window))
+    with ThreadPoolExecutor(1) as thread:
+        drawing = track_drawing(found, record.start, record.unit, file.name)
+        drawn = thread.submit(drawing.saved)
+        found = with_lines_left(found, record.samples, record.interval)
     files = [data, figure, result]
-    content = track_object(record, procedure, found, accuracy)
+    content = track_object(record, found, accuracy)
     text = track_file_text(found, content, file, reading, out, given_command(context))
     table = track_bytes(track_table(found, record.start), style, record.unit)
     write_files({data: table, figure: drawn.result(), result: text.encode() + b"\n"})
     answer(
         as_json,
         lambda: content | {"written": [str(each) for each in files]},
-        lambda: f"{track_text(record, procedure, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
+        lambda: f"{track_text(record, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
     )
 
 
@@ -109,37 +99,25 @@ class Asked(NamedTuple):
     """What a track is asked for; None where it is to be chosen."""
 
     tones: int | None
-    method: str | None
+    accuracy: float | None
     every: float | None
     window: float | None
-    accuracy: float | None
 
 
-def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure]:
-    """The track of a record, and how it was found."""
-    from ctid_cli.frequency.automatic import choose_settings
-    from ctid_cli.frequency.estimator_rows import procedure_of, track_record
-    from ctid_cli.frequency.record_tones import follow_tones
+def _follow(record: SampledSignal, asked: Asked) -> Track:
+    """Return the track of a record."""
+    from ctid_cli.tones.track import track as follow
 
-    samples, interval, method = record.samples, record.interval, asked.method
     try:
         with RecordProgress(Path(record.file).name) as tell:
-            if method is None:
-                return follow_tones(
-                    samples, interval, asked.tones, every=asked.every, window=asked.window, on_progress=tell
-                )
-            if asked.tones is None:
-                raise UsageError(f"--method {method} needs the number of sinusoids, such as --tones 2")
-            settings = choose_settings(samples, interval, asked.tones, method=method, window=asked.window)
-            found = track_record(samples, interval, settings, every=asked.every, on_progress=tell)
+            return follow(record, *asked, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    return found, procedure_of(settings, interval)
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
     """Refuse a part that is too short, which is often one in another unit of time."""
-    from ctid_cli.frequency.record_tones import FEWEST
+    from ctid_cli.tones.constants import FEWEST
 
     if record.samples.size < FEWEST and not (reading.start is None and reading.stop is None):
         end = record.start + (record.samples.size - 1) * record.interval
@@ -149,7 +127,7 @@ def _require_part(record: SampledSignal, reading: Reading) -> None:
 
 def _tones(text: str) -> int | None:
     """The number of tones; None to have it chosen."""
-    from ctid_cli.frequency.record_track import MOST_ASKED
+    from ctid_cli.tones.constants import MOST_ASKED
 
     if text == "auto":
         return None

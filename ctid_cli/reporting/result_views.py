@@ -8,7 +8,6 @@ import numpy as np
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
@@ -23,6 +22,7 @@ from ctid_cli.reporting.track_report import tones_block
 from ctid_cli.reporting.track_summary import invalid_rows
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines
+from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,10 +154,10 @@ def _report(result: Any) -> Report:
     return Report(blocks)
 
 
-def _with_columns(track: FrequencyTrack) -> RecordTrack:
+def _with_columns(track: FrequencyTrack) -> Track:
     """A track as those of records are."""
     every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
-    return RecordTrack.of(track.t, track.omega, track.flags, every)
+    return Track.of(track.t, track.omega, track.flags, every)
 
 
 def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:

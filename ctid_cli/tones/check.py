@@ -43,7 +43,7 @@ class Readings(NamedTuple):
 
     def at(self, which: IndexArray) -> "Readings":
         """Return some of the readings."""
-        return Readings(*(values[which] for values in self))
+        return Readings(**{name: getattr(self, name)[which] for name in self._fields})
 
 
 def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
@@ -112,7 +112,7 @@ def _sound(tones: WindowTones, length: int) -> BoolArray:
     sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~changed
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
     sound &= line <= c.NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
-    full = np.isfinite(tones.omega).all(axis=1)[:, None]
+    full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
     sound &= ~(full & (line > c.COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2))
     for j in range(changed.shape[1]):
         energy = np.where(changed[:, j], tones.change_energy[:, j], 0.0)[:, None]

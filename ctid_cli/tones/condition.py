@@ -120,14 +120,16 @@ def highest_line(samples: Array) -> float:
         segments = values[: values.size // length * length].reshape(-1, length)
         size = next_fast_len(length, real=True)
         taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
-        for segment in np.array_split(segments, max(1, segments.size // c.BLOCK_SAMPLES)):
-            power = np.abs(rfft(segment * taper, size)) ** 2
-            blocks = power[:, : power.shape[1] // c.FLOOR_BINS * c.FLOOR_BINS].reshape(len(segment), -1, c.FLOOR_BINS)
+        together = max(1, c.BLOCK_SAMPLES // length)
+        for first in range(0, len(segments), together):
+            power = np.abs(rfft(segments[first : first + together] * taper, size)) ** 2
+            whole = power.shape[1] // c.FLOOR_BINS * c.FLOOR_BINS
+            blocks = power[:, :whole].reshape(len(power), -1, c.FLOOR_BINS)
             floor = np.median(blocks, axis=2) / np.log(2.0)
             known = c.MEDIAN_EFFICIENCY * c.FLOOR_BINS
             height = known * ((c.FALSE_LINES / values.size) ** (-1.0 / known) - 1.0)
-            lines = np.flatnonzero((blocks.max(axis=2) > height * np.maximum(floor, 1e-300)).any(axis=0))
-            if lines.size:
-                top = max(top, 2.0 * np.pi * (lines[-1] + 1) * c.FLOOR_BINS / size)
+            lines = (blocks > height * np.maximum(floor, c.SMALLEST_FLOOR)[:, :, None]).any(axis=0)
+            if lines.any():
+                top = max(top, 2.0 * np.pi * (int(np.flatnonzero(lines)[-1]) + 1) / size)
         length = min(length // 8, 2 ** int(np.log2(length // 8))) if length >= 8 else 0
     return min(top, np.pi) or np.pi

@@ -1,11 +1,13 @@
 """Every constant of the tracker that decides something, with its source or the measurement that set it.
 
-"Measured" means on ``benchmarks/track_honesty.py``: values that were tried on its signals of seed 1 and then kept, where
-nothing more is said. Those of the compiled fit are in :mod:`ctid_cli.tones.kernels`.
+"Measured" means on ``benchmarks/track_honesty.py``: values that were tried on its signals of seed 1 and then kept,
+where nothing more is said. Those of the compiled fit are in :mod:`ctid_cli.tones.kernels`.
 """
 
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
+#: Name of the method in files.
+METHOD = "tone_windows"
 #: A row is accurate if its standard error is at most this share of the frequency, unless another limit is given.
 USUAL_ACCURACY = 0.001
 #: Most tones that can be asked for, and lines that are fitted in one window: 81 equations.
@@ -151,3 +153,30 @@ LARGEST_JUMP = 0.25
 PAUSE = 0.25
 #: What is never known better than to this share of its frequency is no tone.
 COARSE = 0.01
+
+# --- what a track leaves of its record ------------------------------------------------------------------------------
+
+#: A spectrum is a median over so many half-overlapping segments of some lengths, with so many points for each bin;
+#: segments in which a larger share is unknown are left out.
+SEGMENTS = 16
+SHORTEST_SPECTRUM = 64
+LONGEST_SPECTRUM = 2**15
+SPECTRUM_PADDING = 4
+UNKNOWN = 0.1
+#: A peak stands so many times (in amplitude) above the median of so many bins on each side, and above what leaks from
+#: larger ones; two peaks are so many bins apart, and so is the lowest one from zero. Below the last share of the
+#: largest is rounding of the transform.
+ABOVE_FLOOR = 5.0
+AROUND = 12
+ABOVE_LEAKAGE = 2.0
+CLOSEST = 1.5
+ROUNDING = 1e-9
+#: A line so many bins from where a tone has been may be what its rows do not follow of it; where that is leaves out so
+#: much on both sides [%]. A line of the signal is left if one is there so few bins away that is no more
+#: than so many times smaller.
+BESIDE_TONE = 4.0
+ASIDE = 1.0
+SAME_LINE = 0.5
+MOST_SHRUNK = 2.0
+#: The logarithm of an amplitude changes by no more than this on the way from its row.
+MOST_GROWN = 1.0

@@ -107,7 +107,7 @@ def nearest(middles: Array, places: Array) -> IndexArray:
 def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
     """Take over the tones of the shorter windows nearest to the middles, where nothing is wrong with them."""
     half = 0.5 * (length - 1)
-    middle = fits.first + half
+    middle: Array = np.asarray(fits.first + half, dtype=np.float64)
     beginning = nearest(shorter.middle, middle)
     clean = shorter.converged & (shorter.line_chance >= c.LEVEL) & ~(shorter.change_chance < c.LEVEL).any(axis=1)
     sure = clean[:, None] & (shorter.amplitude > c.SURE * shorter.amplitude_error)

@@ -1,5 +1,6 @@
 """Tones over time: of each instant the longest sound windows, followed from each instant to the next."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,12 +14,16 @@ from ctid_cli.tones.fit import WindowTones, fit_tones, nearest
 from ctid_cli.tones.kernels import PARAMETERS, keep_readings
 
 
-def readings_at(samples: Array, places: Array, longest: int) -> Readings:
+def readings_at(
+    samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
+) -> Readings:
     """Return the tones of a signal at some places [samples], ascending: of each that of its longest sound window."""
     parts: list[Readings] = []
     tones: WindowTones | None = None
     lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]
-    for length, first in zip(lengths, _windows(lengths, samples.size, places), strict=True):
+    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True)):
+        if tell is not None:
+            tell(done, len(lengths))
         tones = fit_tones(samples, length, first, c.MOST_LINES, tones)
         parts.append(readings_of(tones, length, places))
     # The longest windows first, and of those of one length the one whose middle is nearest.

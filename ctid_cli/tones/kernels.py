@@ -302,9 +302,7 @@ def fit_windows(
 
 
 @njit(cache=True, nogil=True)
-def find_changes(
-    white: Array, filters: Array, parameters: Array, used: IndexArray, energy: Array, cube: Array
-) -> None:
+def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArray, energy: Array, cube: Array) -> None:
     """Measure how much the tones of each window seem to change within it.
 
     ``energy``, shape (R, n), is the largest sum of squares that a change of phase and amplitude at one instant would

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -88,6 +88,14 @@ class Track:
             if isinstance(value, np.ndarray) and item.name != "t" and value.shape != self.omega.shape:
                 raise DataError(f"{item.name} of a track is of shape {value.shape}, not {self.omega.shape}")
 
+    @classmethod
+    def of(cls, t: Array, omega: Array, flags: NDArray[np.uint16], every: float, **known: Any) -> Track:
+        """Return a track of which not everything is known; flags of shape (N,) are those of all tones of their row."""
+        names = ("error", "amplitudes", "amplitude_error", "phase", "growth", "rate", "window")
+        parts: dict[str, Any] = {name: np.asarray(known.pop(name, np.full(omega.shape, np.nan))) for name in names}
+        each = np.broadcast_to(flags if flags.ndim == 2 else flags[:, None], omega.shape).astype(np.uint16)
+        return cls(t=t, omega=omega, flags=each, every=every, **parts, **known)
+
     @property
     def settings(self) -> dict[str, Any]:
         """Numbers of the method, for programs."""
@@ -128,6 +136,8 @@ def track(
     accuracy: float | None = None,
     every: float | None = None,
     window: float | None = None,
+    *,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Track:
     """Follow the strongest tones of a recorded signal, or all of them.
 
@@ -147,6 +157,8 @@ def track(
         Time from row to row [s]; by default a thousandth of the record.
     window : float, optional
         Longest window [s]; by default the record.
+    on_progress : callable, optional
+        Called with the number of window lengths that are done, and of all.
 
     Returns
     -------
@@ -170,7 +182,7 @@ def track(
     longest = _longest(window, thin, ready.samples.size)
     step = max(1.0, (samples.size * interval / c.USUAL_ROWS if every is None else every) / thin)
     places = np.arange(0.0, ready.samples.size - 0.5, step)
-    found = readings_at(ready.samples, places, longest)
+    found = readings_at(ready.samples, places, longest, on_progress)
     paths = paths_of(found, places)
     if not paths and tones is None:
         raise DataError(
@@ -218,9 +230,7 @@ def _longest(window: float | None, thin: float, count: int) -> int:
     return length
 
 
-def _columns(
-    found: Readings, paths: list[IndexArray], count: int, places: Array, ready: Conditioned
-) -> dict[str, Any]:
+def _columns(found: Readings, paths: list[IndexArray], count: int, places: Array, ready: Conditioned) -> dict[str, Any]:
     """Put what is known of the tones into columns, in units of the record."""
     thin, scale = ready.interval, ready.scale
     gain = ready.gain(found.omega)

@@ -5,8 +5,8 @@ import pytest
 
 from ctid_cli.frequency import synthesis
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.synthesis import synthesised
+from ctid_cli.tones.residual import synthesised
+from ctid_cli.tones.track import Track
 
 T = 0.001 * np.arange(3950)
 ROWS = 0.1 + 0.05 * np.arange(76)
@@ -21,7 +21,7 @@ def track_of(rows=ROWS, **changed):
     phase, omega, rate, amplitude = (part[:, None] for part in sweep(rows))
     known = {"phase": phase, "rate": rate, "amplitudes": amplitude, "growth": np.full((rows.size, 1), -0.3)}
     known |= {"window": np.full((rows.size, 1), 0.2)} | changed
-    return RecordTrack.of(rows, omega, np.zeros(rows.size, np.uint16), 0.05, **known)
+    return Track.of(rows, omega, np.zeros(rows.size, np.uint16), 0.05, **known)
 
 
 def test_rows_that_are_true_give_the_signal_back():
@@ -37,7 +37,7 @@ def test_a_row_that_is_not_known_makes_a_gap_around_it_and_one_without_the_tone_
     assert not unknown[:550].any()
     assert not unknown[651:].any()
     track = track_of()
-    absent = RecordTrack.of(ROWS, np.full((76, 1), np.nan), np.full(76, int(Flag.ABSENT), np.uint16), 0.05)
+    absent = Track.of(ROWS, np.full((76, 1), np.nan), np.full(76, int(Flag.ABSENT), np.uint16), 0.05)
     assert (synthesised(absent, T)[100:3850] == 0.0).all()
     assert not np.isnan(synthesised(track, T)).any()
 
