@@ -145,10 +145,20 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
     allowed = np.maximum(c.EQUAL_ERRORS * np.maximum(sure[:, 1:], sure[:, :-1]), c.UNEQUAL * steps[:, :-1])
     equal = (np.abs(np.diff(steps, axis=1)) <= allowed) & (steps[:, :-1] < c.HARMONIC * omega[:, :-2])
     for row, k in np.argwhere(equal):
-        first, last = (omega[row, place] + side * c.BESIDE * steps[row, k] for place, side in ((k, -1), (k + 2, 1)))
-        inside = np.flatnonzero((omega[row] > first) & (omega[row] < last))
-        gap[row, order[row, inside]] = steps[row, k]
-        low[row, order[row, inside]], high[row, order[row, inside]] = first, last
+        if gap[row, order[row, k + 1]] > 0.0:
+            continue
+        # All lines at multiples of the distance belong to the comb, unless too many are missing between them.
+        base = steps[row, k]
+        away = (omega[row] - omega[row, k + 1]) / base
+        lines = np.sort(np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))]))
+        breaks = np.flatnonzero(np.diff(lines) > c.MOST_APART)
+        begin = np.searchsorted(breaks, np.searchsorted(lines, 0.0))
+        first = lines[breaks[begin - 1] + 1] if begin > 0 else lines[0]
+        last = lines[breaks[begin]] if begin < breaks.size else lines[-1]
+        inside = order[row, (away > first - c.BESIDE) & (away < last + c.BESIDE)]
+        gap[row, inside] = base
+        low[row, inside] = omega[row, k + 1] + (first - c.BESIDE) * base
+        high[row, inside] = omega[row, k + 1] + (last + c.BESIDE) * base
     return gap, low, high
 
 

@@ -127,11 +127,13 @@ GROWS = 2.0
 BLENDED_GROWTH = 1.0
 #: What should be covered by so many errors is divided by it.
 COVERED = 3.0
-#: Three or more lines at distances equal within this share, or so many errors, may be one tone that is modulated, with
-#: lines at most so many distances beside it. Distances above this share of the frequency are those of harmonics.
+#: Three or more lines at distances equal within this share, or so many errors, may be one tone that is modulated: lines
+#: of the comb are at most so many distances apart, and what is so many distances from its ends belongs to it.
+#: Distances above the last share of the frequency are those of harmonics.
 COMB = 3
 UNEQUAL = 0.05
 EQUAL_ERRORS = 5.0
+MOST_APART = 4
 BESIDE = 3.0
 HARMONIC = 0.2
 #: A line of a comb that shorter windows refute at more than this share of the rows is none at the others either.

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency import synthesis
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.tones.residual import synthesised
 from ctid_cli.tones.track import Track
@@ -50,8 +49,5 @@ def test_far_from_the_rows_nothing_is_known():
 
 def test_pieces_change_nothing(monkeypatch):
     whole = synthesised(track_of(), T)
-    monkeypatch.setattr(synthesis, "PIECE", 97)
-    # Phasors that turn from one instant to the next begin at others: rounding.
+    monkeypatch.setattr("ctid_cli.tones.constants.BLOCK_SAMPLES", 97)
     assert synthesised(track_of(), T) == pytest.approx(whole, abs=1e-12, nan_ok=True)
-    # Instants that are not evenly spaced are computed one by one.
-    assert synthesised(track_of(), np.append(T, T[-1] + 1e-3))[:-1] == pytest.approx(whole, abs=1e-12, nan_ok=True)
