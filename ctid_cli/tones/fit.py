@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.processors import in_threads
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.find import Left, Lines, strongest_lines, whiten
 from ctid_cli.tones.kernels import PARAMETERS, find_changes, fit_windows
@@ -65,8 +66,9 @@ def fit_tones(
     """Fit the tones of windows of one length, starting with what was found in shorter windows."""
     most = max(1, min(most, (length // c.SAMPLES_PER_PARAMETER - 1) // PARAMETERS))
     size = max(1, c.BLOCK_SAMPLES // length)
-    blocks = [_block(samples, length, first[k : k + size], most, shorter) for k in range(0, first.size, size)]
-    return WindowTones(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+    parts = [first[k : k + size] for k in range(0, first.size, size)]
+    blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
+    return WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:

@@ -67,7 +67,24 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     paths = _joined(_followed(found, places, step), found, places.size)
     paths = [path for path in paths if _described(found, path, places, step)]
     # What lasts counts more than what is loud for a moment.
-    return sorted(paths, key=lambda path: -float(found.amplitude[path].sum()))
+    return _merged(sorted(paths, key=lambda path: -float(found.amplitude[path].sum())), found)
+
+
+def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
+    """Join paths whose median frequencies are within one bin of their windows: the rows of the stronger one count."""
+    merged: list[IndexArray] = []
+    for path in paths:
+        for k, other in enumerate(merged):
+            apart = abs(float(np.median(found.omega[path]) - np.median(found.omega[other])))
+            window = min(float(np.median(found.window[path])), float(np.median(found.window[other])))
+            if apart * window < 2.0 * np.pi:
+                new = path[~np.isin(found.row[path], found.row[other])]
+                both = np.concatenate((other, new))
+                merged[k] = both[np.argsort(found.row[both], kind="stable")]
+                break
+        else:
+            merged.append(path)
+    return merged
 
 
 def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:

@@ -43,7 +43,8 @@ def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
     least = min(c.SHORTEST_SPECTRUM, samples.size)
     size = min(c.LONGEST_SPECTRUM, max(least, 2 * samples.size // (c.SEGMENTS + 1)), samples.size)
     while size >= least and not unknown.all():
-        begins = np.linspace(0, samples.size - size, max(1, 2 * samples.size // size - 1)).astype(int)
+        count = min(c.MOST_SEGMENTS, max(1, 2 * samples.size // size - 1))
+        begins = np.linspace(0, samples.size - size, count).astype(int)
         begins = begins[[unknown[k : k + size].mean() <= c.UNKNOWN for k in begins]]
         if begins.size:
             spectra = (median_spectrum(np.where(unknown, 0.0, each), begins, size) for each in (centred, left))

@@ -36,7 +36,7 @@ def track_page(track: Track, signal: SampledSignal, content: Mapping[str, Any]) 
         titles=[("tones", "Tones"), *((chapter.name, chapter.title) for chapter in chapters)],
         provenance=_provenance(content),
         command=shown_command(content["command"]),
-        bibtex=track_bibtex(content["method"]),
+        bibtex=track_bibtex(),
     )
 
 
