@@ -88,5 +88,8 @@ from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, Frequenc
 from .frequency.tracking import Tracker as Tracker
 from .frequency.flags import Flag as Flag
 
+# Tones of recorded signals
+from .tones.track import MissingLine as MissingLine, Track as Track, track as track
+
 # Errors
 from .errors import CtidError as CtidError, DataError as DataError, SpecError as SpecError

@@ -158,8 +158,8 @@ COARSE = 0.01
 
 # --- what a track leaves of its record ------------------------------------------------------------------------------
 
-#: A spectrum is a median over about so many half-overlapping segments, at most so many, of some lengths, with so many points for each
-#: bin; segments in which a larger share is unknown are left out.
+#: A spectrum is a median over about so many half-overlapping segments, at most so many, of some lengths, with so many
+#: points for each bin; segments in which a larger share is unknown are left out.
 SEGMENTS = 16
 MOST_SEGMENTS = 32
 SHORTEST_SPECTRUM = 64

@@ -67,7 +67,7 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     paths = _joined(_followed(found, places, step), found, places.size)
     paths = [path for path in paths if _described(found, path, places, step)]
     # What lasts counts more than what is loud for a moment.
-    return _merged(sorted(paths, key=lambda path: -float(found.amplitude[path].sum())), found)
+    return _merged(sorted(paths, key=lambda path: -path.size * float(np.median(found.amplitude[path]))), found)
 
 
 def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:

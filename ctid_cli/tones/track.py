@@ -46,35 +46,54 @@ class MissingLine(NamedTuple):
 class Track:
     """Tones over time: a column is one tone from first to last, NaN where it is not there or where nothing is known.
 
-    All arrays but ``t`` are of shape (N, n); the frequencies of a row need not ascend.
+    The frequencies of a row need not ascend.
+
+    Parameters
+    ----------
+    t : ndarray, shape (N,)
+        Instants since the first sample [s].
+    omega, error : ndarray, shape (N, n)
+        Frequencies and their standard errors [rad/s].
+    amplitudes, amplitude_error : ndarray, shape (N, n)
+        Amplitudes and their standard errors [signal unit].
+    phase : ndarray, shape (N, n)
+        Phase at the instant of the row, of ``amplitude sin(phase)`` [rad].
+    growth : ndarray, shape (N, n)
+        Logarithmic growth of the amplitude [1/s]; negative where it decays.
+    rate : ndarray, shape (N, n)
+        Rate of change of the frequency [rad/s^2].
+    window : ndarray, shape (N, n)
+        Length of the stretch of signal that the row is read from [s].
+    flags : ndarray of uint16, shape (N, n)
+        Bit fields of :class:`~ctid_cli.frequency.flags.Flag`.
+    every : float
+        Time from one row to the next [s].
+    missing : tuple of MissingLine
+        Lines that are left over, the strongest first.
+    reasons, warnings : tuple of str
+        What was chosen and why, and what to know before believing the tones: sentences.
+    fitted_interval : float
+        Interval of the samples that were fitted [s].
+    kept_of, filter_samples : int
+        One of how many samples was kept, after a filter of so many samples.
+    longest_window : float
+        Longest window [s].
     """
 
-    #: Instants since the first sample [s], shape (N,).
     t: Array
-    #: Frequencies and their standard errors [rad/s].
     omega: Array
     error: Array
-    #: Amplitudes and their standard errors [signal unit].
     amplitudes: Array
     amplitude_error: Array
-    #: Phase at the instant of the row, of ``amplitude sin(phase)`` [rad].
     phase: Array
-    #: Logarithmic growth of the amplitude [1/s]; negative where it decays.
     growth: Array
-    #: Rate of change of the frequency [rad/s^2].
     rate: Array
-    #: Length of the stretch of signal that the row is read from [s].
     window: Array
-    #: Bit fields of :class:`~ctid_cli.frequency.flags.Flag`.
     flags: NDArray[np.uint16]
-    #: Time from one row to the next [s].
     every: float
-    #: Lines that are left over, the strongest first.
     missing: tuple[MissingLine, ...] = ()
-    #: What was chosen and why, and what to know before believing the tones: sentences.
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    #: Interval of the samples that were fitted [s], one of how many was kept, length of the filter, longest window [s].
     fitted_interval: float = np.nan
     kept_of: int = 1
     filter_samples: int = 1
@@ -90,7 +109,26 @@ class Track:
 
     @classmethod
     def of(cls, t: Array, omega: Array, flags: NDArray[np.uint16], every: float, **known: Any) -> Track:
-        """Return a track of which not everything is known; flags of shape (N,) are those of all tones of their row."""
+        """Return a track of which not everything is known.
+
+        Parameters
+        ----------
+        t : ndarray, shape (N,)
+            Instants [s].
+        omega : ndarray, shape (N, n)
+            Frequencies [rad/s].
+        flags : ndarray, shape (N, n) or (N,)
+            Flags of each tone, or those of all tones of a row.
+        every : float
+            Time from one row to the next [s].
+        **known
+            Further fields; NaN where not given.
+
+        Returns
+        -------
+        Track
+            The track.
+        """
         names = ("error", "amplitudes", "amplitude_error", "phase", "growth", "rate", "window")
         parts: dict[str, Any] = {name: np.asarray(known.pop(name, np.full(omega.shape, np.nan))) for name in names}
         each = np.broadcast_to(flags if flags.ndim == 2 else flags[:, None], omega.shape).astype(np.uint16)
@@ -122,7 +160,18 @@ class Track:
         return not self.omega.size or bool(np.isfinite(self.error).any())
 
     def of_accuracy(self, accuracy: float | None) -> Track:
-        """Return the track, not valid where a standard error exceeds the accuracy [Hz], by default a share."""
+        """Return the track, not valid where a standard error exceeds an accuracy.
+
+        Parameters
+        ----------
+        accuracy : float or None
+            Largest standard error [Hz]; if None, .001 of the frequency.
+
+        Returns
+        -------
+        Track
+            The same with other flags.
+        """
         limit = c.USUAL_ACCURACY * np.abs(self.omega) if accuracy is None else np.asarray(2.0 * np.pi * accuracy)
         with np.errstate(invalid="ignore"):
             coarse = self.error > limit
@@ -169,6 +218,17 @@ def track(
     ------
     DataError
         If the signal is too short, constant, or shows no tone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import track
+    >>> from ctid_cli.signals.sampled_signal import SampledSignal
+    >>> t = 0.001 * np.arange(2000)
+    >>> y = np.sin(2 * np.pi * 50 * t) + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    >>> found = track(SampledSignal(y, 0.001, 0.0, "y.csv", "y", None, "s", None))
+    >>> float((np.median(found.omega, axis=0) / (2 * np.pi)).round(2)[0]), bool(found.valid.all())
+    (50.0, True)
     """
     samples, interval = record.samples, record.interval
     require_positive("interval", interval, "s")
