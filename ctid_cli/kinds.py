@@ -61,9 +61,6 @@ KINDS: dict[str, dict[str, str]] = {
     },
 }
 
-#: Estimators of frequencies that take one sample after the other; the others take whole records.
-ONLINE = tuple(kind for kind in KINDS["frequency_estimator"] if kind not in ("esprit", "nonlinear_least_squares"))
-
 
 def resolve(section: str, kind: str) -> type[Any]:
     """Return the class that a kind names."""
