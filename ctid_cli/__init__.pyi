@@ -83,13 +83,8 @@ from .frequency.restarting_least_squares import RestartingLeastSquares as Restar
 from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
 from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, Tracker as Tracker
 
-# Synchrophasors of mains signals
-from .frequency.synchrophasor import SynchrophasorTrack as SynchrophasorTrack
-from .frequency.synchrophasor import measure_synchrophasors as measure_synchrophasors
-from .frequency.synchrophasor_check import SynchrophasorCheck as SynchrophasorCheck
-from .frequency.synchrophasor_check import check_synchrophasors as check_synchrophasors
-from .frequency.synchrophasor_check import CheckedLimit as CheckedLimit
-from .frequency.synchrophasor_limits import Limit as Limit
+# Tones of recorded signals
+from .tones.track import MissingLine as MissingLine, Track as Track, track as track
 
 # Errors
 from .errors import CtidError as CtidError, DataError as DataError, SpecError as SpecError

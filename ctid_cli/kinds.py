@@ -49,9 +49,6 @@ KINDS: dict[str, dict[str, str]] = {
     },
 }
 
-#: Estimators of frequencies that take one sample after the other.
-ONLINE = tuple(KINDS["frequency_estimator"])
-
 
 def resolve(section: str, kind: str) -> type[Any]:
     """Return the class that a kind names."""

@@ -11,7 +11,6 @@ import typing
 import pytest
 
 import ctid_cli
-from ctid_cli.frequency.tracking import BatchEstimator
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.transfer_function import ContinuousModel
@@ -46,7 +45,7 @@ def public_callables():
         for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
                 yield kind, member
-    for contract in (BatchEstimator, ContinuousModel, Noise):
+    for contract in (ContinuousModel, Noise):
         yield from members_of(f"{contract.__module__}.{contract.__name__}", contract)
     without_kind = (ContinuousPid, InstantsFile, ListedInstants, MeasuredSource, Piece, Relay, SumOfSinusoids, Tone)
     for member in (*without_kind, *written_sections()):

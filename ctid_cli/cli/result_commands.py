@@ -303,7 +303,7 @@ def _report_file(path: Path, record: list[Path] | None, validate: Path | None, f
     from ctid_cli.storage.track_file import TRACK
 
     if path.suffix.lower() != ".json":
-        pages = "pages are made of fit.json (ctid fit) and track.json (ctid track); synchrophasors have a figure only"
+        pages = "pages are made of fit.json (ctid fit) and track.json (ctid track)"
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
     is_track = kind_in(str(path), FIT) == TRACK.kind
     page = _page_of_track(path, record, validate) if is_track else _page_of_fit(path, record, validate)

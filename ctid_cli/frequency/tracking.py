@@ -120,49 +120,6 @@ class FrequencyEstimator(base.FrequencyEstimator):
         object.__setattr__(self, name, numbers)
 
 
-class BatchEstimator(FrequencyEstimator):
-    """Options of an estimator that takes whole records.
-
-    Parameters
-    ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    """
-
-    online: ClassVar[bool] = False
-    whole_record: ClassVar[bool] = True
-
-    def track(self, samples: ArrayLike, interval: float) -> base.FrequencyTrack:
-        """Return the one estimate of the record, at its last instant."""
-        found = self.estimate(samples, interval)
-        last = np.array([(np.size(samples) - 1) * interval])
-        return base.FrequencyTrack(last, found.omega[None, :], np.array([int(found.flags)], np.uint16))
-
-    @abstractmethod
-    def estimate(self, samples: ArrayLike, interval: float) -> FrequencyEstimate:
-        """Estimate the frequencies of a record.
-
-        Parameters
-        ----------
-        samples : array_like, shape (N,)
-            Signal on a regular clock [signal unit]; NaN where missing.
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        FrequencyEstimate
-            The frequencies.
-
-        Raises
-        ------
-        DataError
-            If too few samples are there, or some are missing and the estimator needs them all.
-        ValueError
-            If the options do not fit to the sampling interval.
-        """
-
-
 class OnlineEstimator(FrequencyEstimator):
     """Options of an estimator that takes sample after sample."""
 

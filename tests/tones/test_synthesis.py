@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency import synthesis
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.synthesis import synthesised
+from ctid_cli.tones.residual import synthesised
+from ctid_cli.tones.track import Track
 
 T = 0.001 * np.arange(3950)
 ROWS = 0.1 + 0.05 * np.arange(76)
@@ -21,7 +20,7 @@ def track_of(rows=ROWS, **changed):
     phase, omega, rate, amplitude = (part[:, None] for part in sweep(rows))
     known = {"phase": phase, "rate": rate, "amplitudes": amplitude, "growth": np.full((rows.size, 1), -0.3)}
     known |= {"window": np.full((rows.size, 1), 0.2)} | changed
-    return RecordTrack.of(rows, omega, np.zeros(rows.size, np.uint16), 0.05, **known)
+    return Track.of(rows, omega, np.zeros(rows.size, np.uint16), 0.05, **known)
 
 
 def test_rows_that_are_true_give_the_signal_back():
@@ -37,7 +36,7 @@ def test_a_row_that_is_not_known_makes_a_gap_around_it_and_one_without_the_tone_
     assert not unknown[:550].any()
     assert not unknown[651:].any()
     track = track_of()
-    absent = RecordTrack.of(ROWS, np.full((76, 1), np.nan), np.full(76, int(Flag.ABSENT), np.uint16), 0.05)
+    absent = Track.of(ROWS, np.full((76, 1), np.nan), np.full(76, int(Flag.ABSENT), np.uint16), 0.05)
     assert (synthesised(absent, T)[100:3850] == 0.0).all()
     assert not np.isnan(synthesised(track, T)).any()
 
@@ -50,8 +49,5 @@ def test_far_from_the_rows_nothing_is_known():
 
 def test_pieces_change_nothing(monkeypatch):
     whole = synthesised(track_of(), T)
-    monkeypatch.setattr(synthesis, "PIECE", 97)
-    # Phasors that turn from one instant to the next begin at others: rounding.
+    monkeypatch.setattr("ctid_cli.tones.constants.BLOCK_SAMPLES", 97)
     assert synthesised(track_of(), T) == pytest.approx(whole, abs=1e-12, nan_ok=True)
-    # Instants that are not evenly spaced are computed one by one.
-    assert synthesised(track_of(), np.append(T, T[-1] + 1e-3))[:-1] == pytest.approx(whole, abs=1e-12, nan_ok=True)
