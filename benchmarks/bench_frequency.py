@@ -4,13 +4,9 @@ from _timing import cpu, least
 
 import numpy as np
 
-from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
-from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.frequency.filter_regression import FilterRegression
-from ctid_cli.frequency.nonlinear_least_squares import NonlinearLeastSquares
 from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
@@ -30,7 +26,6 @@ def signal(n, count=SAMPLES):
 def estimators(n):
     h, d = (0.7, 0.4) if n == 2 else (0.4, 0.3)
     epsilon = 1.0 if n == 2 else 1e-2
-    start = tuple(OMEGA[n] + 0.2)
     return (
         ("drem_gradient", DremGradient(tones=n, h=h, d=d, epsilon=epsilon), False),
         ("drem_finite_time", DremFiniteTime(tones=n, h=h, d=d, epsilon=epsilon), False),
@@ -39,8 +34,6 @@ def estimators(n):
         ("tracker, prefilter by sums", RestartingLeastSquares(tones=n, h=h, prefilter=1.0), False),
         ("tracker, prefilter by FFT", RestartingLeastSquares(tones=n, h=h, prefilter=1.0), True),
         ("total least squares", RestartingLeastSquares(tones=n, h=h, solution="total_least_squares"), False),
-        ("adaptive_observer", AdaptiveObserver(tones=n, initial_frequencies=start), False),
-        ("filter_regression", FilterRegression(tones=n, pole=4.0, initial_frequencies=start), False),
     )
 
 
@@ -89,14 +82,6 @@ def main():
         [ours] = least(REPEATS, lambda compiled=compiled, y=y[:count]: compiled.start(INTERVAL).run(y))
         ratio = seconds / ours
         print(f"{'finite time, numpy':28}{n:3d}{count / seconds:15.3g}   drem_finite_time is {ratio:.0f} times as fast")
-    y = signal(2, 20_000) + 0.1 * np.random.default_rng(0).standard_normal(20_000)
-    print(f"\n{'20 s, 20,000 samples, n = 2':34}{'ms':>8}")
-    for name, options in (
-        ("ESPRIT on averages of 0.05 s", Esprit(tones=2, averaging=0.05)),
-        ("nonlinear least squares", NonlinearLeastSquares(tones=2, averaging=0.05)),
-    ):
-        [seconds] = least(REPEATS, lambda options=options: options.estimate(y, INTERVAL))
-        print(f"{name:34}{1e3 * seconds:8.1f}")
 
 
 if __name__ == "__main__":

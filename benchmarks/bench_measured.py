@@ -17,9 +17,9 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.svf import Svf
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.csv_file import read_record
 from ctid_cli.signals.excitation import Prbs, Step
 from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.measurement import read_record
 from ctid_cli.signals.noise import WhiteNoise
 from ctid_cli.signals.record import Record
 

@@ -30,7 +30,7 @@ import yaml
 from ctid_cli.running.job import Job, run_job
 from ctid_cli.running.plan import build_plan, current_origin
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage import journal
+from ctid_cli.storage import journal, sqlite_file
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.identity import now
 from ctid_cli.storage.manifest import Key, Outcome
@@ -91,7 +91,7 @@ def fill(folder: Path, spec: Path) -> None:
     plan = build_plan(load_spec(spec))
     manifest = plan.manifest()
     (folder / NAME).mkdir(parents=True)
-    log = journal.open_journal(folder / NAME / journal.FILE_NAME)
+    log = journal.open_journal(folder / NAME / sqlite_file.FILE_NAME)
     session = log.begin(manifest, current_origin(plan), now(), {"limits": {}, "spec_folder": str(spec.parent)})
     batch: list[Outcome] = []
     for outcome in outcomes(plan, manifest):
@@ -143,7 +143,7 @@ def main() -> None:
             began = time.process_time()
             fill(results, spec)
             print(f"filled in {time.process_time() - began:.1f} CPU s")
-        stored = results / NAME / journal.FILE_NAME
+        stored = results / NAME / sqlite_file.FILE_NAME
         print(f"{given.estimates} estimates, {stored.stat().st_size / given.estimates:.0f} bytes each in the journal")
         print(f"{'command':8} {'CPU s':>9} {'wall s':>9} {'MB':>9}")
         for name in given.only.split(","):

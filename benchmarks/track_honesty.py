@@ -1,18 +1,18 @@
 """Is a row of a track right that is called valid? Random signals, asked for too few, enough and too many tones.
 
-    python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show] [--method NAME]
+    python benchmarks/track_honesty.py [--signals 1000] [--seed 1] [--show]
 
 Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of them 3 to 12 bins beside another, steady,
 drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to
 60 dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency is off the nearest true one
 by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the bound of Cramer
 and Rao for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its tone is no
-weaker than six standard errors of its amplitude and three bins of the stretch from any other.
+weaker than six standard errors of its amplitude and three bins of the stretch from any other. All rows that could be
+right count, whether the tracker found their tone or not; asked for one tone fewer, only wrong rows count.
 
-With ``--method`` rows of an online estimator are judged, as ``ctid track`` gives them.
-
-Then: coverage of the standard errors and their size beside the bound, for one to three steady tones in white and
-coloured noise.
+Then: named cases, in which no valid row may be off by more than .02 Hz or 3.3 of its standard errors, whichever is
+larger; and coverage of the standard errors and their size relative to the bound, for one to three steady tones in white
+and coloured noise.
 """
 
 import argparse
@@ -23,16 +23,19 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.automatic import choose_settings
-from ctid_cli.frequency.estimator_rows import track_record
-from ctid_cli.frequency.inputs import MOST_TONES
-from ctid_cli.frequency.record_tones import follow_tones
-from ctid_cli.frequency.record_track import USUAL_ACCURACY, RecordTrack
-from ctid_cli.kinds import ONLINE
+from ctid_cli.tones.constants import USUAL_ACCURACY
+from ctid_cli.tones.track import Track, track
 
 ROWS = 60
 KINDS = ("steady", "steady", "steady", "drift", "decay", "phase step", "frequency step", "amplitude step")
 FAR, ERRORS, AMPLITUDES, BINS = 64, 3.3, 6.0, 3.0
+
+
+class Recorded(NamedTuple):
+    """A signal on a regular clock."""
+
+    samples: np.ndarray
+    interval: float
 
 
 class Tone(NamedTuple):
@@ -131,56 +134,113 @@ def could_be_right(signal: Signal, places: np.ndarray) -> np.ndarray:
     return possible
 
 
-def judged(signal: Signal, track: RecordTrack) -> tuple[int, int, int, int]:
-    """Valid rows, wrong ones; rows that could be right where all that could be are found, and how many are valid."""
-    places = np.minimum(np.round(track.t).astype(int), signal.samples.size - 1)
+def judged(signal: Signal, found: Track) -> tuple[int, int, int, int]:
+    """Valid rows, wrong ones; rows that could be right, and how many of them are valid and right."""
+    places = np.minimum(np.round(found.t).astype(int), signal.samples.size - 1)
     possible = could_be_right(signal, places)
     valid = wrong = 0
-    hit, found = np.zeros_like(possible), np.zeros_like(possible)
+    hit = np.zeros_like(possible)
     for r, place in enumerate(places):
         truth = np.array([tone.frequency[place] for tone in signal.tones])
-        for k in np.flatnonzero(np.isfinite(track.omega[r])):
-            frequency, error = track.omega[r, k] / (2.0 * np.pi), track.error[r, k] / (2.0 * np.pi)
-            off = np.abs(truth - frequency)
-            right = off <= max(ERRORS * error, USUAL_ACCURACY * frequency)
-            found[right, r] = True
-            if track.valid[r, k]:
-                valid += 1
-                wrong += not right.any()
-                hit[right, r] = True
-    # A row in which a tone that could be right was not asked for, or not found, does not count.
-    complete = possible & (found | ~possible).all(axis=0)
-    return valid, wrong, int(complete.sum()), int((complete & hit).sum())
+        for k in np.flatnonzero(found.valid[r] & np.isfinite(found.omega[r])):
+            frequency, error = found.omega[r, k] / (2.0 * np.pi), found.error[r, k] / (2.0 * np.pi)
+            right = np.abs(truth - frequency) <= max(ERRORS * error, USUAL_ACCURACY * frequency)
+            valid += 1
+            wrong += not right.any()
+            hit[right, r] = True
+    return valid, wrong, int(possible.sum()), int((possible & hit).sum())
 
 
-def tracked(signal: Signal, tones: int | None, method: str | None) -> RecordTrack:
-    """The track of a signal, without a method or with one."""
-    every = (signal.samples.size - 1.0) / (ROWS - 1)
-    if method is None:
-        return follow_tones(signal.samples, 1.0, tones, every=every)[0]
-    settings = choose_settings(signal.samples, 1.0, min(MOST_TONES, max(1, tones or 0)), method=method)
-    return track_record(signal.samples, 1.0, settings, every=every)
-
-
-def honesty(signals: int, seed: int, show: bool, method: str | None) -> None:
+def honesty(signals: int, seed: int, show: bool) -> None:
     """The table of the first question."""
     print(f"{'asked for':12} {'valid rows':>10} {'wrong':>7} {'':8} {'could be right':>14} {'valid of them':>13}")
-    for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), *([] if method else [("auto", None)])):
+    for name, more in (("one fewer", -1), ("as many", 0), ("two more", 2), ("auto", None)):
         total = np.zeros(4, int)
         for k in range(signals):
             signal = random_signal(np.random.default_rng([seed, k]))
             asked = None if more is None else max(0, len(signal.tones) + more)
+            every = (signal.samples.size - 1.0) / (ROWS - 1)
             try:
-                track = tracked(signal, asked, method)
+                found = track(Recorded(signal.samples, 1.0), asked, every=every)
             except DataError:
+                places = np.arange(0.0, signal.samples.size - 0.5, every).astype(int)
+                total[2] += int(could_be_right(signal, places).sum())
                 continue
-            one = judged(signal, track.of_accuracy(None))
+            one = judged(signal, found)
             total += one
             if show and one[1]:
                 print(f"   signal {k}: {one[1]} of {one[0]} valid rows are wrong")
         share = f"({100 * total[1] / max(1, total[0]):.2f} %)"
-        hits = f"{100 * total[3] / max(1, total[2]):.1f} %"
-        print(f"{name:12} {total[0]:10} {total[1]:7} {share:8} {total[2]:14} {hits:>13}", flush=True)
+        hits = "-" if more == -1 else f"{100 * total[3] / max(1, total[2]):.1f} %"
+        could = "-" if more == -1 else str(total[2])
+        print(f"{name:12} {total[0]:10} {total[1]:7} {share:8} {could:>14} {hits:>13}", flush=True)
+
+
+def named_cases(records: int, seed: int) -> None:
+    """The table of the named cases: rows of some records of each, at 1 kHz."""
+    print(f"\n{'named case':34} {'rows':>6} {'valid':>7} {'wrong':>6}")
+    for name, seconds, tones, make in NAMED:
+        total = np.zeros(3, int)
+        for k in range(records):
+            rng = np.random.default_rng([seed, 11, k])
+            t = np.arange(int(seconds * RATE)) / RATE
+            signal, truth = make(t, rng)
+            try:
+                found = track(Recorded(signal, 1.0 / RATE), tones, every=seconds / ROWS)
+            except DataError:
+                continue
+            valid, error = found.valid, found.error / (2.0 * np.pi)
+            off = np.abs(found.omega[:, :, None] / (2.0 * np.pi) - np.asarray(truth)).min(axis=2)
+            total += (valid.size, valid.sum(), (valid & (off > np.maximum(0.02, ERRORS * error))).sum())
+        print(f"{name:34} {total[0]:6} {total[1]:7} {total[2]:6}", flush=True)
+
+
+def _tone(t: np.ndarray, rng: np.random.Generator, hertz: float) -> np.ndarray:
+    return np.asarray(np.cos(2.0 * np.pi * hertz * t + rng.uniform(0.0, 2.0 * np.pi)))
+
+
+def _noisy(samples: np.ndarray, rng: np.random.Generator, deviation: float) -> np.ndarray:
+    return samples + deviation * rng.standard_normal(samples.size)
+
+
+def _weak(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    return _noisy(_tone(t, rng, 60.0) + 0.1 * _tone(t, rng, 85.0), rng, 0.01), (60.0, 85.0)
+
+
+def _close(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    return _noisy(_tone(t, rng, 30.0) + _tone(t, rng, 30.5), rng, 0.01), (30.0, 30.5)
+
+
+def _stepping(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    phase = rng.uniform(0.0, 2.0 * np.pi) + np.deg2rad(10.0) * (t > rng.uniform(0.2, 0.8) * t[-1])
+    return _noisy(np.cos(2.0 * np.pi * 50.0 * t + phase), rng, 0.01), (50.0,)
+
+
+def _decaying(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    return _noisy(np.exp(-5.0 * t / t[-1]) * _tone(t, rng, 50.0), rng, 0.01), (50.0,)
+
+
+def _spike(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    samples = _noisy(_tone(t, rng, 50.0), rng, 0.01)
+    samples[rng.integers(t.size)] = 1e6
+    return samples, (50.0,)
+
+
+def _short(t: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, tuple[float, ...]]:
+    return _noisy(_tone(t, rng, 42.0), rng, np.sqrt(0.5 / 10.0)), (42.0,)
+
+
+RATE = 1000.0
+#: Name, seconds, number of tones that is asked for, and a function: the samples and the true frequencies [Hz].
+NAMED = (
+    ("85 Hz at a tenth, 60 Hz, tones=1", 8.0, 1, _weak),
+    ("30 and 30.5 Hz, 8 s, tones=1", 8.0, 1, _close),
+    ("30 and 30.5 Hz, 2 s, tones=1", 2.0, 1, _close),
+    ("phase step of 10 degrees", 8.0, 1, _stepping),
+    ("decay by 43 dB", 8.0, 1, _decaying),
+    ("one spike of 1e6", 8.0, 1, _spike),
+    ("42 Hz at 10 dB in 4 s", 4.0, 1, _short),
+)
 
 
 def efficiency(records: int, seed: int) -> None:
@@ -195,13 +255,13 @@ def efficiency(records: int, seed: int) -> None:
                 raw = lfilter([np.sqrt(1.0 - pole**2)], [1.0, -pole], rng.standard_normal(size + 200))[200:]
                 phase = rng.uniform(0.0, 2.0 * np.pi, 3)
                 y = sum(np.cos(omega[j] * np.arange(size) + phase[j]) for j in range(tones)) + 0.0707 * raw
-                track, _ = follow_tones(y, 1.0, tones, every=size / 2.0)
-                if not np.isfinite(track.omega[1]).all():
+                found = track(Recorded(y, 1.0), tones, every=size / 2.0)
+                if not np.isfinite(found.omega[1]).all():
                     continue
                 density = 0.0707**2 * (1.0 - pole**2) / np.abs(1.0 - pole * np.exp(-1j * omega[:tones])) ** 2
                 bound = np.sqrt(24.0 * density / size**3)
-                error = track.omega[1] - omega[:tones]
-                off += list(zip(np.abs(error) < 1.96 * track.error[1], error / bound, strict=True))
+                error = found.omega[1] - omega[:tones]
+                off += list(zip(np.abs(error) < 1.96 * found.error[1], error / bound, strict=True))
             inside, ratio = np.array(off).T
             name = "AR .9" if pole else "white"
             print(f"{tones:5} {name:8} {100 * inside.mean():7.1f}% {np.sqrt(np.mean(ratio**2)):12.3f}", flush=True)
@@ -212,12 +272,11 @@ def main() -> None:
     parser.add_argument("--signals", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--show", action="store_true", help="name the signals with wrong rows")
-    parser.add_argument("--method", choices=ONLINE, help="judge the rows of an online estimator")
     given = parser.parse_args()
     began = time.process_time()
-    honesty(given.signals, given.seed, given.show, given.method)
-    if given.method is None:
-        efficiency(max(1, given.signals // 4), given.seed)
+    honesty(given.signals, given.seed, given.show)
+    named_cases(max(1, given.signals // 20), given.seed)
+    efficiency(max(1, given.signals // 4), given.seed)
     print(f"{time.process_time() - began:.0f} CPU s")
 
 

@@ -7,7 +7,7 @@ __version__: str
 # Records and the signals that excite and disturb them
 from .signals.held import HeldSignal as HeldSignal
 from .signals.record import Loop as Loop, Record as Record
-from .signals.csv_file import read_record as read_record
+from .signals.measurement import read_record as read_record
 from .signals.excitation import Gaussian as Gaussian, Prbs as Prbs, Step as Step
 from .signals.multisine import Multisine as Multisine
 from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals
@@ -62,7 +62,7 @@ from .reporting.saved_fit import save_fit as save_fit
 # Custom components: the classes that they derive from
 from .signals.excitation import Excitation as Excitation
 from .signals.sampling import Sampling as Sampling
-from .simulation.components import Estimator as Estimator, Noise as Noise, System as System
+from .simulation.components import Estimator as Estimator, Measure as Measure, Noise as Noise, System as System
 
 # Experiments: what ctid run, table and export do
 from .reporting.experiment import ExperimentResults as ExperimentResults
@@ -75,25 +75,15 @@ from .filtering.filter_set import FilterSet as FilterSet, check_filters as check
 from .estimation.redundancy import RedundantMinimum as RedundantMinimum, minimise_redundantly as minimise_redundantly
 
 # Frequencies of signals
-from .frequency.drem import DremGradient as DremGradient, DremFiniteTime as DremFiniteTime, DremWindow as DremWindow
-from .frequency.delay_regression import Online as Online
+from .frequency.flags import Flag as Flag
 from .frequency.base import FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
+from .frequency.delay_regression import Online as Online
+from .frequency.drem import DremGradient as DremGradient, DremFiniteTime as DremFiniteTime, DremWindow as DremWindow
 from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
-from .frequency.adaptive_observer import AdaptiveObserver as AdaptiveObserver
-from .frequency.filter_regression import FilterRegression as FilterRegression
-from .frequency.esprit import Esprit as Esprit
-from .frequency.nonlinear_least_squares import NonlinearLeastSquares as NonlinearLeastSquares
 from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
-from .frequency.tracking import FrequencyEstimate as FrequencyEstimate
-from .frequency.base import Flag as Flag
 
-# Synchrophasors of mains signals
-from .frequency.synchrophasor import SynchrophasorTrack as SynchrophasorTrack
-from .frequency.synchrophasor import measure_synchrophasors as measure_synchrophasors
-from .frequency.synchrophasor_check import SynchrophasorCheck as SynchrophasorCheck
-from .frequency.synchrophasor_check import check_synchrophasors as check_synchrophasors
-from .frequency.synchrophasor_check import CheckedLimit as CheckedLimit
-from .frequency.synchrophasor_limits import Limit as Limit
+# Tones of recorded signals
+from .tones.track import MissingLine as MissingLine, Track as Track, track as track
 
 # Errors
 from .errors import CtidError as CtidError, DataError as DataError, SpecError as SpecError

@@ -28,6 +28,9 @@ from typing import Any, Self
 _UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)
 #: Letters of the text that names a class.
 MAX_LENGTH = 200
+_PACKAGE = Path(__file__).resolve().parent
+#: The studies that are shipped with the program, in an installed package and in a checkout.
+STUDIES = _PACKAGE / "_experiments" if (_PACKAGE / "_experiments").is_dir() else _PACKAGE.parent / "experiments"
 _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 
@@ -70,8 +73,8 @@ def find_class(kind: str, folder: Path) -> type[Any]:
     place, _, name = kind.rpartition(":")
     if not place or not name.isidentifier() or len(kind) > MAX_LENGTH:
         raise CustomCodeError(f"must be './file.py:Class' or 'package.module:Class', not the text {kind[:40]!r}")
-    of_file = "/" in place or place.endswith(".py")
-    module = _serve_file(Path(os.path.abspath(folder / place)), place) if of_file else place
+    file = _file_of(place, folder)
+    module = place if file is None else _serve_file(file, place)
     try:
         # What it prints must not stand between the lines of a command's output.
         with redirect_stdout(sys.stderr):
@@ -83,6 +86,24 @@ def find_class(kind: str, folder: Path) -> type[Any]:
     if not isinstance(found, type):
         raise CustomCodeError(f"{place} has no class {name}" if found is None else f"{kind} is no class")
     return found
+
+
+def is_shipped(kind: str, folder: Path) -> bool:
+    """Return whether a kind names a file of the studies that are shipped with the program.
+
+    Such code is trusted as the program itself is, whoever wrote the specification. A link elsewhere to such a file is
+    not: modules that the file imports would be looked for beside the link.
+    """
+    file = _file_of(kind.rpartition(":")[0], folder)
+    try:
+        return file is not None and not file.is_symlink() and file.parent.resolve().is_relative_to(STUDIES)
+    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+        return False
+
+
+def _file_of(place: str, folder: Path) -> Path | None:
+    """Return the file that a kind names; None where it names a module."""
+    return Path(os.path.abspath(folder / place)) if "/" in place or place.endswith(".py") else None
 
 
 def reason(error: BaseException) -> str:
@@ -98,6 +119,8 @@ def reason(error: BaseException) -> str:
 
 
 _SERVED: dict[str, Source] = {}
+#: Names that served modules have, by the file and a hash of what is served with it.
+_MADE_NAME = r"custom_\w+_[0-9a-f]{12}(\.\w+)*"
 
 
 class _Loader(SourceLoader):
@@ -136,7 +159,8 @@ class _Finder(MetaPathFinder):
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         source = _SERVED.get(fullname)
         if source is None:
-            return None
+            # What Numba has compiled and kept asks for its module by the name that it had before another file changed.
+            return ModuleSpec(fullname, None, is_package=True) if re.fullmatch(_MADE_NAME, fullname) else None
         return importlib.util.spec_from_file_location(
             fullname, source.path, loader=_Loader(source), submodule_search_locations=[]
         )
@@ -215,7 +239,7 @@ def is_custom_file(file: str | None) -> bool:
         return False
     parts = Path(file).parts
     installed = "site-packages" in parts or "dist-packages" in parts or file.startswith(_STANDARD)
-    return not installed and not Path(file).is_relative_to(Path(__file__).parent)
+    return not installed and not Path(file).is_relative_to(_PACKAGE)
 
 
 def source_of(name: str) -> Source | None:

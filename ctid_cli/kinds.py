@@ -9,9 +9,6 @@ from typing import Any
 _NOISES = {
     "white": "ctid_cli.signals.noise:WhiteNoise",
     "arma": "ctid_cli.signals.noise:ArmaNoise",
-    "random_walk": "ctid_cli.signals.drifts:RandomWalk",
-    "one_over_f": "ctid_cli.signals.drifts:OneOverFNoise",
-    "outliers": "ctid_cli.signals.noise:OutlierNoise",
 }
 #: Section, or what stands in it, to the kinds that it may have, to where the class of each is: ``module:Class``.
 KINDS: dict[str, dict[str, str]] = {
@@ -19,21 +16,16 @@ KINDS: dict[str, dict[str, str]] = {
         "prbs": "ctid_cli.signals.excitation:Prbs",
         "gbn": "ctid_cli.signals.excitation:Gbn",
         "multisine": "ctid_cli.signals.multisine:Multisine",
-        "chirp": "ctid_cli.signals.chirp:Chirp",
         "gaussian": "ctid_cli.signals.excitation:Gaussian",
         "step": "ctid_cli.signals.excitation:Step",
-        "steps": "ctid_cli.signals.steps:Steps",
-        "doublets": "ctid_cli.signals.steps:Doublets",
+        "steps": "ctid_cli.signals.excitation:Steps",
         "file": "ctid_cli.signals.excitation:InputFile",
     },
     "sampling": {
         "regular": "ctid_cli.signals.sampling:RegularSampling",
-        "irregular": "ctid_cli.signals.irregular:IrregularSampling",
+        "irregular": "ctid_cli.signals.sampling:IrregularSampling",
         "uniform_intervals": "ctid_cli.signals.sampling:UniformIntervals",
-        "jitter": "ctid_cli.signals.irregular:JitteredSampling",
-        "missing_samples": "ctid_cli.signals.irregular:MissingSamples",
-        "poisson": "ctid_cli.signals.irregular:PoissonSampling",
-        "send_on_delta": "ctid_cli.signals.send_on_delta:SendOnDelta",
+        "jitter": "ctid_cli.signals.sampling:JitteredSampling",
     },
     "noise": _NOISES,
     "disturbance": {
@@ -54,15 +46,8 @@ KINDS: dict[str, dict[str, str]] = {
         "drem_finite_time": "ctid_cli.frequency.drem:DremFiniteTime",
         "drem_window": "ctid_cli.frequency.drem:DremWindow",
         "restarting_least_squares": "ctid_cli.frequency.restarting_least_squares:RestartingLeastSquares",
-        "adaptive_observer": "ctid_cli.frequency.adaptive_observer:AdaptiveObserver",
-        "filter_regression": "ctid_cli.frequency.filter_regression:FilterRegression",
-        "esprit": "ctid_cli.frequency.esprit:Esprit",
-        "nonlinear_least_squares": "ctid_cli.frequency.nonlinear_least_squares:NonlinearLeastSquares",
     },
 }
-
-#: Estimators of frequencies that take one sample after the other; the others take whole records.
-ONLINE = tuple(kind for kind in KINDS["frequency_estimator"] if kind not in ("esprit", "nonlinear_least_squares"))
 
 
 def resolve(section: str, kind: str) -> type[Any]:

@@ -15,6 +15,11 @@ def listed(words: Iterable[object]) -> str:
     return f"{', '.join(first)} and {end}" if first else end
 
 
+def count(n: int, noun: str) -> str:
+    """A number of things."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
 def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
     """Return a paragraph, with another indent for all lines but the first if one is given."""
     return textwrap.fill(

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import chirp
 from typer.testing import CliRunner
+
+from ctid_cli import simulate_dataset
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
 
@@ -22,7 +25,7 @@ def ctid(*arguments, code=0, env=None):
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
-    files = [EXAMPLES / "custom_study.yaml", EXAMPLES / "tank.yaml"]
+    files = [EXAMPLES / "custom_study.yaml", EXAMPLES / "tank.yaml", EXAMPLES / "robust.yaml"]
     assert ctid("run", *files, "--allow-code", "--quiet", "--jobs", "2", "--out", folder).stdout == ""
     return folder
 
@@ -38,13 +41,43 @@ def test_the_study(out):
         assert mine["delay"] == pytest.approx(ours["delay"], abs=2 * ours["standard_errors"]["delay"])
         assert mine["standard_errors"]["delay"] == pytest.approx(ours["standard_errors"]["delay"], rel=0.2)
         assert mine["parameters"]["b0"] == mine["numerator"][0]
-    assert "mine: %" in ctid("table", "custom-study", "--out", out).stdout
+    worst = {name: [row["custom_measures"]["WorstGain"] for row in own] for name, own in by_name.items()}
+    assert 0.0 < max(worst["mine"] + worst["srivc"]) < min(worst["external"])
+    assert re.search(r"mine +\d+\.\d \[.*\] +\d", ctid("table", "custom-study", "--out", out).stdout)
 
 
 def test_the_tank_is_nearly_linear(out):
     rows = json.loads(ctid("export", "tank", "--format", "json", "--out", out).stdout)
     found = np.array([[row["numerator"][0], row["denominator"][1]] for row in rows])
     np.testing.assert_allclose(found, [[0.5, 0.25]] * 4, rtol=0.03)
+
+
+def test_a_robust_loss_sees_less_of_a_faulty_sensor(out):
+    record = simulate_dataset(EXAMPLES / "robust.yaml", (0, 0), allow_code=True).record
+    ends = np.array([0.1, 10.0]) / (2 * np.pi)
+    expected = chirp(record.t, ends[0], record.t[-1], ends[1], "logarithmic", phi=-90)
+    np.testing.assert_allclose(record.input.values, expected, atol=1e-9)
+    errors = np.abs(record.y - record.noise_free)[record.valid]
+    assert 0.05 < np.mean(~record.valid) < 0.15
+    assert 0.02 < np.mean(errors > 4 * 0.05) < 0.08
+    rows = json.loads(ctid("export", "robust", "--format", "json", "--out", out).stdout)
+    assert {row["status"] for row in rows} == {"CONVERGED"}
+    squares, tukey = (
+        np.mean([(row["delay"] - 0.35) ** 2 for row in rows if row["estimator"] == name])
+        for name in ("squares", "tukey")
+    )
+    assert tukey < squares
+
+
+def test_an_estimator_of_frequencies(tmp_path):
+    ctid("run", EXAMPLES / "zero_crossings.yaml", "--allow-code", "--quiet", "--jobs", "1", "--out", tmp_path)
+    rows = json.loads(ctid("export", "zero-crossings", "--format", "json", "--out", tmp_path).stdout)
+    mine = [row["measures"] for row in rows if row["estimator"] == "mine"]
+    assert len(mine) == 2
+    for measures in mine:
+        assert measures["omega_1"] == pytest.approx(2.0, abs=1e-3)
+        assert (measures["valid_share"], "settling_time_1" in measures) == (100.0, False)
+    assert all(row["converged"] for row in rows)
 
 
 def test_one_estimate_is_computed_once_more_with_permission_only(out):
@@ -83,6 +116,7 @@ def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
 def test_the_documentation_names_what_there_is():
     text = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     names = set(re.findall(r"`(\w+\.(?:py|yaml))`", text))
-    assert {"output_error.py", "external_fit.py", "bursts.py", "tank.py"} <= names
+    examples = {"output_error.py", "external_fit.py", "bursts.py", "tank.py", "worst_gain.py"}
+    assert examples | {"chirp.py", "faulty_sensor.py"} <= names
     for name in names:
         assert (EXAMPLES / name).is_file(), name

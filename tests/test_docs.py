@@ -10,7 +10,7 @@ import pytest
 
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.models.controller import ContinuousPid, Relay
-from ctid_cli.signals.recorder import Recorder
+from ctid_cli.signals.sampling import InstantsFile
 from ctid_cli.specification.messages import option_docs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,7 +39,7 @@ SIGNALS = [
     (kind, target)
     for section in ("excitation", "sampling", "noise")
     for kind, target in {name: classes(section)[name] for name in KINDS[section]}.items()
-] + [("recorder", Recorder), ("continuous_pid", ContinuousPid), ("relay", Relay)]
+] + [("file", InstantsFile), ("continuous_pid", ContinuousPid), ("relay", Relay)]
 
 
 def options_of(target):

@@ -11,13 +11,11 @@ import typing
 import pytest
 
 import ctid_cli
-from ctid_cli.frequency.tracking import BatchEstimator
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.transfer_function import ContinuousModel
-from ctid_cli.signals.drifts import ContinuousNoise
 from ctid_cli.signals.noise import Noise
-from ctid_cli.signals.recorder import Recorder
+from ctid_cli.signals.sampling import InstantsFile, ListedInstants
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.sections import Section
@@ -47,10 +45,10 @@ def public_callables():
         for kind, member in classes(section).items():
             if member.__name__ not in ctid_cli.__all__:
                 yield kind, member
-    for contract in (BatchEstimator, ContinuousModel, ContinuousNoise, Noise):
+    for contract in (ContinuousModel, Noise):
         yield from members_of(f"{contract.__module__}.{contract.__name__}", contract)
-    without_kind = (ContinuousPid, MeasuredSource, Piece, Recorder, Relay, SumOfSinusoids, Tone, *written_sections())
-    for member in without_kind:
+    without_kind = (ContinuousPid, InstantsFile, ListedInstants, MeasuredSource, Piece, Relay, SumOfSinusoids, Tone)
+    for member in (*without_kind, *written_sections()):
         yield member.__name__, member
 
 

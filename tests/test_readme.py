@@ -32,10 +32,10 @@ def test_the_specifications_are_valid(tmp_path):
     file.write_text(first, encoding="utf-8")
     plan = build_plan(load_spec(file))
     assert plan.experiment == "my-first"
-    assert len(plan.tasks()) == 40
+    assert plan.data_sets == 40
     file.write_text("experiment: sum\nmonte_carlo: {runs: 300, seed: 1}\n" + second, encoding="utf-8")
     plan = build_plan(load_spec(file))
-    assert (len(plan.tasks()), len(plan.estimators)) == (15_000, 2)
+    assert (plan.data_sets, len(plan.estimators)) == (15_000, 2)
 
 
 def test_linked_files_exist():

@@ -152,11 +152,6 @@ class Reporter(_Progress):
         else:
             self._update(progress.done, total=progress.total)
 
-    def warn(self, text: str) -> None:
-        """Say what is odd, and does not stop the run."""
-        if not self._quiet:
-            self._say(f"warning: {text}")
-
     def _begin(self, total: int) -> None:
         self._ready = True
         self._began = self._last

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -21,9 +21,7 @@ from ctid_cli.cli._common import (
     To,
     answer,
     guarded,
-    write_files,
 )
-from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.cli.experiment_commands import load_plans
 from ctid_cli.errors import MismatchError, UsageError
 from ctid_cli.signals.treatment import AskedHold
@@ -33,7 +31,7 @@ further = typer.Typer(rich_markup_mode=None, context_settings={"help_option_name
 
 @guarded
 def check(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat).")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat, .h5).")],
     time: TimeColumn = None,
     input: InputColumn = None,
     output: OutputColumn = None,
@@ -125,44 +123,6 @@ def check_accuracy(
     ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code, allow_outside=allow_outside)
     content = accuracy_object(plan, find_results(out, plan.experiment))
     answer(as_json, lambda: content, lambda: accuracy_text(content))
-
-
-@further.command("pmu", cls=ComputingCommand)
-@guarded
-def check_pmu(
-    nominal: Annotated[int, typer.Option("--nominal", metavar="50|60", help="Nominal frequency [Hz].")] = 50,
-    performance_class: Annotated[Literal["P", "M"], typer.Option("--pmu-class", help="Performance class.")] = "P",
-    reporting_rate: Annotated[
-        int | None, typer.Option("--reporting-rate", metavar="HERTZ", help="Reports a second; as many as cycles.")
-    ] = None,
-    rate: Annotated[
-        float | None, typer.Option("--rate", metavar="HERTZ", help="Samples a second; 128 to a cycle if not given.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder for check_pmu.csv.")] = None,
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if a limit is exceeded.")] = False,
-    as_json: Json = False,
-) -> None:
-    """Test the synchrophasors of ctid track --pmu as the standard asks.
-
-    Makes the signals of IEEE C37.118.1 and IEC/IEEE 60255-118-1 from their formulas (off-nominal frequency, harmonics,
-    interference, modulation, ramps, steps) and prints the worst errors beside the limits of the class. The first line
-    says PASS or NOT PASSED; the exit code is 0 either way unless --strict is given.
-    """
-    from ctid_cli.frequency.synchrophasor_check import check_synchrophasors
-    from ctid_cli.reporting.layout import csv_text
-    from ctid_cli.reporting.synchrophasor_check_report import check_object, check_report
-
-    try:
-        with RecordProgress("check pmu") as tell:
-            found = check_synchrophasors(nominal, performance_class, reporting_rate, rate, on_progress=tell)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    written = "" if out is None else f"\n\nWritten: {out / 'check_pmu.csv'}"
-    if out is not None:
-        write_files({out / "check_pmu.csv": csv_text(check_object(found)["limits"]).encode()})
-    answer(as_json, lambda: check_object(found), lambda: check_report(found).draw() + written)
-    if strict and not found.passed:
-        raise MismatchError("the measurement does not keep all limits of its class")
 
 
 class CheckCommand(ComputingCommand):

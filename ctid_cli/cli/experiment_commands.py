@@ -65,13 +65,13 @@ def load_plans(
 ) -> list[tuple[Path, Plan]]:
     """Read and check experiment files; warnings go to stderr."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.specification.load import load_spec
+    from ctid_cli.running.trial import load_tried
 
     problems: list[Problem] = []
     plans: list[tuple[Path, Plan]] = []
     for config in configs:
         try:
-            spec = load_spec(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
+            spec = load_tried(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
             plans.append((config, build_plan(spec, runs)))
         except SpecError as error:
             problems += error.problems
@@ -138,7 +138,7 @@ def run(
     the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
     from ctid_cli.running.engine import preview, run_experiment
-    from ctid_cli.running.stopping import StopAt
+    from ctid_cli.running.stopping import StopRequest
     from ctid_cli.storage.manifest import Shard
 
     if keep_readable and not fresh:
@@ -155,14 +155,14 @@ def run(
         for plan, folder in zip(plans, folders, strict=True):
             typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **how), folder)}")
         return
-    # What was imported stays: looking for garbage in it again and again would be a tenth of sealing many estimates.
+    # What was imported stays: looking for garbage in it again and again would be a tenth of exporting many estimates.
     gc.freeze()
     hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
-        stop = StopAt(failures=max_failures, seconds=left)
+        stop = StopRequest(failures=max_failures, seconds=left)
         with Reporter(plan.experiment, quiet=quiet) as reporter:
-            how |= {"progress": reporter, "warn": reporter.warn, "dask": dask}
+            how |= {"progress": reporter, "dask": dask}
             summary = run_experiment(plan, folder, jobs=jobs, stop=stop, keep_readable=keep_readable, **how)
         if not quiet:
             typer.echo(_conclusion(summary, out, part))
@@ -220,11 +220,7 @@ def validate(
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    from ctid_cli.running.custom_check import check_components
-    from ctid_cli.running.limits import Limits
-
     for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
-        check_components(plan, Limits(), lambda warning: typer.echo(printable(f"warning: {warning}"), err=True))
         typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
 
 

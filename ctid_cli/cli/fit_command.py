@@ -28,7 +28,9 @@ from ctid_cli.text import wrapped
 @guarded
 def fit(
     context: typer.Context,
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
+    ],
     poles: Annotated[
         int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
     ] = None,

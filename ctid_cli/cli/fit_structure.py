@@ -190,7 +190,7 @@ def check_loop(loop: Path | None, reference: str | None, ignored: bool) -> None:
 
 def with_loop(loop: Path, measured: "Measurement", ignored: bool) -> "Measurement":
     """The measurement in its loop, or with a note that this is ignored."""
-    from ctid_cli.simulation.dataset import in_loop
+    from ctid_cli.simulation.record_loop import in_loop
     from ctid_cli.specification.load import load_loop
 
     options = load_loop(loop)

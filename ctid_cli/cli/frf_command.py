@@ -25,7 +25,8 @@ from ctid_cli.signals.treatment import ResponseMethod
 @guarded
 def frf(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Record (.csv, .mat); several: realisations of one input.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Record (.csv, .mat, .h5); several: realisations of one input."),
     ],
     method: Annotated[ResponseMethod, typer.Option("--method", help="How the response is estimated.")] = "auto",
     period: Annotated[
@@ -69,8 +70,10 @@ def frf(
             raise UsageError(f"{name} must be {least} or more, not {value}")
     if width is not None and method not in ("auto", "local-polynomial"):
         raise UsageError(f"--width belongs to --method local-polynomial, not to {method}")
-    columns = {"time": time, "input": input, "output": output}
-    measurements = [read_measurement(file, **columns, hold=hold, start=start, stop=stop) for file in files]
+    measurements = [
+        read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
+        for file in files
+    ]
     units = common_units(measurements)
     found = estimate_frequency_response(
         [item.record for item in measurements],

@@ -54,7 +54,9 @@ def _root() -> None:
 @guarded
 def simulate_fit(
     file: FitFile,
-    on: Annotated[Path, typer.Option("--on", metavar="FILE", help="The input (.csv, .mat); an output is not needed.")],
+    on: Annotated[
+        Path, typer.Option("--on", metavar="FILE", help="The input (.csv, .mat, .h5); an output is not needed.")
+    ],
     time: TimeColumn = None,
     input: InputColumn = None,
     hold: OwnHold = None,
@@ -200,7 +202,7 @@ def compare_fits(
 @guarded
 def residuals(
     file: FitFile,
-    on: Annotated[Path, typer.Option("--on", metavar="FILE", help="Record (.csv, .mat).")],
+    on: Annotated[Path, typer.Option("--on", metavar="FILE", help="Record (.csv, .mat, .h5).")],
     time: TimeColumn = None,
     input: InputColumn = None,
     output: OutputColumn = None,

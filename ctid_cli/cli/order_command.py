@@ -26,7 +26,9 @@ from ctid_cli.signals.treatment import InitialState, Offset
 
 @guarded
 def order(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat), an experiment each.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
+    ],
     poles: Annotated[str, typer.Option("--poles", metavar="LOW:HIGH", help="Numbers of poles, 1 to 12.")] = "1:6",
     zeros: Annotated[str, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = "0:3",
     delay: Annotated[

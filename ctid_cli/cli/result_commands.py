@@ -22,10 +22,11 @@ def status(
 
     Counts estimates: done, planned, failed, and those that the latest settings set aside.
     """
+    from ctid_cli.inference.monte_carlo import CellPrecision
     from ctid_cli.reporting.exporting import with_list
     from ctid_cli.reporting.overview import OF_STATUS, overview_text, status_object, status_text
     from ctid_cli.reporting.results import experiments_in, read_results
-    from ctid_cli.running.precision import CellPrecision, cell_precisions
+    from ctid_cli.running.precision import cell_precisions
     from ctid_cli.storage.status import experiment_status
 
     if experiment is None:
@@ -302,7 +303,7 @@ def _report_file(path: Path, record: list[Path] | None, validate: Path | None, f
     from ctid_cli.storage.track_file import TRACK
 
     if path.suffix.lower() != ".json":
-        pages = "pages are made of fit.json (ctid fit) and track.json (ctid track); synchrophasors have a figure only"
+        pages = "pages are made of fit.json (ctid fit) and track.json (ctid track)"
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
     is_track = kind_in(str(path), FIT) == TRACK.kind
     page = _page_of_track(path, record, validate) if is_track else _page_of_fit(path, record, validate)

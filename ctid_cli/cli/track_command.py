@@ -10,18 +10,12 @@ import typer
 
 from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_command, guarded, write_files
 from ctid_cli.cli._progress import RecordProgress
-from ctid_cli.cli.track_mains import Mains, track_mains
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import ONLINE
 
 if TYPE_CHECKING:
-    from ctid_cli.frequency.record_track import Procedure, RecordTrack
     from ctid_cli.signals.sampled_signal import SampledSignal
     from ctid_cli.storage.track_file import Reading
-
-    Method = str
-else:
-    Method = Literal[("automatic", *ONLINE)]
+    from ctid_cli.tones.track import Track
 
 
 @guarded
@@ -29,9 +23,6 @@ def track(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
     tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
-    method: Annotated[
-        Method, typer.Option("--method", help="An online estimator in place of the windows.")
-    ] = "automatic",
     time: TimeColumn = None,
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
     interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None,
@@ -51,17 +42,6 @@ def track(
             help="Rows with a larger standard error are not valid; .001 of the tone's frequency if not given.",
         ),
     ] = None,
-    pmu: Annotated[
-        int | None, typer.Option("--pmu", metavar="50|60", help="Synchrophasors of a mains signal, in place of tones.")
-    ] = None,
-    pmu_class: Annotated[
-        Literal["P", "M"] | None,
-        typer.Option("--pmu-class", help="Performance class of synchrophasors; P if not given."),
-    ] = None,
-    reporting_rate: Annotated[
-        int | None,
-        typer.Option("--reporting-rate", metavar="HERTZ", help="Synchrophasors a second; one a cycle if not given."),
-    ] = None,
     as_json: Json = False,
     style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
@@ -70,9 +50,7 @@ def track(
 
     Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
     trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
-    a page of. All the rest is chosen from the record, and said. With --pmu 50 or 60 it measures phasor, frequency and
-    rate of change of frequency of the mains instead, as IEC/IEEE 60255-118-1 has them, of one phase or, with
-    --signal A,B,C, of three.
+    a page of. All the rest is chosen from the record, and said.
     """
     from ctid_cli.storage.track_file import Reading
 
@@ -80,20 +58,14 @@ def track(
     for name, value in (("--from", start), ("--to", stop)):
         if value is not None and not math.isfinite(value):
             raise UsageError(f"{name} must be an instant, not {value:g}")
-    mains = Mains(pmu, pmu_class, reporting_rate)
-    others = {"--every": every, "--window": window, "--accuracy": accuracy}
-    given = {"--tones": tones != "auto", "--method": method != "automatic"}
-    if mains.wanted({**given, **{name: value is not None for name, value in others.items()}}):
-        track_mains(file, reading, mains, style, out, as_json)
-        return
     from concurrent.futures import ThreadPoolExecutor
 
-    from ctid_cli.frequency.left_over import with_lines_left
     from ctid_cli.reporting.figures.style import load_matplotlib
     from ctid_cli.reporting.track_columns import track_bytes, track_table
     from ctid_cli.reporting.track_plot import track_drawing
     from ctid_cli.reporting.track_report import track_object, track_text
     from ctid_cli.storage.track_file import track_file_text
+    from ctid_cli.tones.residual import with_lines_left
 
     data, figure, result = out / f"track.{style}", out / "track.svg", out / "track.json"
     if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure, result)):
@@ -105,23 +77,21 @@ def track(
         raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
     record = reading.read(file)
     _require_part(record, reading)
-    asked = Asked(_tones(tones), None if method == "automatic" else method, every, window, accuracy)
     load_matplotlib()
-    found, procedure = _follow(record, asked)
-    track = found.of_accuracy(accuracy)
-    with ThreadPoolExecutor(1) as beside:
-        drawing = track_drawing(track, record.start, record.unit, f"{file.name}: {procedure.method}")
-        drawn = beside.submit(drawing.saved)
-        found = with_lines_left(track, record.samples, record.interval)
+    found = _follow(record, Asked(_tones(tones), accuracy, every, window))
+    with ThreadPoolExecutor(1) as thread:
+        drawing = track_drawing(found, record.start, record.unit, file.name)
+        drawn = thread.submit(drawing.saved)
+        found = with_lines_left(found, record.samples, record.interval)
     files = [data, figure, result]
-    content = track_object(record, procedure, found, accuracy)
+    content = track_object(record, found, accuracy)
     text = track_file_text(found, content, file, reading, out, given_command(context))
     table = track_bytes(track_table(found, record.start), style, record.unit)
     write_files({data: table, figure: drawn.result(), result: text.encode() + b"\n"})
     answer(
         as_json,
         lambda: content | {"written": [str(each) for each in files]},
-        lambda: f"{track_text(record, procedure, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
+        lambda: f"{track_text(record, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
     )
 
 
@@ -129,37 +99,25 @@ class Asked(NamedTuple):
     """What a track is asked for; None where it is to be chosen."""
 
     tones: int | None
-    method: str | None
+    accuracy: float | None
     every: float | None
     window: float | None
-    accuracy: float | None
 
 
-def _follow(record: SampledSignal, asked: Asked) -> tuple[RecordTrack, Procedure]:
-    """The track of a record, and how it was found."""
-    from ctid_cli.frequency.automatic import choose_settings
-    from ctid_cli.frequency.estimator_rows import procedure_of, track_record
-    from ctid_cli.frequency.record_tones import follow_tones
+def _follow(record: SampledSignal, asked: Asked) -> Track:
+    """Return the track of a record."""
+    from ctid_cli.tones.track import track as follow
 
-    samples, interval, method = record.samples, record.interval, asked.method
     try:
         with RecordProgress(Path(record.file).name) as tell:
-            if method is None:
-                return follow_tones(
-                    samples, interval, asked.tones, every=asked.every, window=asked.window, on_progress=tell
-                )
-            if asked.tones is None:
-                raise UsageError(f"--method {method} needs the number of sinusoids, such as --tones 2")
-            settings = choose_settings(samples, interval, asked.tones, method=method, window=asked.window)
-            found = track_record(samples, interval, settings, every=asked.every, on_progress=tell)
+            return follow(record, *asked, on_progress=tell)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    return found, procedure_of(settings, interval)
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
     """Refuse a part that is too short, which is often one in another unit of time."""
-    from ctid_cli.frequency.record_tones import FEWEST
+    from ctid_cli.tones.constants import FEWEST
 
     if record.samples.size < FEWEST and not (reading.start is None and reading.stop is None):
         end = record.start + (record.samples.size - 1) * record.interval
@@ -169,7 +127,7 @@ def _require_part(record: SampledSignal, reading: Reading) -> None:
 
 def _tones(text: str) -> int | None:
     """The number of tones; None to have it chosen."""
-    from ctid_cli.frequency.record_track import MOST_ASKED
+    from ctid_cli.tones.constants import MOST_ASKED
 
     if text == "auto":
         return None

@@ -175,8 +175,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     tolerance: float = 1e-8
     variant: StepRule = "relaxed"
     hold_output: OutputHold = "foh"
-    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
-    fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
+    bootstrap_draws: int = DRAWS
+    fixed: tuple[Fixed, ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

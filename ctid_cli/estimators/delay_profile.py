@@ -250,9 +250,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     nested: bool = False
     hold_output: OutputHold = "foh"
     covariance: Covariance = "auto"
-    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
-    fixed: tuple[Fixed, ...] | None = field(default=None, metadata={"added_later": True})
-    integrators: int = field(default=0, metadata={"added_later": True})
+    bootstrap_draws: int = DRAWS
+    fixed: tuple[Fixed, ...] | None = None
+    integrators: int = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

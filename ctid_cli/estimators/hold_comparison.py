@@ -12,9 +12,8 @@ from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.inference.signal_features import input_moves
-from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
 from ctid_cli.signals.record import Record, beginning
-from ctid_cli.signals.regularity import regular_interval
 
 #: Samples of all records on which the holds are compared.
 MOST = 20_000

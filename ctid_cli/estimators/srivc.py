@@ -1,6 +1,6 @@
 """Simplified refined instrumental variables for continuous-time models (SRIVC) at a known delay."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -112,9 +112,9 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
     tolerance: float = 1e-6
     variant: SrivcVariant = "auto"
     hold_output: OutputHold = "foh"
-    instruments: Instruments = field(default="open_loop", metadata={"added_later": True})
+    instruments: Instruments = "open_loop"
     covariance: Covariance = "auto"
-    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
+    bootstrap_draws: int = DRAWS
 
     def __post_init__(self) -> None:
         super().__post_init__()

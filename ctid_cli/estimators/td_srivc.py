@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -116,7 +116,7 @@ class TdSrivc(Estimator["Searches", Fit]):
     variant: Variant = "guarded"
     hold_output: OutputHold = "foh"
     covariance: Covariance = "auto"
-    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
+    bootstrap_draws: int = DRAWS
 
     def __post_init__(self) -> None:
         super().__post_init__()

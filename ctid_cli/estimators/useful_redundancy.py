@@ -174,9 +174,9 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     max_rounds: int = 20
     hold_output: OutputHold = "foh"
     covariance: Covariance = "auto"
-    bootstrap_draws: int = field(default=DRAWS, metadata={"added_later": True})
-    variant: Variant = field(default="guarded", metadata={"added_later": True})
-    max_delay_step: float | None = field(default=None, metadata={"added_later": True})
+    bootstrap_draws: int = DRAWS
+    variant: Variant = "guarded"
+    max_delay_step: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

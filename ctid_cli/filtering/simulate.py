@@ -21,8 +21,7 @@ from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.band_limited import FINER
 from ctid_cli.signals.checks import require_positive
-from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.regularity import REGULARITY, regular_interval
+from ctid_cli.signals.held import REGULARITY, HeldSignal, regular_interval
 
 
 def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> Array:

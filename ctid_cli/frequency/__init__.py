@@ -7,8 +7,6 @@ An online estimator is a frozen dataclass of options. ``tracker = options.start(
 be trusted, if so, and a sentence for each.
 
 The recommended tracker is :class:`RestartingLeastSquares` with a prefilter. :class:`DremGradient`,
-:class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones. :class:`AdaptiveObserver` and
-:class:`FilterRegression` are comparators, derived, not the published algorithms. :class:`Esprit` and
-:class:`NonlinearLeastSquares` are references for whole records. :func:`fit_sinusoids` finds amplitudes, phases and the
-bias once the frequencies are known.
+:class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones. :func:`fit_sinusoids` finds
+amplitudes, phases and the bias once the frequencies are known.
 """

@@ -7,8 +7,8 @@ A plugin is a frozen dataclass of options derived from :class:`FrequencyEstimato
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import IntFlag
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 from ctid_cli.text import ShownAsTable
 
@@ -23,50 +24,6 @@ from ctid_cli.text import ShownAsTable
 MOST_TONES = 8
 #: A sample larger than this counts as missing: its powers would overflow.
 LARGEST_SAMPLE = 1e30
-
-
-class Flag(IntFlag):
-    """Reasons for which an estimate is marked invalid; an estimate is valid exactly if it has none.
-
-    Notes
-    -----
-    Tracks store the flags as unsigned 16-bit integers; ``track.flags & Flag.GAP`` selects one reason.
-    """
-
-    STARTING = 1
-    GAP = 2
-    CHANGED = 4
-    UNDETERMINED = 8
-    UNCERTAIN = 16
-    COMPLEX_ROOTS = 32
-    OUT_OF_BOUNDS = 64
-    INCONSISTENT = 128
-    NOT_CONVERGED = 256
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """One sentence for each flag that is set: what happened, and what to change."""
-        return tuple(MEANINGS[flag] for flag in Flag if flag in self)
-
-
-#: What each flag tells the user.
-MEANINGS: dict[Flag, str] = {
-    Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
-    Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
-    Flag.CHANGED: "The signal changed: the estimate is held until all samples from before have left the delays.",
-    Flag.UNDETERMINED: "The signal has fewer tones, or two that look alike at this delay; use fewer tones.",
-    Flag.UNCERTAIN: (
-        "Noise, a bias or another tone may move a frequency by a tenth of itself or of the distance to the next one; "
-        "use a prefilter, more tones or a longer record."
-    ),
-    Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
-    Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
-    Flag.INCONSISTENT: (
-        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one (use a "
-        "smaller h), or the estimate lags behind a change."
-    ),
-    Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +55,18 @@ class FrequencyTrack(ShownAsTable):
         return np.asarray(self.flags == 0)
 
     def reasons(self, row: int) -> tuple[str, ...]:
-        """Say why a row must not be trusted: one sentence for each flag."""
+        """Say why a row must not be trusted.
+
+        Parameters
+        ----------
+        row : int
+            Number of the row.
+
+        Returns
+        -------
+        tuple of str
+            One sentence for each flag.
+        """
         return Flag(int(self.flags[row])).sentences
 
 
@@ -118,6 +86,10 @@ class FrequencyEstimator(ABC):
     """
 
     kind: ClassVar[str]
+    #: Whether one estimate stands for the whole record: its track has one row, at the last sample.
+    whole_record: ClassVar[bool] = False
+    #: Whether the flag CHANGED is an alarm, so that false alarms are counted.
+    raises_alarms: ClassVar[bool] = False
 
     tones: int
 
@@ -148,8 +120,49 @@ class FrequencyEstimator(ABC):
             If the options do not fit to the sampling interval.
         """
 
+    def check(self, count: int, interval: float) -> None:  # noqa: B027 - most estimators take any record
+        """Refuse records that the options do not fit to, before there are any.
+
+        Parameters
+        ----------
+        count : int
+            Number of samples.
+        interval : float
+            Sampling interval [s].
+
+        Raises
+        ------
+        DataError
+            If the options do not fit, or the samples are too few; ``DataError(message, "h")`` blames the option h.
+        """
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say what is allowed but unwise on a signal: the name of an option, and a sentence about it.
+
+        Parameters
+        ----------
+        interval : float
+            Sampling interval [s].
+        highest : float
+            Highest frequency of the signal [rad/s].
+
+        Yields
+        ------
+        tuple of str
+            The option and the sentence.
+        """
+        yield from ()
+
     def keep_one_for_each(self, name: str, unit: str) -> None:
-        """Check an option that holds one positive number for each tone, and keep it as a tuple."""
+        """Check an option that holds one positive number for each tone, and keep it as a tuple.
+
+        Parameters
+        ----------
+        name : str
+            The option.
+        unit : str
+            Its unit.
+        """
         values = getattr(self, name)
         if values is None:
             return

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
 
-# The first bits of ctid_cli.frequency.base.Flag; a test compares them.
+# The first bits of ctid_cli.frequency.flags.Flag; a test compares them.
 STARTING, GAP, CHANGED, UNDETERMINED = 1, 2, 4, 8
 UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = 16, 32, 64, 128
 

@@ -46,7 +46,6 @@ BLOCK = 1 << 15
 class DelayRegression(FrequencyEstimator):
     """Options of an estimator on the delay regression."""
 
-    online: ClassVar[bool] = True
     #: Further options that say for how long samples are kept [s].
     _kept: ClassVar[tuple[str, ...]] = ()
 

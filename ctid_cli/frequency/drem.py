@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.base import Flag
 from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, gradient_steps, judge_rows, slide
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
 
 

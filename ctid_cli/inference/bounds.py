@@ -139,8 +139,8 @@ def accuracy_of_records(
     if not np.isfinite(covariance).all():
         raise DataError("the data would not determine the parameters, even without noise")
     parameters = ParameterAccuracy.of(form.model, covariance, form.zeros, form.delay_from is not None)
-    # Instruments other than the input itself are not the best there are, nor is least squares where there are outliers.
-    best = form.instruments == "open_loop" and noise.gaussian
+    # Instruments other than the input itself are not the best there are.
+    best = form.instruments == "open_loop"
     start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
     if noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
@@ -160,8 +160,6 @@ def _record_covariance(
         u = simulate_loop(system, loop.controller, loop.reference, 0.0, interval, loop.enters).u
         signal = HeldSignal(record.t, u)
     psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
-    # Nothing is learnt from outputs that are missing; the others keep their distances.
-    psi = psi * record.valid[:, None]
     if form.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + form.delay_from]
     lags = np.arange(psi.shape[0] if noise.coloured else 1)

@@ -21,9 +21,8 @@ from ctid_cli.inference.spectral_methods import (
     welch,
 )
 from ctid_cli.signals.checks import require_choice, require_integer
-from ctid_cli.signals.held import Hold
+from ctid_cli.signals.held import REGULARITY, Hold
 from ctid_cli.signals.record import Record, named
-from ctid_cli.signals.regularity import REGULARITY
 from ctid_cli.signals.treatment import ResponseMethod
 
 #: How a response was estimated.

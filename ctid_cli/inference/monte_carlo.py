@@ -12,7 +12,8 @@ order statistic to another.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -241,25 +242,26 @@ class Measure:
     #: ``""`` stands for that of the parameter, ``^2`` for its square.
     unit: str
     #: What it is computed from: errors of parameters, a distance between models, or what an estimate has one of.
-    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent"]
+    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent", "custom_measures"]
     compute: Callable[..., Measured]
     #: Whether only estimates with a standard error count.
     of_widths: bool = False
 
 
-def requested(name: str) -> Measure:
+def requested(name: str, custom: Mapping[str, Measure] = MappingProxyType({})) -> Measure:
     """A measure by its name: ``rmse``, ``rmse:delay`` of one parameter, ``rmse:poles``, or ``response:1.5`` [rad/s]."""
     base, colon, argument = name.partition(":")
-    if base not in MEASURES:
-        hint = did_you_mean(base, MEASURES) or "."
-        raise UsageError(f"there is no measure {base!r}{hint} Known: {', '.join(MEASURES)}")
-    measure = MEASURES[base]
+    known = {**MEASURES, **custom}
+    if base not in known:
+        hint = did_you_mean(base, known) or "."
+        raise UsageError(f"there is no measure {base!r}{hint} Known: {', '.join(known)}")
+    measure = known[base]
     if base == "response":
         try:
-            known = 0.0 < float(argument) < math.inf
+            usable = 0.0 < float(argument) < math.inf
         except ValueError:
-            known = False
-        if not known:
+            usable = False
+        if not usable:
             raise UsageError(f"{name!r} needs a frequency [rad/s] above zero, such as response:1.5")
     elif colon and (measure.source != "errors" or not argument):
         raise UsageError(f"{name!r} is about the estimate as a whole; ask for {base}")
@@ -305,6 +307,9 @@ class Until:
     rmse_relative: float | None = None
 
 
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
 class Replications(NamedTuple):
     """What an estimator gave on the first data sets of a data cell, in their order."""
 
@@ -312,41 +317,53 @@ class Replications(NamedTuple):
     hits: BoolArray | None
     #: Errors of the parameters; NaN where there is no value, shape (R, p).
     errors: Array
+    #: Names of the parameters, and of the estimator with its swept options and its start.
+    parameters: Sequence[str] = ()
+    estimator: str = ""
+    options: Mapping[str, Any] = _NOTHING
+    start: str = "none"
 
     def first(self, count: int) -> "Replications":
-        """The same on fewer data sets."""
-        return Replications(None if self.hits is None else self.hits[:count], self.errors[:count])
+        """Return the same on fewer data sets."""
+        return self._replace(hits=None if self.hits is None else self.hits[:count], errors=self.errors[:count])
 
 
-class HalfWidth(NamedTuple):
-    """How well a measure is known."""
+@dataclass(frozen=True)
+class Widest:
+    """The measure of a data cell whose interval is farthest from what is asked for."""
 
-    #: Which of the estimators.
-    estimator: int
-    #: Column of the errors; None for the percentage.
-    parameter: int | None
-    #: Half-width of its 95 % interval, [percentage points] or [-]; None where the data sets do not tell.
-    value: float | None
+    estimator: str
+    #: Its swept options.
+    options: Mapping[str, Any]
+    start: str
+    #: ``percent`` or ``rmse``.
+    measure: str
+    parameter: str | None
+    #: Half-width of the 95 % interval, [percentage points] or as a fraction [-]; None where it is not known.
+    half_width: float | None
     #: The largest that is asked for.
     asked: float
 
     @property
     def excess(self) -> float:
         """Half-width over what is asked for; at most 1 where it is narrow enough."""
-        return math.inf if self.value is None else self.value / self.asked
+        return math.inf if self.half_width is None else self.half_width / self.asked
 
 
 @dataclass(frozen=True)
-class Decision:
-    """Whether the data sets of a data cell are enough."""
+class CellPrecision:
+    """How well a data cell is known, and whether its data sets are enough."""
 
+    #: Hash of the data cell, and its swept values.
+    cell: str
+    swept: Mapping[str, Any]
     #: ``enough``; ``open``, more are needed; ``at_most``, as many as are allowed and not precise enough.
     state: Literal["enough", "open", "at_most"]
-    #: End of the last finished block, and of the block that is needed.
+    #: Data sets at the end of the last finished block, and those that are needed as far as is known.
     finished: int
     needed: int
-    #: The widest interval at the end of the last finished block; None where there is none.
-    widest: HalfWidth | None
+    #: None before the end of the first block, and where there is nothing to measure.
+    widest: Widest | None
 
 
 def block_ends(at_most: int) -> Iterator[int]:
@@ -358,7 +375,9 @@ def block_ends(at_most: int) -> Iterator[int]:
     yield at_most
 
 
-def decide(until: Until, estimators: Sequence[Replications], at_most: int) -> Decision:
+def decide(
+    until: Until, estimators: Sequence[Replications], at_most: int, cell: str = "", swept: Mapping[str, Any] = _NOTHING
+) -> CellPrecision:
     """Look at the intervals at the end of each block, up to the first one that leaves none too wide.
 
     Data sets come in blocks. At the end of each the 95 % intervals of all measures of all estimators are looked at, and
@@ -374,26 +393,26 @@ def decide(until: Until, estimators: Sequence[Replications], at_most: int) -> De
     finished, widest = 0, None
     for end in block_ends(at_most):
         if stored < end:
-            return Decision("open", finished, end, widest)
+            return CellPrecision(cell, swept, "open", finished, end, widest)
         finished = end
-        widths = [
-            HalfWidth(k, *width) for k, one in enumerate(estimators) for width in _half_widths(until, one.first(end))
-        ]
+        widths = [width for one in estimators for width in _half_widths(until, one.first(end))]
         widest = max(widths, key=lambda width: width.excess, default=None)
         if widest is None or widest.excess <= 1.0:
-            return Decision("enough", end, end, widest)
-    return Decision("at_most", finished, finished, widest)
+            return CellPrecision(cell, swept, "enough", end, end, widest)
+    return CellPrecision(cell, swept, "at_most", finished, finished, widest)
 
 
-def _half_widths(until: Until, found: Replications) -> Iterator[tuple[int | None, float | None, float]]:
-    """Parameter, half-width and what is asked for; parameters that have no value in any data set do not count."""
+def _half_widths(until: Until, found: Replications) -> Iterator[Widest]:
+    """Yield how well each measure is known; parameters that have no value in any data set do not count."""
+    of = found.estimator, found.options, found.start
     if until.percent_half_width is not None and found.hits is not None:
         low, high = wilson_interval(int(found.hits.sum()), found.hits.size)
-        yield None, 100 * (high - low) / 2, until.percent_half_width
+        yield Widest(*of, "percent", None, 100 * (high - low) / 2, until.percent_half_width)
     if until.rmse_relative is not None:
         counted = complete(found.errors)
+        names = found.parameters or tuple(map(str, range(counted.shape[1])))
         for k in np.flatnonzero(counted.any(axis=0)).tolist():
-            yield k, _relative(found.errors[counted[:, k], k]), until.rmse_relative
+            yield Widest(*of, "rmse", names[k], _relative(found.errors[counted[:, k], k]), until.rmse_relative)
 
 
 def _relative(errors: Array) -> float | None:

@@ -62,17 +62,6 @@ _FREQUENCY = """\
 }"""
 
 
-_ESPRIT = """\
-@article{roy1989,
-  author  = {Roy, R. and Kailath, T.},
-  title   = {{ESPRIT} -- estimation of signal parameters via rotational invariance techniques},
-  journal = {IEEE Transactions on Acoustics, Speech, and Signal Processing},
-  volume  = {37},
-  pages   = {984--995},
-  year    = {1989},
-  doi     = {10.1109/29.32276},
-}"""
-
 _TONES = """\
 @article{rife1976,
   author  = {Rife, D. C. and Boorstyn, R. R.},
@@ -84,29 +73,10 @@ _TONES = """\
   doi     = {10.1002/j.1538-7305.1976.tb02941.x},
 }"""
 
-_MIXING = """\
-@article{aranovskiy2017,
-  author  = {Aranovskiy, S. and Bobtsov, A. and Ortega, R. and Pyrkin, A.},
-  title   = {Performance enhancement of parameter estimators via dynamic regressor extension and mixing},
-  journal = {IEEE Transactions on Automatic Control},
-  volume  = {62},
-  pages   = {3546--3550},
-  year    = {2017},
-  doi     = {10.1109/TAC.2016.2614889},
-}"""
 
-#: Whose work the methods of ``ctid track`` are.
-_OF_TRACKS = {
-    "tone_windows": _TONES,
-    "esprit": _ESPRIT,
-    "nonlinear_least_squares": _TONES,
-    **dict.fromkeys(("drem_window", "drem_finite_time", "drem_gradient"), _MIXING),
-}
-
-
-def track_bibtex(method: str) -> str:
-    """Entries for a track that was found by a method."""
-    return "\n\n".join([_CTID.format(version=ctid_cli.__version__), *filter(None, [_OF_TRACKS.get(method)])])
+def track_bibtex() -> str:
+    """Entries for a track of a recorded signal."""
+    return "\n\n".join([_CTID.format(version=ctid_cli.__version__), _TONES])
 
 
 def bibtex(result: Identification) -> str:

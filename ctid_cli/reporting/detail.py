@@ -80,6 +80,7 @@ def _fitted(found: FoundEstimate) -> list[list[str]]:
     facts = [("fit", f"{number(row['fit_percent'])} % of the data it was estimated from")]
     if row.get("validation_fit_percent") is not None:
         facts.append(("", f"{number(row['validation_fit_percent'])} % of the validation part"))
+    facts += [(name, number(value)) for name, value in (row.get("custom_measures") or {}).items()]
     facts += [
         ("cost", f"{number(row['cost'])} (mean squared output error, output unit^2)"),
         ("iterations", number(row["iterations"])),
@@ -115,30 +116,28 @@ def _redo_command(found: FoundEstimate, out: Path) -> str:
 def repeat(found: FoundEstimate, *, allow_code: bool = False) -> Repeated:
     """Make the data set of an estimate and the estimate once more."""
     from ctid_cli.running.plan import build_plan
-    from ctid_cli.simulation.frequency_measures import FrequencyFit, SignalDataSet
+    from ctid_cli.simulation.frequency_measures import SignalDataSet
     from ctid_cli.specification.load import spec_from_canonical
 
     row = found.row
     folder = spec_folder(found.folder)
     plan = build_plan(spec_from_canonical(found.stored.manifest["spec"], folder, allow_code=allow_code))
-    for task in plan.tasks():
-        cell = plan.data_cells[task.cell]
-        if (cell.hash, task.replicate) != (row["cell"], row["replicate"]):
-            continue
-        for key, estimator, start in plan.keys(task):
-            if key.id == row["id"]:
-                data = cell.dataset(task.replicate)
-                drawn = start.draw(found.stored.manifest["seed"], task.replicate, data.true_model)
-                fit = estimator.estimator.prepare(data.record).fit(drawn)
-                if isinstance(fit, FrequencyFit) and isinstance(data, SignalDataSet):
-                    sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])
-                    then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
-                    return Repeated([], _difference(then, now))
-                model = data.result_of(fit, drawn, None)
-                then, now = _coefficients(row), _coefficients(plain(model))
-                difference = _difference(then, now) if then.keys() <= now.keys() else float("inf")
-                return Repeated([plain(asdict(entry)) for entry in fit.history], difference)
-    raise MismatchError(f"the stored specification of {row['experiment']} does not describe estimate {row['id']}")
+    cells = [number for number, cell in enumerate(plan.data_cells) if cell.hash == row["cell"]]
+    wanted = [one for number in cells[:1] for one in plan.keys(number, row["replicate"]) if one[0].id == row["id"]]
+    if not wanted:
+        raise MismatchError(f"the stored specification of {row['experiment']} does not describe estimate {row['id']}")
+    key, cell, start = wanted[0]
+    data = plan.data_cells[cells[0]].dataset(key.replicate)
+    drawn = start.draw(found.stored.manifest["seed"], key.replicate, data.true_model)
+    fit = cell.estimator.prepare(data.record).fit(drawn)
+    if isinstance(data, SignalDataSet):
+        sides = (row.get("measures") or {}, data.result_of(fit, None, None)["measures"])
+        then, now = ({k: v for k, v in side.items() if k.startswith("omega")} for side in sides)
+        return Repeated([], _difference(then, now))
+    model = data.result_of(fit, drawn, None)
+    then, now = _coefficients(row), _coefficients(plain(model))
+    difference = _difference(then, now) if then.keys() <= now.keys() else float("inf")
+    return Repeated([plain(asdict(entry)) for entry in fit.history], difference)
 
 
 def _coefficients(model: Mapping[str, Any]) -> dict[str, float | None]:

@@ -25,7 +25,6 @@ from ctid_cli.running.plan import Plan
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
-from ctid_cli.signals.send_on_delta import SendOnDelta
 from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
 
@@ -46,10 +45,6 @@ def expected_accuracy(
     estimated = _unbiased(source, estimator)
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
-    if not isinstance(source.noise, Noise):
-        raise DataError("theory is given here for noise with a covariance from sample to sample: white, ARMA, outliers")
-    if isinstance(source.sampling, SendOnDelta):
-        raise DataError("the instants of the samples depend on the noise, and theory is given here for others only")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
     why_not = _why_no_limit(source, estimated)
@@ -161,8 +156,6 @@ def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
         return "the clock is irregular"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
         return f"the {name} is not white Gaussian noise held from sample to sample"
-    if source.recorder.missing:
-        return "outputs are missing"
     if sampling.samples < LONG:
         return f"there are fewer than {LONG} samples"
     if not estimated.model.is_stable and (source.loop is None or isinstance(estimated.model, TransferFunction)):

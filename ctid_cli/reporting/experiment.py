@@ -19,7 +19,7 @@ from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.tables import experiment_report, notes_of
 from ctid_cli.running import engine
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
+from ctid_cli.running.trial import load_tried
 from ctid_cli.storage.estimates import read_stored
 from ctid_cli.storage.manifest import planned_count
 
@@ -223,15 +223,11 @@ def run_experiment(
     >>> results.estimates.groupby("estimator").delay.std()  # doctest: +SKIP
     """
     given = spec if isinstance(spec, Mapping) else Path(spec)
-    plan = build_plan(load_spec(given, overrides, allow_code=allow_code), runs)
+    plan = build_plan(load_tried(given, overrides, allow_code=allow_code), runs)
     for warning in plan.spec.warnings:
         warnings.warn(warning, stacklevel=2)
     folder = Path(out) / plan.experiment
-
-    def warn(text: str) -> None:
-        warnings.warn(text, stacklevel=5)
-
-    summary = engine.run_experiment(plan, folder, jobs=jobs, warn=warn, fresh=fresh, allow_mixed=allow_mixed)
+    summary = engine.run_experiment(plan, folder, jobs=jobs, fresh=fresh, allow_mixed=allow_mixed)
     if summary.exit_code == MachineError.exit_code:
         raise summary.machine_error()
     return read_results(folder)

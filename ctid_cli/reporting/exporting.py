@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.estimate import as_object
 from ctid_cli.storage import columns
+from ctid_cli.storage.column_arrays import ROWS
 from ctid_cli.storage.estimates import Estimates, export_rows
-from ctid_cli.storage.export import ROWS
 from ctid_cli.storage.manifest import swept_names
 
 if TYPE_CHECKING:

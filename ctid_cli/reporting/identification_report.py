@@ -19,7 +19,8 @@ from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
 from ctid_cli.reporting.loss_report import loss_object, loss_text
 from ctid_cli.signals.band_limited import band_limited_doubt
-from ctid_cli.signals.measurement import ROLES, Measurement
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.table import ROLES
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.text import warning_lines, wrapped
 

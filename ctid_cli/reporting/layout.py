@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from ctid_cli.text import count as count  # for those who draw
 from ctid_cli.text import wrapped
 
 Lines = Sequence[Sequence[str]]
@@ -158,11 +159,6 @@ def _to_digits(value: float, digits: int) -> str:
     """A number with its trailing zeros: 0.0400, 2.0, 26, 130; as 1.3e+07 where it has many digits that say nothing."""
     text = f"{value:#.{digits}g}".removesuffix(".")
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
-
-
-def count(n: int, noun: str) -> str:
-    """A number of things."""
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def rate(speed: float) -> str:

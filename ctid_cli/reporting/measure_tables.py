@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ctid_cli.inference.monte_carlo import MEASURES, requested
+from ctid_cli.inference.monte_carlo import Measure
 from ctid_cli.reporting.layout import Report, Table, delay_label, number, with_error
-from ctid_cli.reporting.measures import counted_in, measure_rows
+from ctid_cli.reporting.measures import counted_in, measure_of, measure_rows
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_blocks import NOT_RUN, setting_text, setting_title
@@ -19,12 +19,12 @@ def measure_report(results: Results, names: Sequence[str], notes: Sequence[str] 
     rows = measure_rows(results, names)
     tables: dict[str, list[str]] = {}
     for name in dict.fromkeys(names):
-        source = requested(name).source
+        source = measure_of(name, results).source
         kind = source if source in ("errors", "status") else "estimates"
         tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
     blocks = [[_table(results, [row for row in rows if row["measure"] in own], own)] for own in tables.values()]
-    bases = dict.fromkeys(name.partition(":")[0] for name in names)
-    meanings = "; ".join(f"{name}: {MEASURES[name].meaning}" for name in bases)
+    told = {name.partition(":")[0]: measure_of(name, results).meaning for name in names}
+    meanings = "; ".join(f"{name}: {meaning}" for name, meaning in told.items())
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if any(row["without_value"] for row in rows):
         foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
@@ -50,14 +50,15 @@ def _table(results: Results, rows: Sequence[Row], names: Sequence[str]) -> Table
         body.append(cells + ([str(some["without_value"])] if lacking else []))
     titles = {"initial_delay": "initial delay", "parameter": "status" if "failures" in names else "parameter"}
     header = [titles.get(key) or setting_title(key) for key in keys]
-    header += [*map(_title, names), "n", "failed", *(["no value"] if lacking else [])]
+    header += [_title(name, measure_of(name, results)) for name in names]
+    header += ["n", "failed", *(["no value"] if lacking else [])]
     return Table(header, body, "l" * len(keys) + "r" * (len(header) - len(keys)))
 
 
-def _title(name: str) -> str:
+def _title(name: str, measure: Measure) -> str:
     """A measure with its unit; one in the unit of its parameter has none."""
-    unit = requested(name).unit
-    return f"{name} [{unit}]" if unit in ("%", "s") else name
+    of_parameter = measure.source == "errors" and measure.unit != "%"
+    return name if of_parameter or measure.unit == "-" else f"{name} [{measure.unit}]"
 
 
 def _cell(row: Row | None, n: int) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, requested
+from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, quantile, requested
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.model_measures import distance_of, distances, pole_estimates, system_of
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances
@@ -47,7 +47,7 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
     for name in names:
         _require_measurable(name, results)
     groups = results.groups()
-    of_errors = any(requested(name).source == "errors" for name in names)
+    of_errors = any(measure_of(name, results).source == "errors" for name in names)
     estimates = {one.group: one for one in estimates_by_group(results)} if of_errors else {}
     known = {status.decode() for status in np.unique(results.stored.column("status")).tolist()}
     statuses = sorted(known - SUCCESSES) or ["FAILED"]
@@ -60,7 +60,7 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
             members = members.chosen(members.column("replicate") < first)
         counts = {"n": len(members), "failed": int(members.failures.sum())}
         for name in dict.fromkeys(names):
-            measure, argument = requested(name), name.partition(":")[2]
+            measure, argument = measure_of(name, results), name.partition(":")[2]
             found: Iterable[Found]
             if not members:
                 found = [(None, Measured(), measure.unit, 0)]
@@ -74,7 +74,7 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
                     own = pole_estimates(own, system_of(cells[group.cell], name), members)
                 found = _of_errors(measure, own, argument, bounds.get(group, {}))
             else:
-                found = _of_estimates(measure, members, statuses)
+                found = _of_estimates(name, measure, members, statuses)
             rows += [
                 labels
                 | {"parameter": parameter, "measure": name, "unit": unit, **measured._asdict()}
@@ -87,20 +87,36 @@ def measure_rows(results: Results, names: Sequence[str], first: int | None = Non
 
 def counted_in(row: Row) -> int:
     """Return the number of data sets that the value of a row is computed from."""
-    left_out = 0 if requested(row["measure"]).source in ("distance", "fresh_fit_percent") else row["without_value"]
-    return int(row["n"] - left_out)
+    measure = MEASURES.get(row["measure"].partition(":")[0])
+    infinite = measure is not None and measure.source in ("distance", "fresh_fit_percent")
+    return int(row["n"] - (0 if infinite else row["without_value"]))
+
+
+def measure_of(name: str, results: Results) -> Measure:
+    """Return the measure that a name asks for: one of ctid's, or a custom one of the specification."""
+    contents = results.manifest["data_cells"][0]["content"].get("custom_measures") or {}
+    custom = {
+        own: Measure(f"median of {content['kind']}", content["unit"], "custom_measures", quantile)
+        for own, content in contents.items()
+    }
+    return requested(name, custom)
+
+
+def asked_measures(results: Results) -> list[str]:
+    """Return the names of the measures that the specification asks for."""
+    return [one if isinstance(one, str) else one["name"] for one in results.settings.get("measures") or ()]
 
 
 def default_measures(results: Results) -> Sequence[str]:
     """What the specification asks for; bias and root mean square error where it has no success rule; else nothing."""
-    asked: Sequence[str] = results.settings.get("measures") or ()
+    asked = asked_measures(results)
     measurable = not results.settings.get("success") and any(map(true_values, results.manifest["data_cells"]))
     return asked or (DEFAULT if measurable else ())
 
 
 def _require_measurable(name: str, results: Results) -> None:
     """Refuse a measure of what these results do not have."""
-    measure, settings = requested(name), results.settings
+    measure, settings = measure_of(name, results), results.settings
     true = [name for cell in results.manifest["data_cells"] for name in true_values(cell)]
     argument = name.partition(":")[2]
     if measure.source == "errors" and not true:
@@ -116,7 +132,7 @@ def _require_measurable(name: str, results: Results) -> None:
     if measure.source == "converged" and not settings.get("success"):
         reason = "needs a rule by which an estimate counts as converged, and the specification has no success section"
         raise UsageError(f"{results.experiment}: {name} {reason}; use {', '.join(DEFAULT)}")
-    if name == "fresh_fit" and name not in (settings.get("measures") or ()):
+    if name == "fresh_fit" and name not in asked_measures(results):
         advice = "add 'measures: [fresh_fit]' to the specification, and run it again"
         raise UsageError(f"{results.experiment}: {name} is computed while the experiment runs; {advice}")
 
@@ -144,7 +160,14 @@ def parameter_unit(name: str, names: Sequence[str]) -> str:
     return Units().of_submodel(name) if re.fullmatch(r"g\d+_[ab]\d+", name) else "-"
 
 
-def _of_estimates(measure: Measure, rows: Estimates, statuses: Sequence[str]) -> Iterator[Found]:
+def _custom_values(name: str, rows: Estimates) -> Array:
+    """Finite values of a custom measure."""
+    names = rows.export.parts("custom_measures") if rows.has("custom_measures") else []
+    values = rows.column("custom_measures")[:, names.index(name)] if name in names else np.zeros(0)
+    return np.asarray(values[np.isfinite(values)])
+
+
+def _of_estimates(name: str, measure: Measure, rows: Estimates, statuses: Sequence[str]) -> Iterator[Found]:
     """A measure of what an estimate has one of."""
     if measure.source == "status":
         found = rows.column("status")
@@ -152,7 +175,9 @@ def _of_estimates(measure: Measure, rows: Estimates, statuses: Sequence[str]) ->
             yield status, measure.compute(found == status.encode()), measure.unit, 0
         return
     values: Array
-    if measure.source == "converged":
+    if measure.source == "custom_measures":
+        values = _custom_values(name, rows)
+    elif measure.source == "converged":
         values = np.zeros(0, dtype=bool) if rows.converged is None else rows.converged  # type: ignore[assignment]
     else:
         values = rows.column(measure.source) if rows.has(measure.source) else np.zeros(0)

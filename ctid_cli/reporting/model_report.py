@@ -16,7 +16,7 @@ from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import Table, number, percent, picked
-from ctid_cli.signals.measurement import MeasuredInput, Measurement, read_measurement, read_table
+from ctid_cli.signals.measurement import MeasuredInput, Measurement, open_table, read_measurement
 from ctid_cli.storage.fit_file import read_fit
 from ctid_cli.text import listed, wrapped
 
@@ -86,8 +86,9 @@ def record_for(
     stop: float | None = None,
 ) -> Measurement:
     """A record to look at models with: the columns of their own record where the file has them and none are named."""
+    names: dict[str, Any]
     own, names = models[0].columns, {"time": time, "input": input, "output": output}
-    if not any(names.values()) and set(own.values()) <= set(read_table(file, "export it as .csv").names):
+    if not any(names.values()) and set(own.values()) <= set(open_table(file).names):
         names = {role: own[role] for role in names}
     found = read_measurement(file, **names, hold=hold or models[0].hold, start=start, stop=stop)
     require_units(found.record.name, models[0], found.time_unit, found.input_unit, found.output_unit)

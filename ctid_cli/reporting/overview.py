@@ -6,10 +6,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.reporting.layout import Table, number, picked, rate
 from ctid_cli.reporting.precision_words import precision_table
 from ctid_cli.reporting.results import out_option
-from ctid_cli.running.precision import CellPrecision
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.status import ExperimentStatus
 

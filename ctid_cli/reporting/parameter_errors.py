@@ -161,7 +161,8 @@ def least_covariances(results: Results, groups: Iterable[Group]) -> dict[Group, 
 def readable_plan(results: Results) -> Plan | None:
     """The plan, unless it names code, which is not run to read results, or is of another version."""
     try:
-        return build_plan(spec_from_canonical(results.settings))
+        # Custom measures are stored, and no part of the theory.
+        return build_plan(spec_from_canonical({**results.settings, "measures": None}))
     except (CtidError, ValueError):
         return None
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ctid_cli.reporting.layout import Table, count, number
 
 if TYPE_CHECKING:
-    from ctid_cli.running.precision import CellPrecision, Widest
+    from ctid_cli.inference.monte_carlo import CellPrecision, Widest
 
 #: Data cells that a summary lists.
 LISTED = 5
@@ -80,6 +80,5 @@ def _with_unit(half_width: float, widest: Widest) -> str:
 
 
 def _excess(cell: CellPrecision) -> float:
-    widest = cell.widest
-    assert widest is not None
-    return float("inf") if widest.half_width is None else widest.half_width / widest.asked
+    assert cell.widest is not None
+    return cell.widest.excess

@@ -10,8 +10,8 @@ from ctid_cli.canonical import plain
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.layout import count, number
 from ctid_cli.reporting.order_proposal import Proposal
-from ctid_cli.signals.measurement import ROLES, USUAL_NAMES, Measurement
-from ctid_cli.signals.table import split_header
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.table import ROLES, USUAL_NAMES, split_header
 from ctid_cli.text import wrapped
 
 #: How the levels of findings are printed, the worst in capitals.

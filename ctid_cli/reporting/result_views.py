@@ -9,9 +9,6 @@ import numpy as np
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.base import FrequencyTrack
-from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.synchrophasor import SynchrophasorTrack
-from ctid_cli.frequency.synchrophasor_check import SynchrophasorCheck
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting import identification_plot, track_plot
@@ -20,27 +17,19 @@ from ctid_cli.reporting.figures.style import Picture, require_kind
 from ctid_cli.reporting.identification_report import derived_block, derived_of, parameters_of
 from ctid_cli.reporting.layout import Report, Table, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.synchrophasor_check_report import check_object, check_report
-from ctid_cli.reporting.synchrophasor_plot import synchrophasor_drawing
-from ctid_cli.reporting.synchrophasor_report import (
-    synchrophasor_block,
-    synchrophasor_table,
-    synchrophasor_warnings,
-)
 from ctid_cli.reporting.track_columns import flag_words
 from ctid_cli.reporting.track_report import tones_block
 from ctid_cli.reporting.track_summary import invalid_rows
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines
+from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from ctid_cli.reporting.experiment import ExperimentResults
 
-    Result: TypeAlias = (
-        Fit | Identification | FrequencyTrack | SynchrophasorTrack | SynchrophasorCheck | ExperimentResults
-    )
+    Result: TypeAlias = Fit | Identification | FrequencyTrack | ExperimentResults
 
 
 def summary(result: Result) -> str:
@@ -48,9 +37,8 @@ def summary(result: Result) -> str:
 
     Parameters
     ----------
-    result : Fit, Identification, FrequencyTrack, SynchrophasorTrack, SynchrophasorCheck or ExperimentResults
-        What an estimator, :func:`~ctid_cli.estimators.identification.identify`, a tracker, a measurement of
-        synchrophasors or an experiment found.
+    result : Fit, Identification, FrequencyTrack or ExperimentResults
+        What an estimator, :func:`~ctid_cli.estimators.identification.identify`, a tracker or an experiment found.
 
     Returns
     -------
@@ -86,7 +74,7 @@ def to_frame(result: Result) -> pd.DataFrame:
 
     Parameters
     ----------
-    result : Fit, Identification, FrequencyTrack, SynchrophasorTrack, SynchrophasorCheck or ExperimentResults
+    result : Fit, Identification, FrequencyTrack or ExperimentResults
         What was found.
 
     Returns
@@ -94,8 +82,7 @@ def to_frame(result: Result) -> pd.DataFrame:
     pandas.DataFrame
         Of a fit one row for each parameter: ``estimate``, ``standard_error``, ``relative_percent``, ``low``, ``high``,
         ``unit``, ``status``; of a track one row for each instant ``t``, with ``omega_1`` ..., ``frequency_1_hz`` ...,
-        ``valid`` and ``flags``, in words; of synchrophasors the columns of ``ctid track --pmu``, of their check one row
-        for each limit; of an experiment one row for each estimate, what ``ctid export`` writes.
+        ``valid`` and ``flags``, in words; of an experiment one row for each estimate, what ``ctid export`` writes.
 
     Raises
     ------
@@ -106,23 +93,17 @@ def to_frame(result: Result) -> pd.DataFrame:
 
     if isinstance(result, FrequencyTrack):
         return _frame_of_track(result)
-    if isinstance(result, SynchrophasorTrack):
-        return pd.DataFrame(synchrophasor_table(result)).set_index("t")
-    if isinstance(result, SynchrophasorCheck):
-        return pd.DataFrame(check_object(result)["limits"])
     if isinstance(result, Fit | Identification):
         return pd.DataFrame([parameter_object(item) for item in _parameters(result)]).set_index("name")
     return _of_experiment(result).estimates
 
 
-def plot(
-    result: Identification | FrequencyTrack | SynchrophasorTrack | ExperimentResults, kind: str | None = None
-) -> Picture:
+def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str | None = None) -> Picture:
     """A figure of a result, as ``ctid fit``, ``ctid track`` and ``ctid figure`` draw it.
 
     Parameters
     ----------
-    result : Identification, FrequencyTrack, SynchrophasorTrack or ExperimentResults
+    result : Identification, FrequencyTrack or ExperimentResults
         What was found; a single fit does not hold the record that it would be drawn with,
         :func:`~ctid_cli.estimators.identification.identify` does.
     kind : str, optional
@@ -150,9 +131,6 @@ def plot(
     if isinstance(result, FrequencyTrack):
         require_kind(kind, get_args(track_plot.Kind)[:2])
         return track_plot.track_drawing(_with_columns(result), 0.0, None, "frequencies").picture()
-    if isinstance(result, SynchrophasorTrack):
-        require_kind(kind, ("synchrophasors",))
-        return synchrophasor_drawing(result, None, "synchrophasors").picture()
     if isinstance(result, Fit):
         what = f"a single {type(result).__name__} does not hold the record that it would be drawn with"
         raise UsageError(f"{what}; plot(identify(DelayProfile(...), [record])) does")
@@ -164,10 +142,6 @@ def _report(result: Any) -> Report:
     if isinstance(result, FrequencyTrack):
         track = _with_columns(result)
         return Report([tones_block(track), warning_lines(invalid_rows(track))[1:]])
-    if isinstance(result, SynchrophasorTrack):
-        return Report([synchrophasor_block(result), warning_lines(synchrophasor_warnings(result))[1:]])
-    if isinstance(result, SynchrophasorCheck):
-        return check_report(result)
     if not isinstance(result, Fit | Identification):
         return _of_experiment(result).report
     fit = result.fit if isinstance(result, Identification) else result
@@ -180,10 +154,10 @@ def _report(result: Any) -> Report:
     return Report(blocks)
 
 
-def _with_columns(track: FrequencyTrack) -> RecordTrack:
+def _with_columns(track: FrequencyTrack) -> Track:
     """A track as those of records are."""
     every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
-    return RecordTrack.of(track.t, track.frequencies, track.flags, every)
+    return Track.of(track.t, track.frequencies, track.flags, every)
 
 
 def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:
@@ -200,7 +174,7 @@ def _of_experiment(result: Any) -> ExperimentResults:
     from ctid_cli.reporting.experiment import ExperimentResults
 
     if not isinstance(result, ExperimentResults):
-        results = "a fit, an identification, a track of frequencies or synchrophasors, or the results of an experiment"
+        results = "a fit, an identification, a track of frequencies, or the results of an experiment"
         raise UsageError(f"{type(result).__name__!r} is no result; what can be shown is {results}")
     return result
 

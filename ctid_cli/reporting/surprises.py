@@ -156,7 +156,6 @@ class _Reasons:
             "the search for the delay can end at another minimum of the cost (starts.initial_delay)": (
                 finding.group.estimator in self.far and finding.group.start != "none"
             ),
-            "outputs are rounded, which theory does not count (recorder.resolution)": source.recorder.resolution,
             f"theory does not count what else is estimated ({option})": finding.kind == "rmse" and treated,
         }
         return [clause for clause, holds in clauses.items() if clause and holds]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.column_file import columns_bytes
+from ctid_cli.tones.track import Track
 
 #: Units of the columns of a tone, but for those of the signal's own unit.
 UNITS = {
@@ -26,7 +26,7 @@ def flag_words(flags: int) -> str:
     return " ".join(str(flag.name).lower() for flag in Flag if flags & flag)
 
 
-def track_table(track: RecordTrack, start: float) -> dict[str, NDArray[Any]]:
+def track_table(track: Track, start: float) -> dict[str, NDArray[Any]]:
     """Columns of the file of a track, those of one tone after those of another."""
     table: dict[str, NDArray[Any]] = {"t": start + track.t}
     turn = 2.0 * np.pi

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.spikes import without_spikes
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, Drawing, outline, plain
 from ctid_cli.reporting.track_residual import Spectra
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.residual import without_spikes
+from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,14 +31,14 @@ NAMED_LINES = 8
 BELOW = 30.0
 
 
-def highest_shown(track: RecordTrack, interval: float) -> float:
+def highest_shown(track: Track, interval: float) -> float:
     """Where the frequency axes end [Hz]."""
     frequencies = [*track.omega[np.isfinite(track.omega)].tolist(), *(line.omega for line in track.missing)]
     nyquist = 0.5 / interval
     return min(nyquist, BEYOND * max(frequencies) / TURN) if frequencies else nyquist
 
 
-def signal_drawing(signal: SampledSignal, track: RecordTrack) -> Drawing:
+def signal_drawing(signal: SampledSignal, track: Track) -> Drawing:
     """The signal over time, and its spectrogram."""
 
     def draw(figure: Figure) -> None:
@@ -66,7 +66,7 @@ def signal_drawing(signal: SampledSignal, track: RecordTrack) -> Drawing:
     return Drawing(8.0, 4.8, draw)
 
 
-def _spectrogram(samples: Array, interval: float, track: RecordTrack, top: float) -> tuple[Array, tuple[float, float]]:
+def _spectrogram(samples: Array, interval: float, track: Track, top: float) -> tuple[Array, tuple[float, float]]:
     """Levels [dB] over frequency, from 0 to `top` [Hz], and time, and where the latter begins and ends [s]."""
     size = min(_segment(samples.size, interval, track), samples.size)
     window = np.hanning(size + 2)[1:-1]
@@ -87,7 +87,7 @@ def _spectrogram(samples: Array, interval: float, track: RecordTrack, top: float
     return levels, (half, max(samples.size * interval - half, half + interval))
 
 
-def _segment(count: int, interval: float, track: RecordTrack) -> int:
+def _segment(count: int, interval: float, track: Track) -> int:
     """Samples in a segment: enough to tell the closest tones apart, not too many to see what moves."""
     middles = np.array(
         [np.median(column[np.isfinite(column)]) for column in track.omega.T if np.isfinite(column).any()]
@@ -99,7 +99,7 @@ def _segment(count: int, interval: float, track: RecordTrack) -> int:
     return int(np.clip(2.0 ** np.ceil(np.log2(wanted)), SHORTEST, max(SHORTEST, min(LONGEST, count // 8))))
 
 
-def spectra_drawing(spectra: Spectra, track: RecordTrack, unit: str | None, interval: float) -> Drawing:
+def spectra_drawing(spectra: Spectra, track: Track, unit: str | None, interval: float) -> Drawing:
     """Amplitude spectra of the signal and of what the tones leave, in which missing lines are marked."""
 
     def draw(figure: Figure) -> None:
@@ -122,7 +122,7 @@ def spectra_drawing(spectra: Spectra, track: RecordTrack, unit: str | None, inte
     return Drawing(8.0, 3.4, draw)
 
 
-def _mark_lines(axes: Any, track: RecordTrack) -> None:
+def _mark_lines(axes: Any, track: Track) -> None:
     label: str | None = "line that is missing"
     for k, line in enumerate(track.missing):
         axes.plot([line.omega / TURN], [line.amplitude], "v", color=MARK, markersize=7, label=label)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.figures.style import BAND, Drawing, plain, ramp, spread
+from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ LOGARITHMIC = 10.0
 HEADROOM = 1.1
 
 
-def track_drawing(track: RecordTrack, start: float, unit: str | None, title: str, kind: Kind | None = None) -> Drawing:
+def track_drawing(track: Track, start: float, unit: str | None, title: str, kind: Kind | None = None) -> Drawing:
     """A figure of a track: of all that it holds where no kind is given."""
     t, styles = start + track.t, ramp(track.omega.shape[1])[: track.omega.shape[1]]
     panels = min(max(len(styles), 1), MOST_PANELS) if len(styles) <= MOST_PANELS else 1
@@ -53,7 +53,7 @@ def track_drawing(track: RecordTrack, start: float, unit: str | None, title: str
     return Drawing(7.2, heights.get(alone or "tones", 2.8 + upper), draw)
 
 
-def _draw_all_frequencies(figure: Figure, grid: Any, track: RecordTrack, t: Array, styles: list[dict[str, Any]]) -> Any:
+def _draw_all_frequencies(figure: Figure, grid: Any, track: Track, t: Array, styles: list[dict[str, Any]]) -> Any:
     """Draw the tones into the first places of a grid, and return the first panel."""
     tones = len(styles)
     panels = tones if 0 < tones <= MOST_PANELS else 1
@@ -76,13 +76,13 @@ def _draw_all_frequencies(figure: Figure, grid: Any, track: RecordTrack, t: Arra
     return first
 
 
-def _middle(track: RecordTrack, k: int) -> float:
+def _middle(track: Track, k: int) -> float:
     omega = track.omega[:, k]
     omega = omega[track.valid[:, k]] if track.valid[:, k].any() else omega[np.isfinite(omega)]
     return float(np.median(omega)) if omega.size else 0.0
 
 
-def _draw_frequencies(axes: Any, track: RecordTrack, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
+def _draw_frequencies(axes: Any, track: Track, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
     frequencies = track.omega / (2.0 * np.pi)
     for k, style in lines:
         valid = track.valid[:, k]
@@ -103,7 +103,7 @@ def draw_band(axes: Any, t: Array, values: Array, errors: Array, valid: BoolArra
         axes.fill_between(t, low, high, color=color, alpha=0.25, linewidth=0.0)
 
 
-def _draw_amplitudes(axes: Any, track: RecordTrack, t: Array, unit: str | None, styles: list[dict[str, Any]]) -> None:
+def _draw_amplitudes(axes: Any, track: Track, t: Array, unit: str | None, styles: list[dict[str, Any]]) -> None:
     ends = []
     for k, style in enumerate(styles):
         values = np.where(track.valid[:, k], track.amplitudes[:, k], np.nan)

@@ -6,19 +6,15 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.canonical import plain
-from ctid_cli.frequency.record_track import USUAL_ACCURACY, Procedure, RecordTrack
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.track_summary import summarise, track_warnings
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.text import warning_lines, wrapped
+from ctid_cli.tones.constants import METHOD, USUAL_ACCURACY
+from ctid_cli.tones.track import Track
 
 
-def track_object(
-    signal: SampledSignal,
-    procedure: Procedure,
-    track: RecordTrack,
-    accuracy: float | None = None,
-) -> dict[str, Any]:
+def track_object(signal: SampledSignal, track: Track, accuracy: float | None = None) -> dict[str, Any]:
     """A track for ``ctid track --json``."""
     content = {
         "file": signal.file,
@@ -26,7 +22,7 @@ def track_object(
         "unit": signal.unit,
         "samples": int(signal.samples.size),
         **{name: getattr(signal, name) for name in ("missing", "interval", "start")},
-        "method": procedure.method,
+        "method": METHOD,
         "tones": summarise(track),
         "accuracy_hz": accuracy,
         "rows": int(track.t.size),
@@ -35,22 +31,22 @@ def track_object(
             {"frequency_hz": line.omega / (2.0 * math.pi), "share": line.share, "amplitude": line.amplitude}
             for line in track.missing
         ],
-        "warnings": track_warnings(track, procedure),
+        "warnings": track_warnings(track),
         "notes": list(signal.notes),
-        "chosen": [*procedure.reasons, *accuracy_words(track, accuracy)],
-        "settings": procedure.settings,
+        "chosen": [*track.reasons, *accuracy_words(track, accuracy)],
+        "settings": track.settings,
     }
     return dict(plain(content))
 
 
-def track_text(signal: SampledSignal, procedure: Procedure, track: RecordTrack, accuracy: float | None = None) -> str:
+def track_text(signal: SampledSignal, track: Track, accuracy: float | None = None) -> str:
     """A track for people, within 100 columns."""
     lines = [wrapped(signal_line(signal)), *(wrapped(note, "  ") for note in signal.notes)]
-    reasons = [*procedure.reasons, *accuracy_words(track, accuracy)]
+    reasons = [*track.reasons, *accuracy_words(track, accuracy)]
     lines += [wrapped(f"- {reason}", hanging="  ") for reason in reasons]
     if tones := tones_block(track, signal.start, signal.unit):
         lines += ["", Report([tones]).draw()]
-    return "\n".join([*lines, *warning_lines(track_warnings(track, procedure))])
+    return "\n".join([*lines, *warning_lines(track_warnings(track))])
 
 
 def signal_line(signal: SampledSignal) -> str:
@@ -61,7 +57,7 @@ def signal_line(signal: SampledSignal) -> str:
     return head + f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
 
 
-def accuracy_words(track: RecordTrack, accuracy: float | None) -> list[str]:
+def accuracy_words(track: Track, accuracy: float | None) -> list[str]:
     """What a standard error must not exceed; nothing where none is known."""
     if not np.isfinite(track.error).any():
         return []
@@ -69,7 +65,7 @@ def accuracy_words(track: RecordTrack, accuracy: float | None) -> list[str]:
     return [f"Accuracy: a row is valid only if the standard error of its frequency is at most {limit} (--accuracy HZ)."]
 
 
-def tones_block(track: RecordTrack, start: float = 0.0, unit: str | None = None) -> list[str | Table]:
+def tones_block(track: Track, start: float = 0.0, unit: str | None = None) -> list[str | Table]:
     """A table of the tones, and what its numbers are; columns of which nothing is known are left out."""
     tones = summarise(track)
     if not tones:

@@ -5,10 +5,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.left_over import left_over
-from ctid_cli.frequency.record_track import RecordTrack
-from ctid_cli.frequency.spectrum import PADDING
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.constants import SPECTRUM_PADDING
+from ctid_cli.tones.residual import left_over
+from ctid_cli.tones.track import Track
 
 
 class Spectra(NamedTuple):
@@ -28,12 +28,12 @@ class Spectra(NamedTuple):
     known: float
 
 
-def spectra_of(signal: SampledSignal, track: RecordTrack) -> Spectra | None:
+def spectra_of(signal: SampledSignal, track: Track) -> Spectra | None:
     """Spectra of a signal and of what its tones leave, where all tones are known; None where they never are."""
     left = left_over(signal.samples, signal.interval, track)
     if left is None:
         return None
     segment, known = left.size * signal.interval, ~left.unknown
-    hertz = np.arange(left.signal_spectrum.size) / (PADDING * segment)
+    hertz = np.arange(left.signal_spectrum.size) / (SPECTRUM_PADDING * segment)
     whole, rest = (float(np.sqrt(np.mean(each[known] ** 2))) for each in (left.signal, left.residual))
     return Spectra(hertz, left.signal_spectrum, left.residual_spectrum, segment, whole, rest, float(np.mean(known)))

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.flags import MEANINGS, Flag
-from ctid_cli.frequency.record_track import MOST_ASKED, MissingLine, Procedure, RecordTrack
 from ctid_cli.reporting.layout import count
 from ctid_cli.text import listed
+from ctid_cli.tones.constants import MOST_ASKED
+from ctid_cli.tones.track import MissingLine, Track
 
 #: A smaller share of valid rows is worth a warning.
 MOSTLY_VALID = 0.9
@@ -23,7 +24,7 @@ MOST_TONES_NAMED = 4
 MOST_LINES = 5
 
 
-def summarise(track: RecordTrack) -> list[dict[str, Any]]:
+def summarise(track: Track) -> list[dict[str, Any]]:
     """Each tone over its valid rows; None where nothing is known.
 
     ``frequency_hz`` [Hz], ``omega`` [rad/s] and ``amplitude`` [signal unit] are medians, ``spread_hz`` is half the
@@ -34,7 +35,7 @@ def summarise(track: RecordTrack) -> list[dict[str, Any]]:
     return [_tone(track, k) for k in range(track.omega.shape[1])]
 
 
-def _tone(track: RecordTrack, k: int) -> dict[str, Any]:
+def _tone(track: Track, k: int) -> dict[str, Any]:
     valid, there = track.valid[:, k], track.there[:, k]
     omega, seen = track.omega[valid, k], track.t[there & np.isfinite(track.omega[:, k])]
     unknown = ("frequency_hz", "standard_error_hz", "spread_hz", "omega", "amplitude", "amplitude_error")
@@ -52,7 +53,7 @@ def _tone(track: RecordTrack, k: int) -> dict[str, Any]:
     return tone | {"valid_percent": 100.0 * float(valid.sum() / there.sum()) if there.any() else 0.0}
 
 
-def _error_of_mean(track: RecordTrack, errors: Array, k: int, unit: float = 1.0) -> float | None:
+def _error_of_mean(track: Track, errors: Array, k: int, unit: float = 1.0) -> float | None:
     """Standard error of the mean of a tone's valid rows, of which those with common samples share their errors.
 
     Rows that are read from stretches of length L, every D seconds, have the errors of D/L as many rows without common
@@ -66,17 +67,13 @@ def _error_of_mean(track: RecordTrack, errors: Array, k: int, unit: float = 1.0)
     return float(np.sqrt(np.sum(errors[known, k] ** 2 * common))) / n / unit
 
 
-def track_warnings(track: RecordTrack, procedure: Procedure) -> list[str]:
+def track_warnings(track: Track) -> list[str]:
     """What a reader must know before believing the numbers."""
-    if not track.omega.shape[1]:
-        return [*procedure.warnings, *missing_lines(track), NO_TONE]
-    share = invalid_rows(track)
-    if procedure.online and not track.valid.any():
-        share.append("Windows with samples on both sides of each instant show more of a record: leave --method out.")
-    return [*procedure.warnings, *missing_lines(track), *share]
+    rows = invalid_rows(track) if track.omega.shape[1] else [NO_TONE]
+    return [*track.warnings, *missing_lines(track), *rows]
 
 
-def missing_lines(track: RecordTrack) -> list[str]:
+def missing_lines(track: Track) -> list[str]:
     """One sentence on the lines that are left over, and what to type."""
     lines = track.missing
     if not lines:
@@ -93,7 +90,7 @@ def _line_words(line: MissingLine) -> str:
     return f"{line.omega / (2.0 * np.pi):.6g} Hz (amplitude {line.amplitude:.3g}{rows})"
 
 
-def invalid_rows(track: RecordTrack) -> list[str]:
+def invalid_rows(track: Track) -> list[str]:
     """How many rows are not valid, and why; nothing where nearly all are."""
     if (track.flags == track.flags[:, :1]).all():
         return list(_of_rows(track.flags[:, 0][track.there[:, 0]], "of the rows are", NONE_VALID))

@@ -1,4 +1,4 @@
-"""Running an experiment: compute what is missing, store it as it comes, seal it at the end.
+"""Running an experiment: compute what is missing, store it as it comes, export it at the end.
 
 The same call starts, resumes and re-verifies an experiment. Only this process writes; workers return results. An
 estimate is reported as done after the journal has it safely.
@@ -8,37 +8,38 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import MachineError, RefusedError, StorageError
+from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
-from ctid_cli.running.first_data import check_first_data, compile_kernels
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits, advice
 from ctid_cli.running.plan import Plan, current_origin
-from ctid_cli.running.precision import CellPrecision, as_needed, stored_precisions
+from ctid_cli.running.precision import as_needed, stored_precisions
 from ctid_cli.running.states import States
-from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopAt, StopRequest
-from ctid_cli.running.suspects import Course, GivenUp, Slow, Suspected
+from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopRequest
+from ctid_cli.running.suspects import NAMED, Course
 from ctid_cli.running.workers import LocalWorkers
+from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import FILE_NAME, Journal, open_journal
+from ctid_cli.storage.journal import Journal, JournalReader, open_journal
+from ctid_cli.storage.keeping import keep_readable as keep_readable_of
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.merge import keep_readable as keep_readable_of
+from ctid_cli.storage.sqlite_file import FILE_NAME
+from ctid_cli.text import count
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
 COMMIT_ESTIMATES = 200
-#: Estimates given up that are named at the end.
-CULPRITS = 3
 
 _EXIT_CODES = {"SIGINT": 130, "SIGTERM": 143, MACHINE: MachineError.exit_code}
 #: Exit code after any other stop.
@@ -58,7 +59,7 @@ class Workload(NamedTuple):
     at_most: int | None = None
 
     def __str__(self) -> str:
-        text = f"{_count(self.estimates, 'estimate')} of {_count(self.data_sets, 'data set')} to compute"
+        text = f"{count(self.estimates, 'estimate')} of {count(self.data_sets, 'data set')} to compute"
         text += f", {self.again} of them once more" if self.again else ""
         text += f", {self.reused} already stored" if self.reused else ""
         text += f", {self.left_aside} stored ones set aside" if self.left_aside else ""
@@ -79,10 +80,6 @@ class Progress(NamedTuple):
     message: str = ""
     #: How well the data cells are known, where a block of data sets has just been finished.
     precision: tuple[CellPrecision, ...] = ()
-
-
-def _ignore(progress: Progress) -> None:
-    """Take no notice."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +121,29 @@ class RunSummary:
         """Return what to say where the machine stood in the way."""
         text = f"{self.experiment}: the machine did not let estimates finish, {self.missing} are missing"
         if self.given_up:
-            more = ", …" if len(self.given_up) > CULPRITS else ""
-            text += f" ({', '.join(self.given_up[:CULPRITS])}{more})"
+            more = ", …" if len(self.given_up) > NAMED else ""
+            text += f" ({', '.join(self.given_up[:NAMED])}{more})"
         return MachineError(f"{text}: {self.hindrance}. What helps: {advice(self.hindrance)}. The same command goes on")
+
+
+def compile_kernels(plan: Plan) -> None:
+    """Compile the kernels that a plan needs, or load them from the cache on disk, so that no two workers do."""
+    from ctid_cli.estimation import compilation
+    from ctid_cli.signals.sampling import RegularSampling
+    from ctid_cli.simulation.components import CustomEstimation
+    from ctid_cli.simulation.frequency_measures import FrequencyEstimation, SignalSource
+
+    source, estimators = plan.data_cells[0].source, [cell.estimator for cell in plan.estimators]
+    if isinstance(source, SignalSource):
+        for estimator in estimators:
+            if isinstance(estimator, FrequencyEstimation):
+                estimator.compile(source.sampling.interval)
+        return
+    ours = [estimator for estimator in estimators if not isinstance(estimator, CustomEstimation)]
+    clocks = [(getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells]
+    # A clock that is not known before the data are read is taken as regular.
+    for regular, closed in {(isinstance(clock, RegularSampling | None), loop is not None) for clock, loop in clocks}:
+        compilation.compile_kernels(ours, regular=regular, closed=closed)
 
 
 def run_experiment(
@@ -134,31 +151,28 @@ def run_experiment(
     folder: Path,
     *,
     jobs: int | None = None,
-    progress: Callable[[Progress], object] = _ignore,
-    warn: Callable[[str], object] = warnings.warn,
+    progress: Callable[[Progress], object] = lambda progress: None,
     fresh: bool = False,
     keep_readable: bool = False,
     allow_mixed: bool = False,
-    stop: StopAt | None = None,
+    stop: StopRequest | None = None,
     retry: Collection[str] = (),
     dask: str | None = None,
     warm: Callable[[Plan], object] = compile_kernels,
 ) -> RunSummary:
-    """Compute the missing estimates of a plan and seal all of them.
+    """Compute the missing estimates of a plan and export all of them.
 
     They are computed by `jobs` processes of this machine, or by the workers of the dask scheduler at an address. Stored
     failures of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
     """
     begun = time.monotonic()
-    stopping = StopRequest(stop)
+    stopping = stop or StopRequest()
     origin, limits = current_origin(plan), Limits.of(plan.spec.canonical())
     limits.require_support()
     found = _look(plan, folder, origin, retry, limits, fresh=fresh, allow_mixed=allow_mixed)
-    missing = found.states.missing(found.plan)
-    if any(lacking.any() for lacking in missing):
+    if found.work.estimates:
         # Until workers are at work, a signal ends the process as it ends any other.
         warm(plan)
-        check_first_data(plan, found.states.jobs(found.plan, missing, {}), limits, warn)
     with ExitStack() as stack:
         workers: Any
         if dask is None:
@@ -179,14 +193,14 @@ def run_experiment(
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
         stack.callback(log.close)
+        kept = ""
         if moved is not None and keep_readable:
-            kept = keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)
-            warn(f"{plan.experiment}: {kept}")
+            kept = f"{keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)}"
         if found.state is None or log.state() != found.state:
-            found = _Found(as_needed(plan, log), States.read(log, retry, limits))
-        run = _Run(found, folder, log, origin, progress)
-        stack.callback(place.retract, folder)
-        run.start({"jobs": workers.count, "limits": asdict(limits)})
+            found = _found(plan, log, retry, limits)
+        run = _Run(found, folder, log, progress)
+        stack.callback(announcement.retract, folder)
+        run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
         run.compute(workers, limits, stopping)
         while not stopping() and run.needs_more():
             run.compute(workers, limits, stopping)
@@ -194,55 +208,43 @@ def run_experiment(
 
 
 class _Run:
-    """One run, from the first entry in the journal to the sealed file."""
+    """One run, from the first entry in the journal to ``runs.h5``."""
 
-    def __init__(
-        self,
-        found: _Found,
-        folder: Path,
-        log: Journal,
-        origin: Origin,
-        progress: Callable[[Progress], object],
-    ) -> None:
-        self.plan, self.states, _ = found
-        self.folder, self.log, self.origin, self.progress = folder, log, origin, progress
-        self.computed = self.done = self.total = self.failures = 0
-        self.given_up: tuple[str, ...] = ()
+    def __init__(self, found: _Found, folder: Path, log: Journal, progress: Callable[[Progress], object]) -> None:
+        self.plan, self.states, self.missing, self.work, _ = found
+        self.folder, self.log, self.progress = folder, log, progress
+        self.computed = self.done = self.failures = 0
+        self.total = self.work.data_sets
+        self.given_up: list[str] = []
         self.hindrance = ""
         self.precision: tuple[CellPrecision, ...] = ()
         #: Latest time of an estimate by data cell and estimator [s], and estimates left of the data sets in work.
         self.seconds: dict[tuple[str, str], float] = {}
         self.unfinished: dict[tuple[str, int], int] = {}
         self.started = now()
-        self._lay_out()
 
-    def _lay_out(self) -> None:
-        """Find what of the plan is to be computed."""
-        self.manifest = self.plan.manifest()
-        self.names = {part["hash"]: part["name"] for part in self.manifest["estimators"]}
-        self.missing = self.states.missing(self.plan)
-        self.work = _workload(self.plan, self.states, self.missing)
-        self.total = self.done + self.work.data_sets
-
-    def start(self, circumstances: dict[str, Any]) -> None:
+    def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
+        """Note the beginning of the run, and say what it has to do."""
         spec = self.plan.spec
-        canonical = canonical_text(spec.canonical())
         with _writing(self.folder):
-            for name, text in ((place.SPEC, spec.text), (place.CANONICAL, canonical)):
-                self.log.write_beside(name, text.encode())
+            self.log.write_beside(place.SPEC, spec.text.encode())
+            self.log.write_beside(place.CANONICAL, canonical_text(spec.canonical()).encode())
         info = session_info(spec.text, spec.folder) | circumstances
-        self.session = self.log.begin(self.manifest, self.origin, self.started, info)
+        self.session = self.log.begin(self.plan.manifest(), origin, self.started, info)
         self._tell(message=str(self.work))
+        if kept:
+            self._tell(message=kept)
 
     def needs_more(self) -> bool:
         """Return whether the finished block leaves data cells that are not known well enough; plan their next one."""
-        self.precision = stored_precisions(self.manifest, self.log)
+        self.precision = stored_precisions(self.plan.manifest(), self.log)
         needed = tuple(cell.needed for cell in self.precision)
         if needed in ((), self.plan.replicates):
             return False
         self.plan = self.plan.with_replicates(needed)
-        self._lay_out()
-        self.log.replan(self.manifest)
+        self.missing = self.states.missing(self.plan)
+        self.total = self.done + sum(int(lacking.sum()) for lacking in self.missing)
+        self.log.replan(self.plan.manifest())
         self._tell(precision=self.precision)
         return True
 
@@ -251,55 +253,34 @@ class _Run:
         batch: list[Outcome] = []
         since = time.monotonic()
         told = False
-        course = Course(self._jobs(), workers, limits, stopping)
-        with closing(course.events()) as events:
+        course = Course(self._jobs(), workers, limits, stopping, lambda message: self._tell(message=message))
+        with closing(course.outcomes()) as found:
             try:
-                for event in events:
+                for outcomes in found:
                     if stopping() and not told:
                         told = True
                         what = "waiting for what is in work; once more to stop at once"
                         self._tell(message=f"stopping ({stopping.reason}): {what}")
-                    if isinstance(event, list):
-                        batch += event
-                    elif event is not None:
-                        self._note(event, stopping)
+                    batch += outcomes
                     if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):
                         batch = self._commit(batch)
                         since = time.monotonic()
-                        if self.failures >= (stopping.at.failures or math.inf):
+                        if self.failures >= (stopping.failures or math.inf):
                             stopping.ask(TOO_MANY_FAILURES)
             except (MachineError, RefusedError):
                 # A cluster that is gone does not take with it what it has finished.
                 self._commit(batch)
                 raise
         self._commit(batch)
+        self.given_up += course.given_up
+        self.hindrance = course.hindrance or self.hindrance
+        if course.hopeless:
+            stopping.ask(MACHINE)
 
     def _jobs(self) -> Iterator[Job]:
         for job in self.states.jobs(self.plan, self.missing, self.seconds):
             self.unfinished[job.cell.hash, job.replicate] = len(job.wanted)
             yield job
-
-    def _note(self, event: Suspected | GivenUp | Slow, stopping: StopRequest) -> None:
-        """Tell of what is not a result."""
-        match event:
-            case Suspected():
-                what = f"{_count(len(event.keys), 'estimate')} again, each in a process of its own"
-                self._tell(message=f"a worker process died; computing {what}")
-            case Slow():
-                took = f"{self._name(event.key)} has been in work for {event.seconds / 60:.0f} min"
-                self._tell(message=f"{took}; limits.wall_seconds would end what takes longer than it says")
-            case GivenUp():
-                names = tuple(map(self._name, event.keys))
-                self.given_up += names
-                self.hindrance = event.reason
-                if names:
-                    what = f"{_count(len(names), 'estimate')} given up, not stored ({', '.join(names[:CULPRITS])})"
-                    self._tell(message=f"{what}: {event.reason}")
-                else:
-                    stopping.ask(MACHINE)
-
-    def _name(self, key: Key) -> str:
-        return f"{self.names[key.estimator_hash]} on replicate {key.replicate}"
 
     def _commit(self, batch: list[Outcome]) -> list[Outcome]:
         """Store estimates, then tell of them; nothing is left of the batch."""
@@ -321,33 +302,31 @@ class _Run:
         return []
 
     def _tell(self, **what: Any) -> None:
-        place.announce(self.folder, self.plan.experiment, self.started, self.done, self.total)
+        counts = self.done, self.total, self.states.stored
+        announcement.announce(self.folder, self.plan.experiment, self.started, *counts)
         self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        seal(self.folder, self.log)
+        """Write ``runs.h5``, and note how the run ended."""
+        write_runs(self.folder, self.log)
         counts = self.states.counts(self.plan)
         missing = counts.planned - counts.reused
         reason = reason or (MACHINE if self.given_up else None)
-        stopped, ended = now(), "finished" if not missing else reason or "unfinished"
-        told = {
-            "planned": counts.planned,
-            "reused": counts.reused - self.computed,
-            "computed": self.computed,
-            "failed": counts.failed,
-        }
-        self.log.end(self.session, stopped, ended)
+        self.log.end(self.session, now(), "finished" if not missing else reason or "unfinished")
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,
-            **told,
+            planned=counts.planned,
+            reused=counts.reused - self.computed,
+            computed=self.computed,
+            failed=counts.failed,
             left_aside=self.work.left_aside,
             mixed=len(self.log.origins()) > 1,
             moved_aside=moved,
             seconds=time.monotonic() - begun,
             stopped_by=reason if missing else None,
             precision=self.precision,
-            given_up=self.given_up,
+            given_up=tuple(self.given_up),
             hindrance=self.hindrance,
         )
 
@@ -357,24 +336,17 @@ def preview(
 ) -> Workload:
     """Return what a run would do, without doing or writing anything."""
     limits = Limits.of(plan.spec.canonical())
-    found = _look(plan, folder, current_origin(plan), retry, limits, fresh=fresh, allow_mixed=allow_mixed)
-    return _workload(found.plan, found.states, found.states.missing(found.plan))
-
-
-def _workload(plan: Plan, states: States, missing: Sequence[Any]) -> Workload:
-    counts = states.counts(plan)
-    stored = counts.reused + counts.again
-    data_sets, at_most = sum(int(lacking.sum()) for lacking in missing), plan.monte_carlo.get("at_most")
-    return Workload(
-        data_sets, counts.planned - counts.reused, counts.reused, counts.again, states.stored - stored, at_most
-    )
+    return _look(plan, folder, current_origin(plan), retry, limits, fresh=fresh, allow_mixed=allow_mixed).work
 
 
 class _Found(NamedTuple):
-    """A plan as far as it is decided by what is stored, and that."""
+    """A plan as far as it is decided by what is stored, that, and what is to be computed."""
 
     plan: Plan
     states: States
+    #: Of each data cell which replicates are to be computed.
+    missing: list[BoolArray]
+    work: Workload
     #: State of the journal that tells it.
     state: str | None = None
 
@@ -391,13 +363,27 @@ def _look(
 ) -> _Found:
     """Read what there is in a folder that a plan may be run into."""
     if fresh or not folder.exists():
-        return _Found(plan, States())
+        return _found(plan, None, retry, limits)
     with place.lock(folder, shared=True):
         place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
         with place.reading_journal(folder) as log:
-            if log is None:
-                return _Found(plan, States())
-            return _Found(as_needed(plan, log), States.read(log, retry, limits), log.state())
+            return _found(plan, log, retry, limits)
+
+
+def _found(plan: Plan, log: JournalReader | None, retry: Collection[str], limits: Limits) -> _Found:
+    """Return what of a plan is stored in a journal."""
+    states = States() if log is None else States.read(log, retry, limits)
+    plan = plan if log is None else as_needed(plan, log)
+    counts, missing = states.counts(plan), states.missing(plan)
+    work = Workload(
+        data_sets=sum(int(lacking.sum()) for lacking in missing),
+        estimates=counts.planned - counts.reused,
+        reused=counts.reused,
+        again=counts.again,
+        left_aside=states.stored - counts.reused - counts.again,
+        at_most=plan.monte_carlo.get("at_most"),
+    )
+    return _Found(plan, states, missing, work, None if log is None else log.state())
 
 
 @contextmanager
@@ -407,7 +393,3 @@ def _writing(folder: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or error
         raise StorageError(f"{folder} cannot be written ({reason}); stored estimates are untouched") from error
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

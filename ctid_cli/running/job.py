@@ -10,7 +10,7 @@ import os
 import re
 import time
 import traceback
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -20,18 +20,23 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json, plain
+from ctid_cli.custom_code import reason
 from ctid_cli.running.limits import Limits, shortage
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.manifest import Key, Outcome
 
 if TYPE_CHECKING:
     from ctid_cli.models.additive import Term
-    from ctid_cli.simulation.dataset import Source, StartPoint
+    from ctid_cli.simulation.components import Measure
+    from ctid_cli.simulation.dataset import Source
     from ctid_cli.simulation.frequency_measures import SignalSource
+    from ctid_cli.simulation.start_points import StartPoint
 
 #: Frames of a traceback that are kept, the innermost ones, and characters of a message.
 TRACEBACK_FRAMES = 6
 MESSAGE_LENGTH = 2000
+#: Begins the line of a message that says why a custom measure has no value.
+MEASURE = "Measure "
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +47,8 @@ class DataCell:
     hash: str
     swept: dict[str, Any]
     source: Source | SignalSource
+    #: Custom measures of its estimates, with their names.
+    measures: tuple[tuple[str, Measure], ...] = ()
 
     def dataset(self, replicate: int) -> Any:
         """Return one data set."""
@@ -77,6 +84,10 @@ class Job:
     def keys(self) -> tuple[Key, ...]:
         """The estimates wanted."""
         return tuple(key for key, _, _ in self.wanted)
+
+    def names(self, keys: Collection[Key]) -> list[str]:
+        """Return what some of the estimates are called in messages."""
+        return [f"{cell.name} on replicate {key.replicate}" for key, cell, _ in self.wanted if key in keys]
 
     def only(self, keys: Collection[Key]) -> Job:
         """Return the job of some of the estimates."""
@@ -136,12 +147,33 @@ def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Lim
             fit = prepared.fit(drawn)
             clocks = (preparing + _clocks() - begun).tolist()
             result = no_result() | plain(data.result_of(fit, drawn, job.terms))
+            result = with_measures(result, job.cell.measures, fit, data, limits)
             # What cannot be stored is not a result.
             canonical_json(result).encode()
         except BaseException as error:
             yield from ended((key,), error, limits)
         else:
             yield Outcome(key, result, *clocks)
+
+
+def with_measures(
+    result: Mapping[str, Any], measures: Iterable[tuple[str, Measure]], fit: Any, data: Any, limits: Limits
+) -> dict[str, Any]:
+    """Return a result with the values of custom measures; why one has none is added to the message."""
+    from ctid_cli.simulation.components import value_of
+
+    values: dict[str, Any] = {}
+    reasons = []
+    for name, measure in measures:
+        try:
+            values[name] = plain(value_of(measure, fit, data))
+        except BaseException as error:
+            lacking = shortage(error)
+            if lacking is not None and not (isinstance(lacking, MemoryError) and limits.memory_mb is not None):
+                raise
+            values[name] = None
+            reasons.append(f"{MEASURE}{name}: {_repeatable(_readable(reason(error)))}")
+    return {**result, "custom_measures": values or None, "message": "\n".join([result["message"], *reasons])}
 
 
 def ended(keys: Collection[Key], error: BaseException, limits: Limits) -> Iterator[Outcome | Short]:
@@ -174,8 +206,13 @@ def failure(error: BaseException) -> dict[str, Any]:
     """
     frames = traceback.extract_tb(error.__traceback__)[-TRACEBACK_FRAMES:]
     places = [f"  {Path(frame.filename).name}:{frame.lineno} in {frame.name}" for frame in frames]
-    said = re.sub(r"\b0x[0-9a-fA-F]+", "0x…", _said(error))
+    said = _repeatable(_said(error))
     return failed("\n".join([f"{type(error).__name__}: {said}", *map(_readable, places)]), "FAILED")
+
+
+def _repeatable(text: str) -> str:
+    """Leave out memory addresses, which are others in every run."""
+    return re.sub(r"\b0x[0-9a-fA-F]+", "0x…", text)
 
 
 def _said(error: BaseException) -> str:

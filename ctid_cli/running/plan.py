@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,12 +17,13 @@ import numpy as np
 from ctid_cli.arrays import BoolArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
-from ctid_cli.kinds import KINDS
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.running.job import DataCell, EstimatorCell, Wanted
+from ctid_cli.running.job import DataCell, EstimatorCell, Job, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
-from ctid_cli.simulation.dataset import NO_START, DataSet, SimulatedSource, Source, StartPoint, located
+from ctid_cli.simulation.dataset import DataSet, SimulatedSource, Source, joined, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
+from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
@@ -35,42 +37,12 @@ from ctid_cli.storage.manifest import Key, Manifest, Shard
 MAX_DATA_SETS = 1_000_000
 
 
-class DataCells(Sequence[DataCell]):
-    """The data cells of a plan; very many of them are made when they are asked for."""
-
-    #: This many are made at once, so that what is wrong with any of them is said at once.
-    FEW = 1000
-
-    def __init__(self, count: int, make: Callable[[int], DataCell]) -> None:
-        self._make = make
-        self._made: list[DataCell | None] = [None] * count
-        for number in range(count if count <= self.FEW else 1):
-            self._made[number] = make(number)
-
-    def __len__(self) -> int:
-        return len(self._made)
-
-    def __getitem__(self, item: int) -> DataCell:  # type: ignore[override]  # nobody takes a part of them
-        found = self._made[item]
-        if found is None:
-            found = self._made[item] = self._make(item % len(self))
-        return found
-
-
-@dataclass(frozen=True)
-class Task:
-    """One data set."""
-
-    cell: int
-    replicate: int
-
-
 @dataclass(frozen=True, eq=False)
 class Plan:
     """All data sets and estimates of an experiment."""
 
     spec: Spec
-    data_cells: Sequence[DataCell]
+    data_cells: tuple[DataCell, ...]
     estimators: tuple[EstimatorCell, ...]
     starts: tuple[StartPoint, ...]
     #: Number of data sets of each data cell.
@@ -101,16 +73,6 @@ class Plan:
             return np.ones(own, dtype=bool)
         return np.array([shard.has(cell, replicate, cells) for replicate in range(own)], dtype=bool)
 
-    def tasks(self) -> list[Task]:
-        """Return the data sets that are asked for, replicate by replicate."""
-        asked = [self.asked(cell) for cell in range(len(self.data_cells))]
-        return [
-            Task(cell, replicate)
-            for replicate in range(self.runs)
-            for cell, some in enumerate(asked)
-            if replicate < len(some) and some[replicate]
-        ]
-
     @property
     def data_sets(self) -> int:
         """Number of data sets."""
@@ -119,7 +81,7 @@ class Plan:
     @property
     def estimates_each(self) -> int:
         """Number of estimates of every data set."""
-        return len(self.keys(Task(0, 0)))
+        return len(self.keys(0, 0))
 
     def with_replicates(self, replicates: Sequence[int]) -> Plan:
         """Return the plan with other numbers of data sets."""
@@ -136,30 +98,36 @@ class Plan:
             )
         return dataclasses.replace(self, shard=shard)
 
-    def keys(self, task: Task) -> list[Wanted]:
+    @property
+    def files(self) -> list[tuple[str, str]]:
+        """Path and SHA-256 of each file that data sets are made from."""
+        sections: list[Any] = [self.spec.data, self.spec.sampling, (self.spec.generator or ((), None))[1]]
+        read = [one for one in sections if getattr(one, "sha256", None) is not None and not one.custom]
+        return [(joined(self.spec.folder.resolve(), section.file), section.sha256) for section in read]
+
+    def keys(self, cell: int, replicate: int) -> list[Wanted]:
         """Return the estimates wanted of a data set."""
-        data_hash = self.data_cells[task.cell].hash
+        data_hash = self.data_cells[cell].hash
         return [
-            (Key(data_hash, task.replicate, cell.hash, start.label), cell, start)
-            for cell in self.estimators
-            for start in starts_of(cell.estimator.start_from, self.starts)
+            (Key(data_hash, replicate, part.hash, start.label), part, start)
+            for part in self.estimators
+            for start in starts_of(part.estimator.start_from, self.starts)
         ]
+
+    def job(self, cell: int, replicate: int) -> Job:
+        """Return a data set and the estimates wanted of it; two names of the same estimator share theirs."""
+        wanted = {one[0]: one for one in reversed(self.keys(cell, replicate))}
+        seed = self.monte_carlo.get("seed")
+        return Job(self.data_cells[cell], replicate, seed, tuple(reversed(wanted.values())), self.terms)
 
     @cached_property
     def terms(self) -> tuple[Term, ...] | None:
-        """Structure of the submodels that estimates of one fraction are also given as; None for none.
-
-        That of the simulated system, by rising natural frequency, or else of the first estimator of submodels.
-        """
-        cell = self.data_cells[0].source
-        if isinstance(cell, SimulatedSource) and isinstance(cell.system, AdditiveModel):
-            return cell.system.sorted().terms
-        found = (getattr(cell.estimator, "terms", None) for cell in self.estimators)
-        return next((tuple(terms) for terms in found if terms is not None), None)
+        """Structure of the submodels that estimates of one fraction are also given as; None for none."""
+        return structure(self.data_cells[0].source, [cell.estimator for cell in self.estimators])
 
     def manifest(self) -> Manifest:
         """Return the plan as plain data."""
-        canonical, wanted = dict(self.spec.canonical()), self.keys(Task(0, 0))
+        canonical, wanted = dict(self.spec.canonical()), self.keys(0, 0)
         # Limits end estimates; they are no part of what the results are of.
         canonical.pop("limits", None)
         return {
@@ -194,6 +162,14 @@ def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPo
     return tuple(start for start in starts if start.of == kind) or (NO_START,)
 
 
+def structure(source: Source | SignalSource, estimators: Iterable[Any]) -> tuple[Term, ...] | None:
+    """Return the submodels of the simulated system by rising frequency, or else of the first estimator."""
+    if isinstance(source, SimulatedSource) and isinstance(source.system, AdditiveModel):
+        return source.system.sorted().terms
+    found = (getattr(estimator, "terms", None) for estimator in estimators)
+    return next((tuple(terms) for terms in found if terms is not None), None)
+
+
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     """Plan an experiment."""
     if runs is not None and runs < 1:
@@ -216,7 +192,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
         starts = (*starts, NO_START)
     spec_hash = content_hash(_without_circumstances(spec.canonical()))
-    return Plan(spec, _data_cells(spec, parts, names), estimators, starts, (first,) * cells, spec_hash)
+    return Plan(spec, tuple(_data_cells(spec, parts, names)), estimators, starts, (first,) * cells, spec_hash)
 
 
 def simulate_dataset(
@@ -234,7 +210,7 @@ def simulate_dataset(
         A specification: the path of a YAML file, or its content.
     key : tuple of int
         Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
-        fastest, in the order of the sections system, excitation, loop, sampling, noise, recorder, signal, disturbance.
+        fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance.
     overrides : sequence of str, default ()
         Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
     allow_code : bool, default False
@@ -258,8 +234,8 @@ def simulate_dataset(
 
     Notes
     -----
-    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input, the
-    noise and the recorder come from streams of their own, so that cases which differ in the noise have the same input.
+    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input and
+    the noise come from streams of their own, so that cases which differ in the noise have the same input.
 
     Examples
     --------
@@ -288,52 +264,62 @@ def simulate_dataset(
     for name, number, count in (("case", case, len(cells)), ("replicate", replicate, most)):
         if not 0 <= number < count:
             raise UsageError(f"{spec.experiment}: there is no {name} {number}; they are numbered from 0 to {count - 1}")
-    found: DataSet | SignalDataSet = cells[case].dataset(replicate)
-    return found
+    source = cells[case].source
+    if isinstance(source, SimulatedSource):
+        source.require_stable()
+    return source.dataset(replicate)
 
 
-def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> DataCells:
+def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> Iterator[DataCell]:
+    """Yield every combination of the variants of the sections that data are made from."""
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
-    # Absolute, because worker processes may have been started in another working directory.
-    folder = spec.folder.resolve()
-    ways = [list(found) for found in parts.values()]
-
-    def make(number: int) -> DataCell:
-        point: list[Variant] = []
-        for found in reversed(ways):
-            number, k = divmod(number, len(found))
-            point.insert(0, found[k])
+    measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
+    custom = tuple((name, variant.options) for name, variant in measures.items())
+    for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
-        options = {name: variant.options for name, variant in chosen.items()}
         content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
-        loop = options.get("loop")
-        source: Source | SignalSource
         if spec.signal is not None:
-            # What is measured of an estimate is stored with it, so that it belongs to its identity.
-            measuring = _measuring(spec)
             content |= {"disturbance": content.get("disturbance"), "seed": seed}
-            content["measuring"] = dataclasses.asdict(measuring)
-            disturbance = options.get("disturbance")
-            source = SignalSource(options["signal"], disturbance, options["sampling"], seed or 0, measuring)
+            # What is measured of an estimate is stored with it, so that it belongs to its identity.
+            content["measuring"] = dataclasses.asdict(_measuring(spec))
         elif spec.data is not None:
             # The seed decides where random starts lie; the record itself is in the content as a hash.
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
-            source = dataclasses.replace(located(spec.data.options(), folder), loop=loop)
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            if is_custom(options["system"]):
-                truth, system = content["system"]["truth"], content["system"]
-                # The name of an option stands for its value.
-                system["truth"] = {
-                    name: system[value] if isinstance(value, str) else value for name, value in truth.items()
-                }
+            content["system"] = system_content(chosen["system"])
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
-            source = spec.simulated_source(options, folder)
+        if measures:
+            content["custom_measures"] = {
+                name: {**variant.values, "unit": variant.options.unit} for name, variant in measures.items()
+            }
         swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
-        return DataCell(content, content_hash(content), swept, source)
+        source = source_of(spec, {name: variant.options for name, variant in chosen.items()})
+        yield DataCell(content, content_hash(content), swept, source, custom)
 
-    return DataCells(math.prod(map(len, ways)), make)
+
+def system_content(system: Variant) -> dict[str, Any]:
+    """Return a system as plain data; in the truth of a custom one the name of an option stands for its value."""
+    content = _without_place(system.values)
+    if is_custom(system.options):
+        truth = content["truth"].items()
+        content["truth"] = {name: content[value] if isinstance(value, str) else value for name, value in truth}
+    return content
+
+
+def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
+    """Return what makes the data sets of one combination of the options of the sections."""
+    # Absolute, because worker processes may have been started in another working directory.
+    folder = spec.folder.resolve()
+    if spec.signal is not None:
+        seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
+        given = options["signal"], options.get("disturbance"), options["sampling"]
+        return SignalSource(*given, seed, _measuring(spec))
+    if spec.data is not None:
+        source: Source = dataclasses.replace(located(spec.data.options(), folder), loop=options.get("loop"))
+        return source
+    return spec.simulated_source(options, folder)
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -347,12 +333,14 @@ def _measuring(spec: Spec) -> Measuring:
 def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -> EstimatorCell:
     swept = {names["estimator", *path]: value for path, value in variant.swept.items()}
     content = variant.values
-    estimator = variant.options
-    if is_custom(estimator):
-        estimator = CustomEstimation(estimator)
-    elif content["kind"] in KINDS["frequency_estimator"]:
-        estimator = FrequencyEstimation(estimator)
-    return EstimatorCell(name, content["kind"], estimator, content, content_hash(content), swept)
+    return EstimatorCell(name, content["kind"], estimation(variant), content, content_hash(content), swept)
+
+
+def estimation(variant: Variant) -> Any:
+    """Return what prepares a record and fits to it."""
+    if isinstance(variant.options, FrequencyEstimator):
+        return FrequencyEstimation(variant.options)
+    return CustomEstimation(variant.options) if is_custom(variant.options) else variant.options
 
 
 def _column_names(parts: Mapping[str, Iterable[Variant]]) -> dict[KeyPath, str]:
@@ -394,6 +382,7 @@ def current_version(plan: Plan) -> str:
 
 
 def computing_parts(plan: Plan) -> list[Any]:
-    """Return what computes the estimates of a plan: the source of its data sets, and its estimators."""
+    """Return what computes the estimates of a plan: the source of its data sets, its estimators and custom measures."""
     # All data cells are made by the same classes; only the values of their fields differ.
-    return [plan.data_cells[0].source, *(cell.estimator for cell in plan.estimators)]
+    first = plan.data_cells[0]
+    return [first.source, first.measures, *(cell.estimator for cell in plan.estimators)]

@@ -6,13 +6,12 @@ needs, of an earlier plan.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import count, takewhile
 from typing import Any
 
 import numpy as np
 
-from ctid_cli.inference.monte_carlo import Replications, Until, decide
+from ctid_cli.inference.monte_carlo import CellPrecision, Replications, Until, decide
 from ctid_cli.running.plan import Plan
 from ctid_cli.storage.estimates import is_converged
 from ctid_cli.storage.journal import JournalReader
@@ -20,37 +19,6 @@ from ctid_cli.storage.manifest import Key, Manifest, found_values, true_values
 
 #: Stored results by estimate.
 Found = Mapping[Key, Mapping[str, Any]]
-
-
-@dataclass(frozen=True)
-class Widest:
-    """The measure of a data cell whose interval is farthest from what is asked for."""
-
-    estimator: str
-    #: Its swept options.
-    options: Mapping[str, Any]
-    start: str
-    #: ``percent`` or ``rmse``.
-    measure: str
-    parameter: str | None
-    #: Half-width of the 95 % interval, [percentage points] or as a fraction [-]; None where it is not known.
-    half_width: float | None
-    asked: float
-
-
-@dataclass(frozen=True)
-class CellPrecision:
-    """How well a data cell is known."""
-
-    cell: str
-    swept: Mapping[str, Any]
-    #: ``enough``, ``open`` or ``at_most``, as in a `Decision`.
-    state: str
-    #: Data sets at the end of the last finished block, and those that are needed as far as is known.
-    finished: int
-    needed: int
-    #: None before the end of the first block, and where there is nothing to measure.
-    widest: Widest | None
 
 
 def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ...]:
@@ -80,31 +48,28 @@ def _asked(manifest: Manifest) -> Mapping[str, Any] | None:
 
 def _cell(manifest: Manifest, cell: Mapping[str, Any], section: Mapping[str, Any], found: Found) -> CellPrecision:
     truth = true_values(cell)
-    parts = [(part, start) for part in manifest["estimators"] for start in part["starts"]]
-    estimates = [_results(found, cell["hash"], part["hash"], start) for part, start in parts]
-    replications = [_replications(results, manifest["success"], truth) for results in estimates]
-    decision = decide(Until(**section["until"]), replications, section["at_most"])
-    widest = None
-    if decision.widest is not None:
-        (part, start), column = parts[decision.widest.estimator], decision.widest.parameter
-        measure, parameter = ("percent", None) if column is None else ("rmse", list(truth)[column])
-        of = (part["name"], part["swept"], start, measure, parameter)
-        widest = Widest(*of, decision.widest.value, decision.widest.asked)
-    return CellPrecision(cell["hash"], cell["swept"], decision.state, decision.finished, decision.needed, widest)
-
-
-def _results(found: Found, *of: str) -> list[Mapping[str, Any]]:
-    """Results of an estimator on a data cell, from the first data set to the last before one that is missing."""
-    data, estimator, start = of
-    keys = (Key(data, replicate, estimator, start) for replicate in count())
-    return [found[key] for key in takewhile(found.__contains__, keys)]
+    replications = [
+        _replications(found, cell["hash"], part, start, manifest["success"], truth)
+        for part in manifest["estimators"]
+        for start in part["starts"]
+    ]
+    return decide(Until(**section["until"]), replications, section["at_most"], cell["hash"], cell["swept"])
 
 
 def _replications(
-    results: list[Mapping[str, Any]], success: Mapping[str, Any] | None, truth: Mapping[str, float]
+    found: Found,
+    data: str,
+    part: Mapping[str, Any],
+    start: str,
+    success: Mapping[str, Any] | None,
+    truth: Mapping[str, float],
 ) -> Replications:
+    """Return what an estimator gave, from the first data set to the last before one that is missing."""
+    keys = (Key(data, replicate, part["hash"], start) for replicate in count())
+    results = [found[key] for key in takewhile(found.__contains__, keys)]
     hits = [is_converged(row, success, truth) for row in results]
     values = [[found_values(row, truth)[0][name] for name in truth] for row in results]
     errors = np.array(values, dtype=float).reshape(len(results), len(truth)) - np.array([*truth.values()], dtype=float)
     # Without a rule, or without true values to compare with, an estimate neither converges nor fails to.
-    return Replications(None if None in hits else np.array(hits, dtype=bool), errors)
+    counted = None if None in hits else np.array(hits, dtype=bool)
+    return Replications(counted, errors, tuple(truth), part["name"], part["swept"], start)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
-from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.running.job import Job, Wanted
+from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.plan import Plan, Task
+from ctid_cli.running.plan import Plan
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Key
@@ -79,7 +78,7 @@ class States:
         states: dict[Place, Array] = {}
         for cell in range(len(plan.data_cells)):
             asked = plan.asked(cell)
-            for key in {key for key, _, _ in plan.keys(Task(cell, 0))}:
+            for key in {key for key, _, _ in plan.keys(cell, 0)}:
                 place = key.data_hash, key.estimator_hash, key.start
                 planned[place] = asked | planned[place] if place in planned else asked
                 states[place] = self._of(key, len(asked))
@@ -95,7 +94,7 @@ class States:
         for cell in range(len(plan.data_cells)):
             asked = plan.asked(cell)
             lacking = np.zeros(len(asked), dtype=bool)
-            for key in {key for key, _, _ in plan.keys(Task(cell, 0)) if key.data_hash not in seen}:
+            for key in {key for key, _, _ in plan.keys(cell, 0) if key.data_hash not in seen}:
                 lacking |= np.isin(self._of(key, len(asked)), _TO_COMPUTE)
             seen.add(plan.data_cells[cell].hash)
             found.append(lacking & asked)
@@ -111,20 +110,8 @@ class States:
         def expected(job: Job) -> float:
             return sum(seconds.get((key.data_hash, key.estimator_hash), float("inf")) for key in job.keys)
 
-        tasks = (
-            Task(cell, replicate)
-            for replicate in range(plan.runs)
-            for cell, lacking in enumerate(missing)
-            if replicate < len(lacking) and lacking[replicate]
-        )
-        for _, group in groupby(tasks, key=lambda task: task.replicate):
-            yield from sorted((self._job(plan, task) for task in group), key=expected, reverse=True)
-
-    def _job(self, plan: Plan, task: Task) -> Job:
-        wanted: dict[Key, Wanted] = {}
-        for one in plan.keys(task):
-            # Two names of the same estimator share their estimates.
-            if self._get(one[0]) in _TO_COMPUTE:
-                wanted.setdefault(one[0], one)
-        seed = plan.monte_carlo.get("seed")
-        return Job(plan.data_cells[task.cell], task.replicate, seed, tuple(wanted.values()), plan.terms)
+        for replicate in range(plan.runs):
+            cells = [k for k, lacking in enumerate(missing) if replicate < len(lacking) and lacking[replicate]]
+            jobs = [plan.job(cell, replicate) for cell in cells]
+            wanted = [job.only([key for key in job.keys if self._get(key) in _TO_COMPUTE]) for job in jobs]
+            yield from sorted(wanted, key=expected, reverse=True)

@@ -3,7 +3,6 @@
 import signal
 import threading
 import time
-from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -13,18 +12,6 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 
 
-@dataclass(frozen=True)
-class StopAt:
-    """When a run is to stop although it is not finished."""
-
-    #: Set by the caller.
-    event: threading.Event | None = None
-    #: Number of estimates of this run that failed.
-    failures: int | None = None
-    #: Time after its beginning [s].
-    seconds: float | None = None
-
-
 class StopRequest:
     """Notices requests to stop; signals, while it is entered.
 
@@ -32,9 +19,12 @@ class StopRequest:
     once, as if nobody had listened; the workers end with it, and the journal is made for that.
     """
 
-    def __init__(self, at: StopAt | None = None) -> None:
-        self.at = at or StopAt()
-        self._deadline = None if self.at.seconds is None else time.monotonic() + self.at.seconds
+    def __init__(
+        self, event: threading.Event | None = None, *, failures: int | None = None, seconds: float | None = None
+    ) -> None:
+        """Stop when the caller sets an event, after failed estimates of this run, or after some time [s]."""
+        self._event, self.failures = event, failures
+        self._deadline = None if seconds is None else time.monotonic() + seconds
         self._reason: str | None = None
         self._before: dict[signal.Signals, Any] = {}
 
@@ -62,13 +52,13 @@ class StopRequest:
 
     def __call__(self) -> bool:
         """Return whether a stop was asked for."""
-        if self.at.event is not None and self.at.event.is_set():
-            self.ask("stop")
-        elif self._deadline is not None and time.monotonic() > self._deadline:
-            self.ask(TIME_BUDGET)
-        return self._reason is not None
+        return self.reason is not None
 
     @property
     def reason(self) -> str | None:
         """Name of the signal, ``"stop"`` for the caller's event, another reason, or None."""
-        return self._reason if self() else None
+        if self._event is not None and self._event.is_set():
+            self.ask("stop")
+        elif self._deadline is not None and time.monotonic() > self._deadline:
+            self.ask(TIME_BUDGET)
+        return self._reason

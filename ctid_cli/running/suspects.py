@@ -12,15 +12,16 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from ctid_cli.running.job import Job, Short
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.workers import Ending
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Key, Outcome
+from ctid_cli.text import count
 
 if TYPE_CHECKING:
     from ctid_cli.running.dask_cluster import DaskWorkers
@@ -34,78 +35,68 @@ SHORTAGES = 8
 SLOW = 600.0
 #: Share of a limit of wall time that a process must have had the processor for, to be guilty of it [-].
 AT_WORK = 0.5
+#: Estimates given up that are named.
+NAMED = 3
 #: Signals that no estimate sends itself by mistake: something else ended its process.
 _FROM_OUTSIDE = {"SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGXFSZ"}
-
-
-class Suspected(NamedTuple):
-    """Estimates that were in work when a process died, and are computed again."""
-
-    keys: Sequence[Key]
-
-
-class GivenUp(NamedTuple):
-    """Estimates that the machine did not let finish; without any, it is fit for none."""
-
-    keys: Sequence[Key]
-    reason: str
-
-
-class Slow(NamedTuple):
-    """An estimate that has been in work for long [s]."""
-
-    key: Key
-    seconds: float
-
-
-Event = list[Outcome] | Suspected | GivenUp | Slow | None
 
 
 class Course:
     """Jobs on their way to estimates."""
 
     def __init__(
-        self, jobs: Iterator[Job], workers: LocalWorkers | DaskWorkers, limits: Limits, stopping: Callable[[], bool]
+        self,
+        jobs: Iterator[Job],
+        workers: LocalWorkers | DaskWorkers,
+        limits: Limits,
+        stopping: Callable[[], bool],
+        tell: Callable[[str], object],
     ) -> None:
-        self._jobs, self._workers, self._limits, self._stopping = jobs, workers, limits, stopping
+        self._jobs, self._workers, self._limits, self._stopping, self._tell = jobs, workers, limits, stopping, tell
+        #: Estimates that the machine did not let finish, by name, and what was in their way.
+        self.given_up: list[str] = []
+        self.hindrance = ""
+        #: Whether the machine is fit for no estimate.
+        self.hopeless = False
         #: What is left of jobs whose process died, and is not suspect.
         self._again: deque[Job] = deque()
         self._suspects: list[Job] = []
         #: What is computed once more, one at a time.
         self._undecided: list[Job] = []
         self._exhausted = False
-        #: Since the last finished estimate: how often the machine was short of something, and of what.
-        self._short = 0
+        #: Since the last finished estimate: how often the machine was short of something, and rounds.
+        self._short = self._vain = 0
+        #: What the last process died of, or the machine was short of.
         self._reason = ""
         self._mentioned: dict[Key, float] = {}
 
-    def events(self) -> Generator[Event]:
-        """Yield finished estimates and what else happens; None now and then."""
-        vain = 0
+    def outcomes(self) -> Generator[list[Outcome]]:
+        """Yield finished estimates; an empty list now and then."""
         while not self._stopping() and not (self._exhausted and not self._again):
-            finished = False
-            for event in self._round():
-                finished |= isinstance(event, list)
-                yield event
-            vain = 0 if finished else vain + 1
-            if vain >= PATIENCE and not self._exhausted:
-                yield GivenUp((), self._reason or self._workers.trouble)
+            self._vain += 1
+            yield from self._round()
+            if self._vain >= PATIENCE and not self._exhausted:
+                self.hopeless = True
+                self.hindrance = self._reason or self._workers.trouble
                 return
-            time.sleep(PAUSE * vain)
+            time.sleep(PAUSE * self._vain)
 
-    def _round(self) -> Generator[Event]:
+    def _round(self) -> Generator[list[Outcome]]:
         """Compute until all is done or a process dies; then each of the suspects alone."""
         with closing(self._workers.results(self._handed_out(), self._stopping)) as results:
-            for result in results:
-                yield from self._slow() if result is None else self._settle(*result)
+            yield from self._settled(results, tries=0)
         while (self._suspects or self._undecided) and not self._stopping():
             if self._suspects:
-                suspects, self._suspects = self._suspects, []
-                yield Suspected([key for job in suspects for key in job.keys])
-                yield from self._alone(suspects, self._workers.count, tries=1)
+                jobs, at_once, tries = self._suspects, self._workers.count, 1
+                self._suspects = []
+                estimates = count(sum(len(job.wanted) for job in jobs), "estimate")
+                self._tell(f"a worker process died; computing {estimates} again, each in a process of its own")
             else:
-                undecided, self._undecided = self._undecided, []
-                yield from self._alone(undecided, 1, tries=2)
+                jobs, at_once, tries = self._undecided, 1, 2
+                self._undecided = []
+            wanted = itertools.takewhile(lambda _: not self._stopping(), jobs)
+            with closing(self._workers.alone(wanted, at_once)) as results:
+                yield from self._settled(results, tries)
         self._short = 0
 
     def _handed_out(self) -> Iterator[Job]:
@@ -116,45 +107,46 @@ class Course:
                 return
             yield job
 
-    def _alone(self, jobs: list[Job], at_once: int, tries: int) -> Generator[Event]:
-        wanted = itertools.takewhile(lambda _: not self._stopping(), jobs)
-        with closing(self._workers.alone(wanted, at_once)) as endings:
-            for ending in endings:
-                yield from self._slow() if ending is None else self._settle(*ending, tries)
+    def _settled(self, results: Iterator[tuple[Job, Ending] | None], tries: int) -> Generator[list[Outcome]]:
+        """Decide on jobs that ended, in the pool at first, then alone, then alone on the machine."""
+        for result in results:
+            if result is None:
+                self._mention_slow()
+            yield [] if result is None else self._settle(*result, tries)
 
-    def _slow(self) -> Generator[Event]:
-        yield None
-        for key, seconds in self._workers.slow(SLOW):
-            if seconds > self._mentioned.get(key, SLOW):
-                self._mentioned[key] = 2 * seconds
-                yield Slow(key, seconds)
+    def _mention_slow(self) -> None:
+        for job, keys, seconds in self._workers.slow(SLOW):
+            if seconds > self._mentioned.get(keys[0], SLOW):
+                self._mentioned[keys[0]] = 2 * seconds
+                took = f"{job.names(keys)[0]} has been in work for {seconds / 60:.0f} min"
+                self._tell(f"{took}; limits.wall_seconds would end what takes longer than it says")
 
-    def _settle(self, job: Job, ending: Ending, tries: int = 0) -> Generator[Event]:
-        """Decide on a job that ended, in the pool at first, then alone, then alone on the machine."""
+    def _settle(self, job: Job, ending: Ending, tries: int) -> list[Outcome]:
+        """Return what a job has finished, and decide on the rest of it."""
         outcomes = [entry for entry in ending.entries if isinstance(entry, Outcome)]
         left = [key for key in job.keys if key not in {outcome.key for outcome in outcomes}]
         if outcomes:
-            self._short = 0
-            yield outcomes
+            self._short = self._vain = 0
         for entry in ending.entries:
             if isinstance(entry, Short):
                 left = [key for key in left if key not in entry.keys]
                 self._short += 1
-                yield from self._hindered(job.only(entry.keys), entry.reason, tries)
+                self._hindered(job.only(entry.keys), entry.reason, tries)
         self._reason = ending.how or self._reason
         in_work = [key for key in ending.begun if key in left] if ending.how else []
         if tries and ending.how and not in_work:
             # It died before it began.
             in_work = left
-        if in_work and (tries == 0 or outcomes):
-            self._suspects.append(job.only(in_work))
-        elif in_work:
-            yield from self._decided(job.only(in_work), ending, tries)
         rest = [key for key in left if key not in in_work]
         if rest:
             self._again.append(job.only(rest))
+        if in_work and (tries == 0 or outcomes):
+            self._suspects.append(job.only(in_work))
+        elif in_work:
+            outcomes += self._decided(job.only(in_work), ending, tries)
+        return outcomes
 
-    def _decided(self, job: Job, ending: Ending, tries: int) -> Generator[Event]:
+    def _decided(self, job: Job, ending: Ending, tries: int) -> Iterator[Outcome]:
         """Decide on estimates that ended a process which had computed nothing else."""
         limits = self._limits
         if ending.late and limits.wall_seconds is not None:
@@ -169,14 +161,18 @@ class Course:
             status = "CRASHED"
             reason = f"the worker process died each time this was computed, the last time alone ({ending.how})"
         else:
-            yield from self._hindered(job, ending.how, tries)
+            self._hindered(job, ending.how, tries)
             return
-        yield [Outcome(key, failed(reason, status), None) for key in job.keys]
+        self._vain = 0
+        yield from (Outcome(key, failed(reason, status), None) for key in job.keys)
 
-    def _hindered(self, job: Job, reason: str, tries: int) -> Generator[Event]:
+    def _hindered(self, job: Job, reason: str, tries: int) -> None:
         """Give up what the machine did not let finish, or compute it once more."""
         self._reason = reason
         if tries < 2:
             self._undecided.append(job)
-        else:
-            yield GivenUp(job.keys, reason)
+            return
+        self.hindrance = reason
+        names = job.names(job.keys)
+        self.given_up += names
+        self._tell(f"{count(len(names), 'estimate')} given up, not stored ({', '.join(names[:NAMED])}): {reason}")

@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import cache
@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 from ctid_cli import custom_code
 from ctid_cli.running.job import Begun, Entry, Job, ended, run_job
 from ctid_cli.running.limits import Limits
+from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.temporary import TemporaryFolder
 
@@ -36,13 +37,20 @@ from ctid_cli.temporary import TemporaryFolder
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: File beside the records that tells workers to begin nothing more.
-_STOP = "stop"
+#: Files beside the records: one tells workers to begin nothing more, the other is there while anything is to be done.
+_STOP, _GOING = "stop", "going"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
 _PR_SET_PDEATHSIG = 1
+
+
+class Task(NamedTuple):
+    """A job on its way to another process."""
+
+    keys: tuple[Key, ...]
+    content: bytes
 
 
 class Ending(NamedTuple):
@@ -95,18 +103,17 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def compute(keys: Collection[Key], packed: bytes, record: str, limits: Limits) -> list[Entry]:
+def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
     """Compute the estimates of a job under limits, and keep a record of what is begun and finished."""
     found: list[Entry] = []
-    in_work = keys
+    in_work = task.keys
     # The traceback of a process that dies would garble the terminal; loky has asked for it.
     faulthandler.disable()
     try:
-        with open(record, "wb", buffering=0) as file, open(f"{record}.late", "wb") as late:
+        with record.open("wb", buffering=0) as file, _late(record).open("wb") as late:
             file.write(pickle.dumps(os.getpid()))
             # The code of custom components is imported here.
-            _, job = pickle.loads(packed)
-            for entry in run_job(job, limits):
+            for entry in run_job(unpacked(task.content)[0], limits):
                 if isinstance(entry, Begun):
                     in_work = entry.keys
                     file.write(pickle.dumps(entry._replace(since=time.process_time())))
@@ -123,11 +130,22 @@ def compute(keys: Collection[Key], packed: bytes, record: str, limits: Limits) -
     return found
 
 
+def _compute_named(record: Path, task: Task, limits: Limits) -> tuple[Path, list[Entry]]:
+    """Compute a job unless the run is to stop, and say of which record it is."""
+    return record, [] if record.with_name(_STOP).exists() else compute(task, record, limits)
+
+
+def _wait(going: Path) -> None:
+    """Keep a worker from taking jobs until nothing is left to be done."""
+    while going.exists():
+        time.sleep(TICK)
+
+
 def main() -> None:
     """Call the function that a file holds, and write what it returns to another: a process of its own does this."""
     folder, parent = Path(sys.argv[1]), int(sys.argv[2])
     initialise(parent)
-    _, function, given = pickle.loads((folder / "call").read_bytes())
+    function, given = unpacked((folder / "call").read_bytes())
     (folder / "returned").write_bytes(pickle.dumps(function(*given)))
 
 
@@ -136,16 +154,16 @@ def main() -> None:
 
 
 def packed(*content: Any) -> bytes:
-    """Return content for another process, after the custom code that it needs to read it."""
-    return pickle.dumps((custom_code.served(), *content))
+    """Return content for another process, after the custom code that it needs to read it and the files it was sent."""
+    return pickle.dumps((custom_code.served(), COPIES, *content))
 
 
-def task_of(job: Job) -> tuple[tuple[Key, ...], bytes] | list[Entry]:
-    """Return what is sent of a job, or what comes of it where it cannot be sent."""
-    try:
-        return job.keys, packed(job)
-    except Exception as error:
-        return list(ended(job.keys, error, Limits()))
+def unpacked(data: bytes) -> list[Any]:
+    """Return content from another process."""
+    content: list[Any]
+    _, copies, *content = pickle.loads(data)
+    COPIES.update(copies)
+    return content
 
 
 def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple[Any, str, float]:
@@ -164,9 +182,7 @@ def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple
         # A terminal's Ctrl-C does not reach it there.
         start_new_session=True,
     )
-    (folder / "process").write_text(str(process.pid), encoding="ascii")
     _, status, used = os.wait4(process.pid, 0)
-    (folder / "process").unlink()
     process.returncode = code = os.waitstatus_to_exitcode(status)
     processor = used.ru_utime + used.ru_stime
     try:
@@ -175,11 +191,11 @@ def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple
         return None, signal.Signals(-code).name if code < 0 else f"exit code {code}", processor
 
 
-def compute_alone(keys: Collection[Key], packed: bytes, limits: Limits, folder: Path) -> Ending:
+def compute_alone(task: Task, limits: Limits, folder: Path) -> Ending:
     """Compute a job in a process of its own, which is told how it ended."""
     record = folder / "record"
     try:
-        found, how, used = call_alone(folder, compute, keys, packed, str(record), limits)
+        found, how, used = call_alone(folder, compute, task, record, limits)
     except OSError as error:
         return Ending([], f"no process could be started ({error.strerror or error})")
     return _remains(record, how, used) if how else Ending(found)
@@ -187,16 +203,14 @@ def compute_alone(keys: Collection[Key], packed: bytes, limits: Limits, folder: 
 
 def _remains(record: Path, how: str, used: float = 0.0) -> Ending:
     """Return what the record of a dead process says."""
-    entries, late = _read(record)[1:], Path(f"{record}.late")
+    entries, late = _read(record)[1:], _late(record)
     since = next((entry.since for entry in reversed(entries) if isinstance(entry, Begun)), 0.0)
     return Ending(entries, how, late.exists() and late.stat().st_size > 0, used - since)
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii")
-    except OSError:
-        return ""
+def _late(record: Path) -> Path:
+    """Return the file that is not empty where a job has exceeded its wall time."""
+    return record.with_suffix(".late")
 
 
 def _read(record: Path) -> list[Any]:
@@ -208,6 +222,43 @@ def _read(record: Path) -> list[Any]:
     return entries
 
 
+def in_parallel(
+    jobs: Iterator[Job],
+    submit: Callable[[Job, Task], Future[Ending]],
+    at_once: Callable[[], int],
+    died: Callable[[Job, Exception], Ending],
+) -> Results:
+    """Keep a number of jobs in work, and yield each with what came of it; None where nothing has ended for a while."""
+    in_work: dict[Future[Ending], Job] = {}
+    while True:
+        while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
+            task = task_of(job)
+            if isinstance(task, Ending):
+                yield job, task
+            else:
+                in_work[submit(job, task)] = job
+        if not in_work:
+            return
+        done, _ = wait(in_work, TICK, FIRST_COMPLETED)
+        for future in done:
+            job = in_work.pop(future)
+            try:
+                ending = future.result()
+            except Exception as error:
+                ending = died(job, error)
+            yield job, ending
+        if not done:
+            yield None
+
+
+def task_of(job: Job) -> Task | Ending:
+    """Return what is sent of a job, or what comes of it where it cannot be sent."""
+    try:
+        return Task(job.keys, packed(job))
+    except Exception as error:
+        return Ending(list(ended(job.keys, error, Limits())))
+
+
 @cache
 def _joblib_thread(process: int) -> ThreadPoolExecutor:
     """Return the one thread of this process that starts workers, for as long as the process lives.
@@ -215,30 +266,6 @@ def _joblib_thread(process: int) -> ThreadPoolExecutor:
     Workers end with the thread that started them, and inherit that it leaves signals to others.
     """
     return ThreadPoolExecutor(1, "joblib", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
-
-
-def in_parallel(
-    jobs: Iterator[Job], submit: Callable[[Job], Future[Any] | list[Entry]], at_once: Callable[[], int]
-) -> Iterator[tuple[Job, Any] | None]:
-    """Keep a number of jobs in work, and yield each with its future, or what came of it, when it is over.
-
-    None is yielded where nothing has ended for a while.
-    """
-    in_work: dict[Future[Any], Job] = {}
-    while True:
-        while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
-            future = submit(job)
-            if isinstance(future, list):
-                yield job, Ending(future)
-            else:
-                in_work[future] = job
-        if not in_work:
-            return
-        done, _ = wait(in_work, TICK, FIRST_COMPLETED)
-        for future in done:
-            yield in_work.pop(future), future
-        if not done:
-            yield None
 
 
 class LocalWorkers:
@@ -249,10 +276,11 @@ class LocalWorkers:
         #: Why the last workers ended before all was done.
         self.trouble = ""
         self._folder = TemporaryFolder()
-        self._stop = self._folder.path / _STOP
+        self._stop, self._going = self._folder.path / _STOP, self._folder.path / _GOING
         self._numbers = itertools.count()
-        #: What is in work, by the place of its record.
+        #: What is in work, by the place of its record, and whether nothing follows.
         self._at_work: dict[Path, Job] = {}
+        self._last = False
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
@@ -261,9 +289,13 @@ class LocalWorkers:
         job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
         self._stop.unlink(missing_ok=True)
+        self._last = False
+        # Without it both workers of a single job take turns, which is slower and no worse.
+        with suppress(OSError):
+            self._going.touch()
         news: queue.SimpleQueue[Any] = queue.SimpleQueue()
         working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
-        working.add_done_callback(lambda _: news.put(None))
+        working.add_done_callback(news.put)
         try:
             while True:
                 if stopping():
@@ -274,7 +306,7 @@ class LocalWorkers:
                     self._watch()
                     yield None
                     continue
-                if item is None:
+                if item is working:
                     break
                 if isinstance(item, BaseException):
                     raise item
@@ -288,11 +320,8 @@ class LocalWorkers:
                 ending = _remains(record, how)
                 yield self._over(record), ending
         finally:
-            # Otherwise what is in work would be waited for.
-            while not working.done():
-                self._kill(number for record in list(self._at_work) for number in _read(record)[:1])
-                time.sleep(TICK)
-            self._at_work.clear()
+            self._going.unlink(missing_ok=True)
+            self._abandon(working.done)
 
     def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
         """Put what comes of jobs into a queue: what the thread of joblib does."""
@@ -300,63 +329,82 @@ class LocalWorkers:
 
         settings = {"initializer": initialise, "initargs": (os.getpid(),)}
         with parallel_config("loky", inner_max_num_threads=1, **settings):
-            # With one worker joblib would compute in this very process: there are two, of which one is at work.
-            ahead = self.count + 1 if self.count > 1 else 1
+            # With one worker joblib would compute in this very process: there are two, of which one waits for the end.
+            ahead = self.count + 1 if self.count > 1 else 2
             how = {"n_jobs": max(self.count, 2), "pre_dispatch": ahead, "batch_size": 1, "max_nbytes": None}
             parallel = Parallel(return_as="generator_unordered", **how)
             for found in parallel(self._calls(jobs, news)):
-                news.put(found)
+                if found is not None:
+                    news.put(found)
 
     def _calls(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> Iterator[Any]:
         """Yield what joblib is to call; it asks for the next when a worker is free, in whichever thread."""
         from joblib import delayed
 
         try:
+            if self.count == 1:
+                yield delayed(_wait)(self._going)
             for job in jobs:
                 record, task = self._folder.path / str(next(self._numbers)), task_of(job)
                 self._at_work[record] = job
-                if isinstance(task, list):
-                    news.put((record, task))
+                if isinstance(task, Ending):
+                    news.put((record, task.entries))
                 else:
-                    yield delayed(_compute_named)(record, *task, self._limits)
+                    yield delayed(_compute_named)(record, task, self._limits)
         except Exception as error:
             # joblib would wait for ever.
             news.put(error)
+        finally:
+            self._last = True
+            self._note_end()
 
     def _over(self, record: Path) -> Job:
         """Forget a job that is over."""
-        for path in (record, Path(f"{record}.late")):
+        for path in (record, _late(record)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
-        return self._at_work.pop(record)
+        job = self._at_work.pop(record)
+        self._note_end()
+        return job
+
+    def _note_end(self) -> None:
+        if self._last and not self._at_work:
+            self._going.unlink(missing_ok=True)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
         threads = ThreadPoolExecutor(at_once)
-        started: dict[Path, Future[Ending]] = {}
+        started: list[Future[Ending]] = []
 
-        def submit(job: Job) -> Future[Any] | list[Entry]:
-            task, folder = task_of(job), self._folder.path / f"alone-{next(self._numbers)}"
-            if isinstance(task, list):
-                return task
+        def submit(job: Job, task: Task) -> Future[Ending]:
+            folder = self._folder.path / f"alone-{next(self._numbers)}"
             self._at_work[folder / "record"] = job
-            started[folder] = threads.submit(compute_alone, *task, self._limits, folder)
-            return started[folder]
+            started.append(threads.submit(compute_alone, task, self._limits, folder))
+            return started[-1]
+
+        def died(job: Job, error: Exception) -> Ending:
+            raise error
 
         try:
-            for over in in_parallel(jobs, submit, lambda: at_once):
+            for over in in_parallel(jobs, submit, lambda: at_once, died):
                 if over is None:
                     self._watch()
-                yield over if over is None or isinstance(over[1], Ending) else (over[0], over[1].result())
+                else:
+                    self._at_work = {record: job for record, job in self._at_work.items() if job is not over[0]}
+                yield over
         finally:
-            # Otherwise what is in work would be waited for.
-            while in_work := [folder for folder, future in started.items() if not future.done()]:
-                self._kill(int(text) for folder in in_work if (text := _text(folder / "process")))
-                time.sleep(TICK)
+            self._abandon(lambda: all(future.done() for future in started))
             threads.shutdown()
-            self._at_work.clear()
 
-    def at_work(self) -> Iterator[tuple[Path, float]]:
+    def _abandon(self, ended: Callable[[], bool]) -> None:
+        """Kill what is in work, which would be waited for otherwise, until all has ended."""
+        while not ended():
+            for record in list(self._at_work):
+                _kill(record)
+            time.sleep(TICK)
+        self._at_work.clear()
+
+    def _seconds(self) -> Iterator[tuple[Path, float]]:
         """Yield the record of each job in work, and for how long its estimate has been in work [s]."""
         for record in list(self._at_work):
             with suppress(OSError):
@@ -365,28 +413,25 @@ class LocalWorkers:
     def _watch(self) -> None:
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
         if self._limits.wall_seconds is not None:
-            for record, seconds in self.at_work():
+            for record, seconds in self._seconds():
                 if seconds > self._limits.wall_seconds * 1.5 + GRACE:
-                    Path(f"{record}.late").write_bytes(b"killed")
-                    self._kill(_read(record)[:1])
+                    _late(record).write_bytes(b"killed")
+                    _kill(record)
 
-    def slow(self, least: float) -> Iterator[tuple[Key, float]]:
-        """Yield the estimates that have been in work for longer than this, and for how long [s]."""
-        for record, seconds in self.at_work():
+    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
+        """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
+        for record, seconds in self._seconds():
             if seconds > least:
-                yield (*_remains(record, "").begun, *self._at_work[record].keys)[0], seconds
-
-    @staticmethod
-    def _kill(processes: Iterable[int]) -> None:
-        for process in processes:
-            with suppress(OSError):
-                os.kill(process, signal.SIGKILL)
+                job = self._at_work[record]
+                yield job, _remains(record, "").begun or job.keys, seconds
 
     def close(self) -> None:
         """Remove the records."""
         self._folder.close()
 
 
-def _compute_named(record: Path, keys: Collection[Key], packed: bytes, limits: Limits) -> tuple[Path, list[Entry]]:
-    """Compute a job unless the run is to stop, and say of which record it is."""
-    return record, [] if record.with_name(_STOP).exists() else compute(keys, packed, str(record), limits)
+def _kill(record: Path) -> None:
+    """Kill the process that keeps a record."""
+    for process in _read(record)[:1]:
+        with suppress(OSError):
+            os.kill(process, signal.SIGKILL)

@@ -4,8 +4,8 @@ Between its samples such a signal is ``sum_k u_k sinc((t - t_k)/h)``, which no e
 points h/4 apart do, if the points are chosen so that the lines have the spectrum of the signal below half the sampling
 frequency: lines damp a wave ``exp(jwt)`` by ``sinc(w h/8)^2``, so the points are those of the signal over that factor.
 What is left are the images of the finer clock, around multiples of 4 sampling frequencies. Behind a system they are
-``(w/(4 w_s - w))^2 |G(4 w_s - w)/G(w)|`` of the answer to the frequency w: one or two ten thousandths of the output at
-most, where lines through the samples themselves are wrong by hundredths.
+``(w/(4 w_s - w))^2 |G(4 w_s - w)/G(w)|`` of the response to the frequency w: one or two ten thousandths of the output
+at most, where lines through the samples themselves are wrong by hundredths.
 
 The sum runs over all time. Of a periodic signal all is known, and it is formed by Fourier's series. Otherwise it is cut
 off by a Kaiser window after 32 samples, and beyond the ends of a record the signal is taken as mirrored in its last
@@ -38,7 +38,7 @@ class BandLimitedDoubt(NamedTuple):
 
 
 def finer_values(values: Array, *, periodic: bool) -> Array:
-    """Points between which straight lines have the spectrum of a signal.
+    """Return points between which straight lines have the spectrum of a signal.
 
     Of a periodic signal those of one whole period, ``4 N``; otherwise those from the first sample to the last.
     """
@@ -46,12 +46,12 @@ def finer_values(values: Array, *, periodic: bool) -> Array:
 
 
 def values_between(values: Array) -> Array:
-    """The signal itself on the finer clock, from the first sample to the last."""
+    """Return the signal itself on the finer clock, from the first sample to the last."""
     return _of_window(values, "odd", undamped=False)
 
 
 def finer_times(t: Array, *, periodic: bool) -> Array:
-    """The instants of these points, every fourth of them one of the signal's own."""
+    """Return the instants of these points; every fourth of them is one of the signal."""
     places = np.arange((t.size - 1) * FINER + 1) / FINER
     times = np.interp(places, np.arange(t.size), t)
     if not periodic:
@@ -61,7 +61,7 @@ def finer_times(t: Array, *, periodic: bool) -> Array:
 
 
 def band_limited_doubt(t: Array, values: Array) -> BandLimitedDoubt:
-    """What another guess of the samples beyond the ends changes, and how much power the window treats roughly."""
+    """Return what another guess of the samples beyond the ends changes, and the power near the edge of the band."""
     mirrored, held = (_of_window(values, way) for way in ("odd", "constant"))
     edge = min(REACH * FINER, mirrored.size // 2)
     off = np.concatenate([(mirrored - held)[:edge], (mirrored - held)[-edge:]])
@@ -83,7 +83,7 @@ def _of_series(values: Array) -> Array:
 
 
 def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:
-    """Points by the windowed sum, the signal beyond its ends mirrored in (``odd``) or held at the last sample."""
+    """Return points by the windowed sum, the signal beyond its ends mirrored (``odd``) or held at the last sample."""
     more = REACH + 2
     if beyond == "odd" and values.size > 1:
         longer = np.pad(values, more, mode="reflect", reflect_type="odd")

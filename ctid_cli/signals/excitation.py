@@ -1,5 +1,6 @@
 """Inputs: each is a frozen dataclass of options that generates a held signal."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, get_args
@@ -10,9 +11,8 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
-from ctid_cli.signals.clock import check_clock, clock_instants
-from ctid_cli.signals.csv_file import read_held_signal
-from ctid_cli.signals.held import HeldSignal, Hold
+from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
+from ctid_cli.signals.measurement import read_held_signal
 
 #: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
 #: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.
@@ -50,7 +50,7 @@ class Excitation(ABC):
 
     @abstractmethod
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The signal over one record.
+        """Return the signal over one record.
 
         Parameters
         ----------
@@ -71,8 +71,30 @@ class Excitation(ABC):
         """
 
 
+# --- the clock of an input ------------------------------------------------------------------------------------------
+
+
+def check_clock(period: float | None) -> None:
+    """Refuse a clock that does not advance; None is the clock of the sampling."""
+    if period is not None:
+        checks.require_positive("clock_period", period, "s")
+
+
+def clock_instants(sample_times: Array, period: float | None) -> Array:
+    """Return the instants at which an input takes a new value, from the first sample to the last."""
+    if period is None:
+        return sample_times
+    duration = float(sample_times[-1] - sample_times[0])
+    # An edge that coincides with the last sample counts, on whichever side rounding puts it.
+    ticks = math.floor(duration / period + COINCIDENCE) + 1
+    return np.asarray(sample_times[0] + period * np.arange(ticks))
+
+
+# --- random inputs --------------------------------------------------------------------------------------------------
+
+
 def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
-    """Output of a maximal-length feedback shift register.
+    """Return the output of a maximal-length feedback shift register.
 
     Over GF(2) the square of the feedback polynomial has the same coefficients at twice the exponents, so a
     sequence that obeys the recurrence at lags ``l`` obeys it at ``2 l``, ``4 l``, … too. Doubling the lags as
@@ -132,7 +154,7 @@ class Prbs(Excitation):
         checks.require_positive("amplitude", self.amplitude, "input unit")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The sequence on its clock, the first edge at the first instant; the register's first state is drawn."""
+        """Return the sequence on its clock from the first instant on; the first state of the register is drawn."""
         clock = clock_instants(sample_times, self.clock_period)
         bits = maximal_length_sequence(self.stages, clock.size, int(rng.integers(1, 2**self.stages)))
         return HeldSignal(clock, np.where(bits == 1, self.amplitude, -self.amplitude))
@@ -172,7 +194,7 @@ class Gbn(Excitation):
         checks.require_positive("amplitude", self.amplitude, "input unit")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The values on their clock, the first edge at the first instant; the first value and all changes are drawn."""
+        """Return the values on their clock from the first instant on; the first value and all changes are drawn."""
         clock = clock_instants(sample_times, self.clock_period)
         drawn = rng.random(clock.size)
         changes = np.concatenate(([drawn[0] < 0.5], drawn[1:] < self.switching_probability))
@@ -201,9 +223,12 @@ class Gaussian(Excitation):
         check_clock(self.clock_period)
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Independent values on the clock."""
+        """Return independent values on the clock."""
         clock = clock_instants(sample_times, self.clock_period)
         return HeldSignal(clock, self.standard_deviation * rng.standard_normal(clock.size))
+
+
+# --- inputs that are given ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -231,18 +256,69 @@ class Step(Excitation):
         checks.require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The step, which must come before the last instant; nothing is drawn."""
-        start, end = float(sample_times[0]), float(sample_times[-1])
-        if self.time >= end:
-            raise DataError(f"the step at {self.time:g} s comes too late for a record that ends at {end:g} s")
-        if self.time <= start:
-            return HeldSignal(np.array([start]), np.array([self.amplitude]))
-        return HeldSignal(np.array([start, self.time]), np.array([0.0, self.amplitude]))
+        """Return the step, which must come before the last instant; nothing is drawn."""
+        return _staircase(sample_times, (self.time,), (self.amplitude,))
+
+
+@dataclass(frozen=True)
+class Steps(Excitation):
+    """A staircase: values that follow one another at given instants.
+
+    Parameters
+    ----------
+    times : tuple of float
+        When the values begin [s], increasing; the input is zero before the first one.
+    levels : tuple of float
+        The values [input unit], as many as times; each is held until the next one.
+
+    Raises
+    ------
+    ValueError
+        If the lists differ in length, the times do not increase, or all levels are zero.
+    """
+
+    kind: ClassVar[str] = "steps"
+    deterministic: ClassVar[bool] = True
+
+    times: tuple[float, ...]
+    levels: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name, unit in (("times", "s"), ("levels", "input unit")):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+            for value in getattr(self, name):
+                checks.require_finite(name, value, unit, label=f"each of the {name}")
+        if len(self.times) != len(self.levels):
+            counts = f"there are {len(self.levels)} of them and {len(self.times)} times"
+            raise OptionError("levels", f"levels must be as many as times, and {counts}.")
+        if not any(self.levels):
+            raise OptionError("levels", "levels must not all be zero [input unit]: such an input excites nothing.")
+        if self.times[0] < 0 or (np.diff(self.times) <= 0).any():
+            raise OptionError("times", f"times must increase from 0 s on; they are {list(self.times)} s.")
+
+    def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
+        """Return the staircase, whose first step must come before the last instant; nothing is drawn."""
+        return _staircase(sample_times, self.times, self.levels)
+
+
+def _staircase(sample_times: Array, times: tuple[float, ...], levels: tuple[float, ...]) -> HeldSignal:
+    """Return values that are held from given instants on, over one record; zero before the first of them."""
+    start, end = float(sample_times[0]), float(sample_times[-1])
+    if times[0] >= end:
+        which = f"the {'first ' * (len(times) > 1)}step at {times[0]:g} s"
+        raise DataError(f"{which} comes too late for a record that ends at {end:g} s")
+    # What begins after the record, or ends before it, is not applied.
+    first = max(int(np.searchsorted(times, start, side="right")) - 1, 0)
+    last = int(np.searchsorted(times, end, side="right"))
+    breaks, values = np.maximum(times[first:last], start), np.array(levels[first:last], dtype=float)
+    if breaks[0] > start:
+        breaks, values = np.concatenate(([start], breaks)), np.concatenate(([0.0], values))
+    return HeldSignal(breaks, values)
 
 
 @dataclass(frozen=True)
 class InputFile(Excitation):
-    """The user's own input, from a comma-separated file.
+    """The user's own input, from a text (.csv), MATLAB or HDF5 file.
 
     Parameters
     ----------
@@ -278,7 +354,7 @@ class InputFile(Excitation):
             raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """The file's signal from the first instant on; nothing is drawn."""
+        """Return the file's signal from the first instant on; nothing is drawn."""
         whole = read_held_signal(self.file, time=self.time, input=self.input, hold=self.hold)
         start, end = float(sample_times[0]), float(sample_times[-1])
         if whole.t[0] >= end:

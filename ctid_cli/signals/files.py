@@ -13,6 +13,9 @@ MAX_VALUES = 100_000_000
 #: Letters of a file that a message repeats, and names that it lists.
 MAX_LETTERS, MAX_NAMES = 24, 20
 
+#: Copies of files that this process was sent, by the SHA-256 of their content.
+COPIES: dict[str, str] = {}
+
 _KINDS = {
     stat.S_ISDIR: "a folder",
     stat.S_ISFIFO: "a pipe",

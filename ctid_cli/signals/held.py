@@ -13,12 +13,24 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.band_limited import finer_times, finer_values, values_between
 from ctid_cli.signals.checks import freeze, require_increasing
-from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.treatment import Hold as Hold
 
 #: Instants closer than this fraction of the shortest break interval count as the same instant.
 #: Products such as ``k * 0.05`` and ``j * 0.5`` name one instant and differ in the last bit.
 COINCIDENCE = 1e-9
+#: A clock counts as regular when no instant is further than this fraction of the interval from its place.
+REGULARITY = 1e-7
+
+
+def regular_interval(t: Array) -> float | None:
+    """Return the interval of a regular clock [s]; None if the clock is irregular."""
+    if t.size < 2:
+        return None
+    interval = float((t[-1] - t[0]) / (t.size - 1))
+    grid = t[0] + interval * np.arange(t.size)
+    # Large times carry their own rounding, which is no sign of an irregular clock.
+    tolerance = REGULARITY * interval + 4 * np.finfo(float).eps * float(np.abs(t).max())
+    return interval if float(np.abs(t - grid).max()) <= tolerance else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +89,7 @@ class HeldSignal:
 
     @cached_property
     def periodic_lines(self) -> HeldSignal:
-        """The same of a signal that repeats itself one interval after its last sample."""
+        """Lines of a signal that repeats itself one interval after its last sample."""
         return self._in_lines(periodic=True)
 
     def _in_lines(self, *, periodic: bool) -> HeldSignal:
@@ -97,7 +109,7 @@ class HeldSignal:
         return float(self.values.mean())
 
     def at(self, times: ArrayLike) -> Array:
-        """Value of the signal at given instants, from the right at a jump.
+        """Return the signal at given instants, from the right at a jump.
 
         Parameters
         ----------
@@ -120,7 +132,7 @@ class HeldSignal:
         return np.where(index < 0, 0.0, held)
 
     def delayed(self, delay: float) -> HeldSignal:
-        """The same signal, later by ``delay``.
+        """Return the signal delayed by ``delay``.
 
         Parameters
         ----------

@@ -11,26 +11,15 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
+from ctid_cli.signals.array_file import HDF5, MATLAB, read_array_table
 from ctid_cli.signals.checks import require_choice
-from ctid_cli.signals.csv_file import read_csv_table
 from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.mat_file import read_mat_table
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
+from ctid_cli.signals.table import USUAL_NAMES, Columns, Role, Table, split_header
+from ctid_cli.signals.text_file import read_text_table
 from ctid_cli.text import closest, listed
 
-Role = Literal["time", "input", "output"]
-
-ROLES: tuple[Role, ...] = get_args(Role)
-
-#: Names by which a column is recognised when nobody says which one it is, the most telling first; case is ignored.
-USUAL_NAMES: dict[Role, tuple[str, ...]] = {
-    "time": ("t", "time", "times", "seconds", "timestamp", "samplinginstants", "ts", "sampletime"),
-    "input": ("u", "input", "inputs", "inputdata"),
-    "output": ("y", "output", "outputs", "outputdata"),
-}
-#: How the names of files that hold text end.
-TEXT_EXTENSIONS = (".csv", ".txt", ".dat", "")
+Offset = Literal["none", "remove"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +53,55 @@ class Measurement:
         return f"{split_header(str(getattr(self, role)))[0]} [{unit}]"
 
 
+def open_table(path: str | os.PathLike[str]) -> Table:
+    """Open a MATLAB or HDF5 file; what has another name is text."""
+    return read_array_table(path) if Path(path).suffix.lower() in MATLAB + HDF5 else read_text_table(path)
+
+
+def read_record(
+    path: str | os.PathLike[str],
+    *,
+    time: str = "t",
+    input: str = "u",
+    output: str = "y",
+    hold: Hold = "zoh",
+    offset: Offset = "none",
+) -> Record:
+    """Record from a file with one line per instant.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A text file whose first line names the columns, or a MATLAB (``.mat``) or HDF5 (``.h5``) file of vectors.
+    time : str, default "t"
+        Column of the instants [s], strictly increasing.
+    input : str, default "u"
+        Column of the input [input unit].
+    output : str, default "y"
+        Column of the output [output unit]; an empty field or NaN is a missing sample.
+    hold : {"zoh", "foh", "band-limited"}, default "zoh"
+        How the input behaves between its samples.
+    offset : {"none", "remove"}, default "none"
+        ``remove`` subtracts the mean of the input and the mean of the present output samples.
+
+    Returns
+    -------
+    Record
+        The record; its name is `path`.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be used; the message names the file, the line and what to do.
+    """
+    require_choice("offset", offset, get_args(Offset))
+    record = read_measurement(path, time=time, input=input, output=output, hold=hold, in_seconds=True).record
+    if offset == "none":
+        return record
+    u, y = record.input.values, record.y
+    return Record(record.t, y - np.nanmean(y), HeldSignal(record.t, u - u.mean(), hold), name=record.name)
+
+
 def read_measurement(
     path: str | os.PathLike[str],
     *,
@@ -74,60 +112,61 @@ def read_measurement(
     start: float | None = None,
     stop: float | None = None,
     reference: str | None = None,
+    in_seconds: bool = False,
 ) -> Measurement:
-    """Record from a comma-separated or MATLAB file, with its units, and the reference of its loop from another column.
+    """Read a record from a file, with its units, and the reference of its loop from another column.
 
     A window is read as if the file had no other lines: the input before it is not used, since the state that it
-    left behind is estimated with the model where that is asked for.
+    left behind is estimated with the model where that is asked for. Where times must be in seconds, a column that is
+    labelled with another unit is refused unless it is named with that unit.
     """
     require_choice("hold", hold, get_args(Hold))
-    cure = "export the record as comma-separated text (.csv) whose first line names the columns, or from MATLAB as"
-    table = read_table(path, f"{cure} vectors (.mat)")
+    table = open_table(path)
     other = None if reference is None else table.named(reference)
-    columns, notes = _choose(table, {"time": time, "input": input, "output": output}, other)
-    unit = {role: split_header(name)[1] for role, name in columns.items()}
-    u, y = table.numbers(columns["input"]), table.numbers(columns["output"])
+    chosen, assumed = _choose(table, {"time": time, "input": input, "output": output}, other)
+    unit = {role: split_header(name)[1] for role, name in chosen.items()}
+    if in_seconds:
+        _require_seconds(table, chosen["time"], time)
+    columns = table.read([*chosen.values(), *filter(None, [other])])
+    notes = [*table.notes, *columns.notes, *assumed]
     label = unit["time"] or "s"
-    t = _instants(table, columns["time"], label, columns["output"], y, notes)
-    table.require_as_many(columns["input"], u, columns["output"], y)
-    table.check_times(columns["time"], t, label)
+    t = _instants(columns, chosen["time"], label, chosen["output"], notes)
+    columns.require_as_many(chosen["input"], columns.values[chosen["input"]], chosen["output"])
+    columns.check_times(chosen["time"], t, label)
     first, last = _window(table, t, start, stop, label)
     if last - first < t.size:
         part = f"Only the {last - first} of {t.size} samples from {t[first]:.6g} to {t[last - 1]:.6g} {label} are used"
         notes.append(f"{part}; the input before them is not.")
-    whole, t = y, t[first:last]
-    u = table.check_input(columns["input"], u[first:last], first)
-    y = table.check_output(columns["output"], y[first:last], first)
+    t = t[first:last]
+    u = columns.check_input(chosen["input"], columns.values[chosen["input"]][first:last], first)
+    y = columns.check_output(chosen["output"], columns.values[chosen["output"]][first:last], first)
     record = Record(t, y, HeldSignal(t, u, hold), name=table.file)
-    named = (columns["time"], columns["input"], columns["output"])
+    named = (chosen["time"], chosen["input"], chosen["output"])
     r = None
     if other is not None:
-        r = table.numbers(other)
-        table.require_as_many(other, r, columns["output"], whole)
-        r = table.check_input(other, r[first:last], first, "reference")
+        columns.require_as_many(other, columns.values[other], chosen["output"])
+        r = columns.check_input(other, columns.values[other][first:last], first, "reference")
     units = unit["time"], unit["input"], unit["output"]
     return Measurement(record, *units, *named, start, stop, tuple(notes), Path(path), other, r)
 
 
-def read_table(path: str | os.PathLike[str], otherwise: str) -> Table:
-    """Columns of a comma-separated or MATLAB file; ``otherwise`` is the advice for all others."""
-    extension = Path(path).suffix.lower()
-    if extension == ".mat":
-        return read_mat_table(path)
-    if extension in TEXT_EXTENSIONS:
-        return read_csv_table(path)
-    raise DataError(f"{os.fspath(path)}: files ending in {extension} are not read; {otherwise}")
+def _require_seconds(table: Table, name: str, asked: str | None) -> None:
+    """Refuse times that are labelled with another unit, unless the column was named with it."""
+    unit = split_header(name)[1]
+    if unit not in (None, "s", "sec", "seconds") and asked != name:
+        wrong = f"the time {name!r} is in {unit}, and seconds are expected"
+        raise DataError(f"{table.head}: {wrong}; convert the column, or name it {name!r} to count in {unit}")
 
 
-def _instants(table: Table, name: str, unit: str, other: str, others: Array, notes: list[str]) -> Array:
-    """The instants of another column, of which one number may be there in their place: their interval."""
-    t = table.numbers(name)
-    if t.size == 1 and others.size > 1:
-        interval = table.lone_interval(name, float(t[0]))
-        t = interval * np.arange(others.size, dtype=float)
+def _instants(columns: Columns, name: str, unit: str, other: str, notes: list[str]) -> Array:
+    """Return the instants of another column, of which one number may be there in their place: their interval."""
+    t, size = columns.values[name], columns.values[other].size
+    if t.size == 1 and size > 1:
+        interval = columns.lone_interval(name)
+        t = interval * np.arange(size, dtype=float)
         note = f"{name!r} is one number: it was taken as the sampling interval"
         notes.append(f"{note}, {interval:g} {unit}, from 0 {unit} on.")
-    table.require_as_many(name, t, other, others)
+    columns.require_as_many(name, t, other)
     return t
 
 
@@ -136,7 +175,6 @@ def _choose(
 ) -> tuple[dict[Role, str], list[str]]:
     """The column of each role that is asked for, and what was assumed."""
     chosen = {role: table.named(wanted) for role, wanted in asked.items() if wanted is not None}
-    refuse_nameless(table)
     for role in asked:
         if role not in chosen and (found := _recognised(table, role, chosen)) is not None:
             chosen[role] = found
@@ -148,7 +186,7 @@ def _choose(
         if name == reference:
             raise DataError(f"{table.head}: {name!r} cannot be both the {role} and the reference")
     unused = [repr(name) for name in table.names if name not in (*chosen.values(), reference)]
-    if unused and table.lines is not None:
+    if unused and table.is_text:
         words = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
         notes.append(f"{words[0]} {listed(unused)} {words[1]} not used.")
     return chosen, notes
@@ -162,7 +200,7 @@ def _take_by_position(table: Table, chosen: dict[Role, str], roles: tuple[Role, 
     left = [name for name in table.names if name not in chosen.values()]
     # A column with a usual name is not put in another place than its name says.
     named = any(table.leaf(name).lower() in USUAL_NAMES[role] for name in left for role in roles)
-    if table.lines is None or len(table.names) != len(roles) or len(left) != len(missing) or named:
+    if not table.is_text or len(table.names) != len(roles) or len(left) != len(missing) or named:
         _refuse_unrecognised(table, missing[0], chosen, roles)
     chosen.update(zip(missing, left, strict=True))
     taken = [f"{chosen[role]!r} as the {role}" for role in missing]
@@ -176,8 +214,9 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
     for usual in USUAL_NAMES[role]:
         matching = [name for name in candidates if table.leaf(name).lower() == usual]
         # What lies in the same struct as the columns that are known belongs to them.
-        close = [name for name in matching if table.lines is None and name.rpartition(".")[0] in homes]
+        close = [name for name in matching if not table.is_text and name.rpartition(".")[0] in homes]
         matching = close or matching
+        table.require_single(matching)
         if len(matching) > 1:
             several = listed([repr(name) for name in matching])
             raise DataError(f"{table.head}: {several} may all be the {role}; say which one (option {role})")
@@ -187,13 +226,12 @@ def _recognised(table: Table, role: Role, chosen: Mapping[Role, str]) -> str | N
 
 
 def _refuse_unrecognised(table: Table, role: Role, chosen: Mapping[Role, str], roles: tuple[Role, ...]) -> NoReturn:
-    refuse_one_column(table)
     if len(table.names) < len(roles) and not table.hint:
         needs = "a record needs a time, an input and an output" if "output" in roles else "an input needs a time too"
-        raise DataError(f"{table.head}: {listing(table)} and nothing else; {needs}")
+        raise DataError(f"{table.head}: {table.listing} and nothing else; {needs}")
     usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
     other = "other " if any(table.leaf(name).lower() in USUAL_NAMES[role] for name in chosen.values()) else ""
-    message = f"{table.head}: no {other}{table.noun} is called {usual}; {listing(table)}"
+    message = f"{table.head}: no {other}{table.noun} is called {usual}; {table.listing}"
     close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, table.names))), None)
     meant = f"; did you mean {close!r}?" if close else ""
     parts = [message, f"Say which one is the {role} (option {role}){meant}", table.hint]
@@ -234,13 +272,38 @@ class MeasuredInput:
 
 
 def read_input(
-    path: str | os.PathLike[str], *, time: str | None = None, input: str | None = None, hold: Hold = "zoh"
+    path: str | os.PathLike[str],
+    *,
+    time: str | None = None,
+    input: str | None = None,
+    hold: Hold = "zoh",
+    in_seconds: bool = False,
 ) -> MeasuredInput:
-    """An input to simulate with, from a file whose other columns do not matter."""
+    """Read an input to simulate with, from a file whose other columns do not matter."""
     require_choice("hold", hold, get_args(Hold))
-    table = read_table(path, "export the input as comma-separated text (.csv) whose first line names the columns")
+    table = open_table(path)
     chosen, _ = _choose(table, {"time": time, "input": input})
+    if in_seconds:
+        _require_seconds(table, chosen["time"], time)
+    columns = table.read(list(chosen.values()))
     unit = {role: split_header(name)[1] for role, name in chosen.items()}
-    u, label = table.numbers(chosen["input"]), unit["time"] or "s"
-    t = table.check_times(chosen["time"], _instants(table, chosen["time"], label, chosen["input"], u, []), label)
-    return MeasuredInput(HeldSignal(t, table.check_input(chosen["input"], u), hold), unit["time"], unit["input"])
+    label = unit["time"] or "s"
+    t = columns.check_times(chosen["time"], _instants(columns, chosen["time"], label, chosen["input"], []), label)
+    u = columns.check_input(chosen["input"], columns.values[chosen["input"]])
+    return MeasuredInput(HeldSignal(t, u, hold), unit["time"], unit["input"])
+
+
+def read_held_signal(
+    path: str | os.PathLike[str], *, time: str = "t", input: str = "u", hold: Hold = "zoh"
+) -> HeldSignal:
+    """Read an input over seconds."""
+    return read_input(path, time=time, input=input, hold=hold, in_seconds=True).signal
+
+
+def read_instants(path: str | os.PathLike[str], time: str = "t") -> Array:
+    """Read instants in seconds, from a file whose other columns do not matter."""
+    table = open_table(path)
+    name = table.named(time)
+    _require_seconds(table, name, time)
+    columns = table.read([name])
+    return columns.check_times(name, columns.values[name])

@@ -1,52 +1,38 @@
-"""What is added to the output: white noise, also with outliers, and white innovations through a rational filter."""
+"""Noise that is added to an output, white or through a rational filter, and the random streams of an experiment."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.signals.checks import require_finite, require_not_negative, require_positive, require_share
+from ctid_cli.signals.checks import require_finite, require_not_negative
 
+Role = Literal["input", "sampling", "noise", "start", "parameters"]
+
+#: First component of every spawn key. Results are repeatable only while these numbers stay what they are.
+ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
 #: Unit of every way to say how strong noise is.
 LEVEL_UNITS = {
     "snr_db": "dB",
     "standard_deviation": "output unit",
     "variance": "output unit^2",
     "innovation_variance": "output unit^2",
-    "intensity": "output unit^2/s",
 }
-
 #: Largest signal-to-noise ratio of either sign; far beyond it no number holds the ratio of the variances.
 MAX_SNR_DB = 1000
 
 
-def require_one_level(noise: Any) -> None:
-    """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
-    levels = {name: getattr(noise, name) for name in LEVEL_UNITS if hasattr(noise, name)}
-    given = [name for name, value in levels.items() if value is not None]
-    if len(given) != 1:
-        choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
-        found = f"{' and '.join(given)} were" if given else "none was"
-        raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
-    check = require_finite if given == ["snr_db"] else require_not_negative
-    check(given[0], levels[given[0]], LEVEL_UNITS[given[0]])
-    if given == ["snr_db"] and abs(noise.snr_db) > MAX_SNR_DB:
-        raise OptionError("snr_db", f"snr_db must be within plus or minus {MAX_SNR_DB} dB, not {noise.snr_db!r}.")
+def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:
+    """Return the random numbers of one role in one replicate; they depend on nothing else.
 
-
-def variance_at(snr_db: float, noise_free: Array | None) -> float:
-    """Variance of noise at a signal-to-noise ratio [dB] to an output."""
-    if noise_free is None:
-        raise DataError("a signal-to-noise ratio is a level only beside a noise-free output; give that")
-    power = float(np.mean(noise_free**2))
-    if power == 0.0:
-        why = "the noise-free output is zero, so no noise has a signal-to-noise ratio to it"
-        raise DataError(f"{why}; is the delay longer than the record? Give noise.variance, or a longer record")
-    return power / 10 ** (snr_db / 10)
+    Levels (noise power, record length, estimators) do not enter, so every level of an experiment sees the
+    same input and the same noise shape in the same replicate, and adding a level changes no other.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROLES[role], replicate)))
 
 
 class Noise:
@@ -58,11 +44,22 @@ class Noise:
     kind: ClassVar[str]
     #: Whether samples at different instants are correlated.
     coloured: ClassVar[bool]
-    #: Whether least squares is the best there is.
-    gaussian: ClassVar[bool] = True
 
     snr_db: float | None
     variance: float | None
+
+    def _require_one_level(self) -> None:
+        """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
+        levels = {name: getattr(self, name) for name in LEVEL_UNITS if hasattr(self, name)}
+        given = [name for name, value in levels.items() if value is not None]
+        if len(given) != 1:
+            choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
+            found = f"{' and '.join(given)} were" if given else "none was"
+            raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
+        check = require_finite if given == ["snr_db"] else require_not_negative
+        check(given[0], levels[given[0]], LEVEL_UNITS[given[0]])
+        if self.snr_db is not None and abs(self.snr_db) > MAX_SNR_DB:
+            raise OptionError("snr_db", f"snr_db must be within plus or minus {MAX_SNR_DB} dB, not {self.snr_db!r}.")
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -76,7 +73,7 @@ class Noise:
         return None if deviation is None else deviation**2
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the innovations.
+        """Return the variance of the innovations.
 
         Parameters
         ----------
@@ -98,12 +95,12 @@ class Noise:
             return given
         variance = self.variance
         if self.snr_db is not None:
-            variance = variance_at(self.snr_db, noise_free)
+            variance = _variance_at(self.snr_db, noise_free)
         assert variance is not None
         return variance / self._unit_variance
 
     def variance_of(self, noise_free: Array | None = None) -> float:
-        """Variance of the noise: that for unit innovations times theirs.
+        """Return the variance of the noise: that for unit innovations times theirs.
 
         Parameters
         ----------
@@ -118,7 +115,7 @@ class Noise:
         return self._unit_variance * self.innovation_variance_of(noise_free)
 
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """Covariance of samples at a distance, from the first state's stationary covariance on.
+        """Return the covariance of samples at a distance.
 
         Parameters
         ----------
@@ -144,7 +141,7 @@ class Noise:
         return np.asarray(self.innovation_variance_of(noise_free) * covariances[distances], dtype=float)
 
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record: filtered innovations; the first state is drawn from its stationary distribution.
+        """Draw the noise of one record: filtered innovations, the first state from its stationary distribution.
 
         Parameters
         ----------
@@ -241,57 +238,7 @@ class WhiteNoise(Noise):
     variance: float | None = None
 
     def __post_init__(self) -> None:
-        require_one_level(self)
-
-
-@dataclass(frozen=True)
-class OutlierNoise(Noise):
-    """Independent Gaussian samples, a few of which are far larger: the contaminated normal distribution.
-
-    Parameters
-    ----------
-    share : float
-        Probability that a sample is an outlier [-], above 0 and below 1.
-    size : float
-        Standard deviation of the outliers over that of the other samples [-].
-    snr_db : float, optional
-        Signal-to-noise ratio [dB]: ten times the decimal logarithm of the mean square of the noise-free
-        output over the variance of all samples.
-    standard_deviation : float, optional
-        Standard deviation of the samples that are no outliers [output unit].
-    variance : float, optional
-        Variance of all samples [output unit^2]. Exactly one of the three is given.
-
-    Notes
-    -----
-    With the standard deviation s of the other samples the variance of all is ``s^2 (1 + share (size^2 - 1))``. The
-    same standard normal samples as of white noise are drawn at every level.
-    """
-
-    kind: ClassVar[str] = "outliers"
-    coloured: ClassVar[bool] = False
-    gaussian: ClassVar[bool] = False
-
-    share: float
-    size: float
-    snr_db: float | None = None
-    standard_deviation: float | None = None
-    variance: float | None = None
-
-    def __post_init__(self) -> None:
-        require_share("share", self.share, whole=False)
-        require_positive("size", self.size, "-")
-        require_one_level(self)
-
-    def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Noise for one record; which samples are outliers is drawn from a stream of its own."""
-        outliers = rng.spawn(1)[0].random(noise_free.size) < self.share
-        return super().generate(noise_free, rng) * np.where(outliers, self.size, 1.0)
-
-    @property
-    def _unit_variance(self) -> float:
-        """Variance of all samples where that of the others is 1."""
-        return 1 + self.share * (self.size**2 - 1)
+        self._require_one_level()
 
 
 @dataclass(frozen=True)
@@ -358,7 +305,7 @@ class ArmaNoise(Noise):
         if largest >= 1.0:
             why = f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound"
             raise OptionError("denominator", f"{why}; all must lie inside the unit circle.")
-        require_one_level(self)
+        self._require_one_level()
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -368,3 +315,14 @@ class ArmaNoise(Noise):
     @property
     def _given_innovation_variance(self) -> float | None:
         return self.innovation_variance
+
+
+def _variance_at(snr_db: float, noise_free: Array | None) -> float:
+    """Return the variance of noise at a signal-to-noise ratio [dB] to an output."""
+    if noise_free is None:
+        raise DataError("a signal-to-noise ratio is relative to a noise-free output; give that")
+    power = float(np.mean(noise_free**2))
+    if power == 0.0:
+        why = "the noise-free output is zero, so no noise has a signal-to-noise ratio to it"
+        raise DataError(f"{why}; is the delay longer than the record? Give noise.variance, or a longer record")
+    return power / 10 ** (snr_db / 10)

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
-from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.regularity import REGULARITY, regular_interval
+from ctid_cli.signals.held import REGULARITY, HeldSignal, Hold, regular_interval
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
@@ -83,7 +82,7 @@ class Record:
     loop : Loop, optional
         What closed the loop; None for a record taken in open loop, or in a loop that is not known.
     feedback : bool, default False
-        Whether the input answers to the output in a way of which ``loop`` says nothing.
+        Whether the input depends on the output in a way that ``loop`` does not describe.
 
     Raises
     ------
@@ -148,7 +147,7 @@ class Record:
 
     @classmethod
     def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:
-        """Record whose input is known at the instants of the output.
+        """Make a record whose input is known at the instants of the output.
 
         Parameters
         ----------
@@ -178,7 +177,7 @@ class Record:
 
     @property
     def in_loop(self) -> bool:
-        """Whether the input is known to answer to the output."""
+        """Whether the input is known to depend on the output."""
         return self.loop is not None or self.feedback
 
     @property
@@ -217,7 +216,7 @@ class Record:
 
 
 def beginning(record: Record, samples: int) -> Record:
-    """The first samples, with the input until then."""
+    """Return the first samples of a record, with the input until then."""
     if record.n_samples <= samples:
         return record
     t = record.t[:samples]
@@ -227,5 +226,5 @@ def beginning(record: Record, samples: int) -> Record:
 
 
 def named(record: Record) -> str:
-    """How a message about a record begins."""
+    """Return how a message about a record begins."""
     return f"{record.name}: " if record.name else ""

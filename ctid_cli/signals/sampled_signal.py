@@ -10,9 +10,9 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, require_positive, require_scale, require_steps
-from ctid_cli.signals.measurement import USUAL_NAMES, no_sample, read_table
+from ctid_cli.signals.measurement import no_sample, open_table
 from ctid_cli.signals.sound import is_sound, read_sound
-from ctid_cli.signals.table import Table, listing, refuse_nameless, refuse_one_column, split_header
+from ctid_cli.signals.table import USUAL_NAMES, Columns, Table, split_header
 
 #: Names by which the signal is recognised when nobody says which column it is, the most telling first.
 SIGNAL_NAMES = (
@@ -78,7 +78,7 @@ def read_sampled_signal(
     start: float | None = None,
     stop: float | None = None,
 ) -> SampledSignal:
-    """Signal from a comma-separated, MATLAB or sound file."""
+    """Read a signal from a text, MATLAB, HDF5 or sound file."""
     if interval is not None:
         require_positive("interval", interval, "s")
     notes: list[str] = []
@@ -87,28 +87,32 @@ def read_sampled_signal(
         interval = 1.0 / rate if interval is None else interval
         notes.append(note)
     else:
-        sources = "comma-separated text (.csv), MATLAB vectors (.mat) or sound (.wav, .flac)"
-        table = read_table(path, f"a signal is read from {sources}")
+        table = open_table(path)
     times, column, more = _columns(table, time, signal, interval is not None)
-    notes += more
     name, unit = split_header(column)
-    values = table.numbers(column)
+    clocked = interval is None and times is not None
+    try:
+        columns = table.read([column, *filter(None, [times if clocked else None])])
+    except DataError as error:
+        if not clocked:
+            raise
+        table.read([column])  # says what is wrong with the signal itself
+        raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
+    notes += [*table.notes, *columns.notes, *more]
+    values = columns.values[column]
     infinite = np.isinf(values)
     if infinite.any():
         values = np.where(infinite, np.nan, values)
     time_unit: str | None = "s"
     if interval is None and times is not None:
         time_unit = split_header(times)[1]
-        try:
-            clock = table.numbers(times)
-        except DataError as error:
-            raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
+        clock = columns.values[times]
         if clock.size == 1 and values.size > 1:
-            interval, first, time_unit = table.lone_interval(times, float(clock[0])), 0.0, time_unit or "s"
+            interval, first, time_unit = columns.lone_interval(times), 0.0, time_unit or "s"
             notes.append(f"{times!r} is one number and was taken as the sampling interval.")
         else:
-            table.require_as_many(times, clock, column, values)
-            values, interval, note = _on_grid(table, times, clock, values, time_unit or "s")
+            columns.require_as_many(times, clock, column)
+            values, interval, note = _on_grid(columns, times, clock, values, time_unit or "s")
             first = float(clock[0])
             notes += [note] if note else []
     else:
@@ -130,24 +134,22 @@ def read_sampled_signal(
 
 def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) -> tuple[str | None, str, list[str]]:
     """Columns of the times and of the signal, and what was assumed."""
-    refuse_nameless(table)
-    refuse_one_column(table)
     times = table.named(time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
     if times is None and not clocked:
         ways = "Say which one holds the times (--time), or give the clock (--interval SECONDS or --rate HERTZ)"
-        raise DataError(f"{table.head}: no {table.noun} is called 't' or 'time'; {listing(table)}. {ways}")
+        raise DataError(f"{table.head}: no {table.noun} is called 't' or 'time'; {table.listing}. {ways}")
     column = table.named(signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
     left = [name for name in table.names if name != times]
     notes = []
     if column is None:
         if len(left) != 1 and table.noun != "channel":
-            which = f"{listing(table)}. Say which one is the signal (--signal)"
+            which = f"{table.listing}. Say which one is the signal (--signal)"
             raise DataError(f"{table.head}: no {table.noun} is called 'y' or 'signal'; {which}")
         column = left[0]
     if column == times:
         raise DataError(f"{table.head}: {column!r} cannot be both the time and the signal")
     unused = [name for name in left if name != column]
-    if unused and table.lines is not None:
+    if unused and table.is_text:
         notes.append(f"Not used: {', '.join(map(repr, unused))}.")
     return times, column, notes
 
@@ -157,11 +159,11 @@ def _usual(table: Table, usual: tuple[str, ...], taken: str | None) -> str | Non
     return next((name for name in found if taken not in (name, table.leaf(name))), None)
 
 
-def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tuple[Array, float, str]:
+def _on_grid(columns: Columns, name: str, t: Array, values: Array, unit: str) -> tuple[Array, float, str]:
     """Samples at all instants of the grid that the times lie on, its interval, and a note on what is missing."""
-    table.check_times(name, t, unit)
+    columns.check_times(name, t, unit)
     if t.size < 2:
-        raise DataError(f"{table.file}: one sample has no frequency")
+        raise DataError(f"{columns.file}: one sample has no frequency")
     steps = np.diff(t)
     places, interval, stray = _nearest_grid(t, float(np.median(steps)))
     tolerance = 4 * np.finfo(float).eps * float(np.abs(t).max())
@@ -172,10 +174,10 @@ def _on_grid(table: Table, name: str, t: Array, values: Array, unit: str) -> tup
         places, interval, stray = _nearest_grid(t, float(steps.min()))
         if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
             ways = "Resample the record, or give its clock (--interval or --rate) if its times are only rounded"
-            raise DataError(f"{table.place(worst)}: the clock is not regular: {beside}. {ways}")
+            raise DataError(f"{columns.place(worst)}: the clock is not regular: {beside}. {ways}")
     if places[-1] > MOST_FILLED * t.size:
         some = f"of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
-        raise DataError(f"{table.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
+        raise DataError(f"{columns.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
     if places[-1] + 1 == t.size:
         return values, interval, ""
     filled = np.full(int(places[-1]) + 1, np.nan)

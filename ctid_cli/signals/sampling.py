@@ -7,17 +7,18 @@ from typing import ClassVar, Literal, get_args
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.errors import OptionError
-from ctid_cli.signals.checks import require_choice, require_integer, require_positive
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.signals import checks
+from ctid_cli.signals.measurement import read_instants
 
 InputRecord = Literal["sampled", "exact"]
 
 
 def geometric_sizes(first: int, last: int, count: int) -> list[int]:
-    """Whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows with them."""
-    require_integer("the first size", first, 1)
-    require_integer("the last size", last, 1)
-    require_integer("the count", count, 2)
+    """Return whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows."""
+    checks.require_integer("the first size", first, 1)
+    checks.require_integer("the last size", last, 1)
+    checks.require_integer("the count", count, 2)
     if first >= last:
         raise ValueError(f"the first size must be below the last; they are {first} and {last}.")
     sizes = [int(size) for size in np.rint(np.geomspace(first, last, count))]
@@ -48,7 +49,7 @@ class Sampling(ABC):
 
     @abstractmethod
     def times(self, rng: np.random.Generator) -> Array:
-        """Sampling instants.
+        """Return the sampling instants.
 
         Parameters
         ----------
@@ -58,7 +59,7 @@ class Sampling(ABC):
         Returns
         -------
         ndarray, shape (N,)
-            Instants [s], the first 0.
+            Instants [s], increasing.
         """
 
 
@@ -70,9 +71,9 @@ class OfInterval(Sampling):
     samples: int = field(metadata={"geometric": True})
 
     def __post_init__(self) -> None:
-        require_positive("interval", self.interval, "s")
-        require_integer("samples", self.samples, 2)
-        require_choice("input_record", self.input_record, get_args(InputRecord))
+        checks.require_positive("interval", self.interval, "s")
+        checks.require_integer("samples", self.samples, 2)
+        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
 
     @property
     def mean_interval(self) -> float:
@@ -108,7 +109,7 @@ class RegularSampling(OfInterval):
     input_record: InputRecord = "sampled"
 
     def times(self, rng: np.random.Generator) -> Array:
-        """The clock; nothing is drawn."""
+        """Return the ticks of the clock; nothing is drawn."""
         return self.interval * np.arange(self.samples, dtype=float)
 
 
@@ -130,8 +131,8 @@ class UniformIntervals(Sampling):
     Notes
     -----
     Holding the samples of an input whose edges fall between them makes it late by half an interval on
-    average, which biases the delay: that is what ``sampled`` is for. :class:`IrregularSampling` is the same scheme by
-    its mean.
+    average, which biases the delay: that is what ``sampled`` is for. :class:`IrregularSampling` draws the same
+    intervals, given by their mean.
     """
 
     kind: ClassVar[str] = "uniform_intervals"
@@ -142,12 +143,12 @@ class UniformIntervals(Sampling):
     input_record: InputRecord = "exact"
 
     def __post_init__(self) -> None:
-        require_positive("low", self.low, "s")
-        require_positive("high", self.high, "s")
+        checks.require_positive("low", self.low, "s")
+        checks.require_positive("high", self.high, "s")
         if self.low > self.high:
             raise OptionError("low", f"low must not exceed high; they are {self.low:g} s and {self.high:g} s.")
-        require_integer("samples", self.samples, 2)
-        require_choice("input_record", self.input_record, get_args(InputRecord))
+        checks.require_integer("samples", self.samples, 2)
+        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
 
     @property
     def mean_interval(self) -> float:
@@ -155,10 +156,146 @@ class UniformIntervals(Sampling):
         return 0.5 * float(self.low + self.high)
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Instants at intervals that are drawn."""
-        return from_zero(rng.uniform(self.low, self.high, self.samples - 1))
+        """Return instants at intervals that are drawn."""
+        return _from_zero(rng.uniform(self.low, self.high, self.samples - 1))
 
 
-def from_zero(intervals: Array) -> Array:
-    """Instants at given intervals [s], the first 0."""
+@dataclass(frozen=True)
+class IrregularSampling(OfInterval):
+    """Samples at independent random intervals around a mean, from 0 s.
+
+    Parameters
+    ----------
+    interval : float
+        Mean interval [s]; in place of interval and samples, ``times`` may list the instants, or ``file`` name a file.
+    samples : int
+        Number of samples, at least 2.
+    spread : float, default 0.5
+        Intervals are uniform within this fraction below and above the mean [-], above 0 and below 1.
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+
+    Notes
+    -----
+    The same as ``uniform_intervals`` with ``low = (1 - spread) interval`` and ``high = (1 + spread) interval``.
+    """
+
+    kind: ClassVar[str] = "irregular"
+
+    spread: float = 0.5
+    input_record: InputRecord = "exact"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.require_share("spread", self.spread, whole=False)
+
+    def times(self, rng: np.random.Generator) -> Array:
+        """Return instants at intervals that are drawn."""
+        low, high = (1 - self.spread) * self.interval, (1 + self.spread) * self.interval
+        return _from_zero(rng.uniform(low, high, self.samples - 1))
+
+
+@dataclass(frozen=True)
+class JitteredSampling(OfInterval):
+    """Samples near the ticks of a regular clock, from 0 s; the errors of the instants do not add up.
+
+    Parameters
+    ----------
+    interval : float
+        Interval of the clock [s].
+    samples : int
+        Number of samples, at least 2.
+    largest_shift : float
+        Each instant but the first is off its tick by an independent time, uniform within plus or minus this [s];
+        less than half the interval.
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+
+    Notes
+    -----
+    The instants are known to the estimator: this is a clock that is recorded, not one that is mistaken.
+    """
+
+    kind: ClassVar[str] = "jitter"
+
+    largest_shift: float
+    input_record: InputRecord = "exact"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.require_not_negative("largest_shift", self.largest_shift, "s")
+        if self.largest_shift >= 0.5 * self.interval:
+            most = f"half the interval, {0.5 * self.interval:g} s; it is {self.largest_shift:g} s"
+            raise OptionError("largest_shift", f"largest_shift must be less than {most}: samples would change places.")
+
+    def times(self, rng: np.random.Generator) -> Array:
+        """Return the ticks of the clock with shifts that are drawn."""
+        shifts = rng.uniform(-self.largest_shift, self.largest_shift, self.samples - 1)
+        ticks = self.interval * np.arange(self.samples, dtype=float)
+        ticks[1:] += shifts
+        return ticks
+
+
+class GivenInstants(Sampling):
+    """Samples at instants that are known before any data are made; the record begins at the first of them."""
+
+    kind: ClassVar[str] = "irregular"
+    #: No random number is drawn.
+    deterministic: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class ListedInstants(GivenInstants):
+    """Samples at instants that are listed.
+
+    Parameters
+    ----------
+    instants : tuple of float
+        The instants [s], two or more that increase.
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+    """
+
+    instants: tuple[float, ...]
+    input_record: InputRecord = "exact"
+
+    def times(self, rng: np.random.Generator) -> Array:
+        """Return the instants; nothing is drawn."""
+        return np.array(self.instants, dtype=float)
+
+
+@dataclass(frozen=True)
+class InstantsFile(GivenInstants):
+    """Samples at instants from a text (.csv), MATLAB or HDF5 file.
+
+    Parameters
+    ----------
+    file : str
+        Name of the file; its first line names the columns.
+    time : str, default "t"
+        Column of the instants [s], strictly increasing.
+    sha256 : str, optional
+        SHA-256 of the file, to make sure of its content; a specification fills it in from the file.
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+    """
+
+    file: str
+    time: str = "t"
+    sha256: str | None = None
+    input_record: InputRecord = "exact"
+
+    def __post_init__(self) -> None:
+        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
+
+    def times(self, rng: np.random.Generator) -> Array:
+        """Return the instants of the file; nothing is drawn."""
+        instants = read_instants(self.file, self.time)
+        if instants.size < 2:
+            raise DataError(f"{self.file}: there is one instant, and a record has two or more")
+        return instants
+
+
+def _from_zero(intervals: Array) -> Array:
+    """Return instants at given intervals [s], the first 0."""
     return np.concatenate(([0.0], np.cumsum(intervals)))

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import OptionError
 from ctid_cli.signals.checks import require_choice, require_finite, require_positive
-from ctid_cli.signals.drifts import ContinuousNoise, noise_at
 from ctid_cli.signals.held import COINCIDENCE
 from ctid_cli.signals.noise import Noise
 
@@ -124,12 +123,12 @@ class SumOfSinusoids:
         return float(max(_values(tone.frequency).max() for tone in self.tones))
 
     def frequencies_at(self, times: ArrayLike) -> Array:
-        """Frequencies at some instants."""
+        """Return the frequencies at some instants [rad/s], one row each, ascending."""
         t = np.asarray(times, dtype=float)
         return np.sort(np.column_stack([_course_at(tone.frequency, t) for tone in self.tones]), axis=1)
 
     def generate(self, times: ArrayLike) -> Array:
-        """The signal."""
+        """Return the signal at some instants [signal unit]."""
         t = np.asarray(times, dtype=float)
         total = np.full(t.size, float(self.bias))
         for tone in self.tones:
@@ -164,13 +163,13 @@ class UniformDisturbance:
         require_positive("half_width", self.half_width, "signal unit")
 
     def generate(self, undisturbed: Array, rng: np.random.Generator) -> Array:
-        """Disturbance of one record; of the signal without it only the length matters."""
+        """Draw the disturbance of one record; of the signal only the length matters."""
         return self.half_width * rng.uniform(-1.0, 1.0, undisturbed.size)
 
 
 @dataclass(frozen=True)
 class SineDisturbance:
-    """One more sinusoid, which is not asked for.
+    """One more sinusoid, whose frequency is not estimated.
 
     Parameters
     ----------
@@ -201,11 +200,11 @@ class SineDisturbance:
         require_finite("phase", self.phase, "rad")
 
     def at(self, times: ArrayLike) -> Array:
-        """The disturbance at some instants."""
+        """Return the disturbance at some instants [signal unit]."""
         return self.amplitude * np.sin(self.frequency * np.asarray(times, dtype=float) + self.phase)
 
 
-Disturbance = UniformDisturbance | SineDisturbance | Noise | ContinuousNoise
+Disturbance = UniformDisturbance | SineDisturbance | Noise
 
 
 def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: np.random.Generator) -> Array:
@@ -214,7 +213,7 @@ def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: n
         return signal
     if isinstance(disturbance, SineDisturbance):
         return signal + disturbance.at(times)
-    return signal + noise_at(disturbance, times, signal, rng)
+    return signal + disturbance.generate(signal, rng)
 
 
 def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> None:
@@ -252,7 +251,7 @@ def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:
 
 
 def _place(course: float | tuple[Piece, ...], t: Array) -> IndexArray:
-    """Number of the piece at each instant; 3 k 0.1 and k 0.3 are one instant, whatever their last bits."""
+    """Return the number of the piece at each instant; 3 k 0.1 and k 0.3 are one instant, whatever their last bits."""
     ends = _ends(course)
     return np.searchsorted(ends * (1.0 - COINCIDENCE), t, side="right")
 

@@ -1,4 +1,7 @@
-"""How the signals of a record are treated: the words that commands, specifications and options have in common."""
+"""Words for how the signals of a record are treated, shared by commands, specifications and options.
+
+They have a file of their own because the command line starts with them and without NumPy.
+"""
 
 from typing import Literal
 

@@ -20,7 +20,7 @@ from ctid_cli.inference.criteria import fit_percent
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals import drifts, noise
+from ctid_cli.signals import noise
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.text import did_you_mean
@@ -170,10 +170,55 @@ class Estimator(ABC):
         """
 
 
+class Measure(ABC):
+    """A custom measure of an estimate; its options are the fields of a frozen dataclass.
+
+    Its value is stored with every estimate. Tables show the median over the data sets.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from ctid_cli import Measure
+    >>> @dataclass(frozen=True)
+    ... class GainError(Measure):
+    ...     unit = "%"
+    ...     def value(self, fit, data):
+    ...         true = data.true_model.steady_state_gain
+    ...         return 100.0 * abs(fit.model.steady_state_gain / true - 1.0)
+    """
+
+    #: Unit of the value, which tables show.
+    unit: ClassVar[str] = "-"
+
+    @abstractmethod
+    def value(self, fit: Any, data: Any) -> float:
+        """Return the value of the measure.
+
+        Parameters
+        ----------
+        fit : Fit
+            The estimate as the estimator returned it. What is returned as a mapping has ``parameters`` and
+            ``standard_errors`` by name, and a ``model`` where these make one. An estimate of the frequencies of a
+            signal has ``found``, a `FrequencyTrack` or a `FrequencyEstimate`.
+        data : DataSet
+            What `simulate_dataset` returns: ``record`` and, of one of ctid's systems, ``true_model``.
+
+        Returns
+        -------
+        float
+            The value [unit]; NaN where there is none.
+
+        Raises
+        ------
+        Exception
+            Any exception leaves the estimate as it is, without a value of the measure; its text is stored in the
+            message of the estimate.
+        """
+
+
 System.register(TransferFunction)
 System.register(AdditiveModel)
 Noise.register(noise.Noise)
-Noise.register(drifts.ContinuousNoise)  # type: ignore[type-abstract]
 Estimator.register(common.Estimator)
 
 
@@ -249,6 +294,18 @@ class PreparedCustom:
         if not all(np.array_equal(now, then, equal_nan=True) for now, then in pairs):
             raise changes
         return taken(found, record, what)
+
+
+def value_of(measure: Measure, fit: Any, data: Any) -> float:
+    """Return the value of a measure, which is given copies: nothing that it changes is seen by what comes next."""
+    what = f"{type(measure).__name__}.value"
+    measure, fit, data = copy.deepcopy((measure, fit, data))
+    value = measure.value(fit, data)
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise ComponentError(f"{what} returned {type(value).__name__}; one number is expected, float(...)")
+    if np.isinf(value):
+        raise ComponentError(f"{what} returned {float(value)}; a number, or NaN where there is no value, is expected")
+    return float(value)
 
 
 def taken(found: Any, record: Record, what: str) -> Fit:

@@ -5,36 +5,30 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.common import Start
 from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousPid, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.csv_file import Offset, read_held_signal, read_record
-from ctid_cli.signals.excitation import Excitation, InputFile
-from ctid_cli.signals.files import require_file
-from ctid_cli.signals.held import HeldSignal, Hold
-from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.excitation import Excitation
+from ctid_cli.signals.files import COPIES, require_file
+from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
+from ctid_cli.signals.measurement import Offset, read_measurement
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.record import Enters, Loop, Record
-from ctid_cli.signals.recorder import Recorder
-from ctid_cli.signals.regularity import regular_interval
 from ctid_cli.signals.sampling import Sampling
-from ctid_cli.signals.send_on_delta import SendOnDelta
-from ctid_cli.signals.streams import stream
-from ctid_cli.signals.table import split_header
 from ctid_cli.simulation.components import ComponentError, Noise, System, is_custom
 
 #: Data sets to try models on are numbered from here: no experiment has so many.
@@ -155,7 +149,6 @@ class SimulatedSource:
     noise: Noise | None
     seed: int
     loop: LoopOptions | None = None
-    recorder: Recorder = field(default_factory=Recorder)
     #: Whether models are tried on a data set besides the one that they are estimated from.
     fresh: bool = False
 
@@ -191,7 +184,7 @@ class SimulatedSource:
 
     def _realised(self, replicate: int) -> DataSet:
         with at("sampling"):
-            times = samples_of(self.sampling, "times", stream(self.seed, "sampling", replicate))
+            times = samples_of(_as_planned(self.sampling), "times", stream(self.seed, "sampling", replicate))
             if times.size < 2 or not (np.diff(times) > 0).all():
                 wanted = "must return two or more instants that increase"
                 raise ComponentError(f"{_called(self.sampling, 'times')} {wanted}")
@@ -207,24 +200,18 @@ class SimulatedSource:
                 output = samples_of(self.system, "simulate", applied, times, size=times.size)
             else:
                 output = _simulated(true_model, applied, times)
-        y = self.recorder.rounded(output + self._drawn(times, output, replicate))
-        if isinstance(self.sampling, SendOnDelta):
-            with at("sampling"):
-                sent = self.sampling.sent(y)
-            times, output, y = times[sent], output[sent], y[sent]
+        y = output + self._drawn(times, output, replicate)
         known = applied
         if self.sampling.input_record == "sampled":
             known = HeldSignal(times, applied.at(times), applied.hold)
-        record = Record(times, self._with_losses(y, replicate), known, noise_free=output)
-        return DataSet(record, true_model=true_model)
+        return DataSet(Record(times, y, known, noise_free=output), true_model=true_model)
 
     def _applied(self, times: Array, replicate: int) -> HeldSignal:
         """Return what drives the simulation: the input, or the reference of the loop."""
         generator = self.excitation if self.loop is None else self.loop.reference
         if generator is None:  # a relay needs no reference
             return HeldSignal(times[:1], np.zeros(1))
-        if isinstance(generator, InputFile) and generator.sha256 is not None:
-            require_content(generator.file, generator.sha256)
+        generator = _as_planned(generator)
         found = made(generator, "generate", times, stream(self.seed, "input", replicate))
         if not isinstance(found, HeldSignal):
             text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
@@ -246,8 +233,7 @@ class SimulatedSource:
             u, x = simulate_loop(system, controller, r, noise, interval, loop.enters)
         # Estimators know the loops of linear controllers only.
         closed = None if isinstance(controller, Relay) else Loop(r, controller, loop.enters)
-        y = self._with_losses(self.recorder.rounded(x + noise), replicate)
-        return Record(times, y, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
+        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
 
     def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:
@@ -257,9 +243,6 @@ class SimulatedSource:
             if getattr(type(self.noise), "generate_at", Noise.generate_at) is not Noise.generate_at:
                 return samples_of(self.noise, "generate_at", times, output, rng, size=output.size, missing=True)
             return samples_of(self.noise, "generate", output, rng, size=output.size, missing=True)
-
-    def _with_losses(self, y: Array, replicate: int) -> Array:
-        return self.recorder.with_losses(y, stream(self.seed, "recorder", replicate))
 
 
 @contextmanager
@@ -313,7 +296,7 @@ class MeasuredSource:
     Parameters
     ----------
     file : str
-        Comma-separated file, relative to the folder of the specification.
+        File with the record, relative to the folder of the specification.
     sha256 : str, optional
         SHA-256 of the file.
     time : str, default "t"
@@ -355,9 +338,15 @@ class MeasuredSource:
         """Read the record."""
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
-        if self.sha256 is not None:
-            require_content(self.file, self.sha256)
-        whole = read_record(self.file, time=self.time, input=self.input, output=self.output, hold=self.hold)
+        file = self.file if self.sha256 is None else require_content(self.file, self.sha256)
+        columns: dict[str, Any] = {
+            "time": self.time,
+            "input": self.input,
+            "output": self.output,
+            "reference": self.reference,
+        }
+        measured = read_measurement(file, **columns, hold=self.hold, in_seconds=True)
+        whole = measured.record
         t, u, y = whole.t, whole.input.values, whole.y
         count = t.size if self.estimation_samples is None else self.estimation_samples
         used = f"the {count} samples used for estimation"
@@ -369,8 +358,8 @@ class MeasuredSource:
             constant = f"the input {self.input!r} is constant ({u[0]:g}) over {used}"
             raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
         loop = None
-        if self.reference is not None:
-            r = read_held_signal(self.file, time=self.time, input=self.reference).values[:count]
+        if measured.reference_values is not None:
+            r = measured.reference_values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
                 # A record of a loop is refused where its clock is not regular.
@@ -437,123 +426,19 @@ def file_sha256(path: str) -> str:
         raise DataError(f"{path}: the file cannot be read: {error.strerror or error}") from None
 
 
-def require_content(path: str, sha256: str) -> None:
-    """Refuse a file that is not the one that an experiment was planned with."""
+def require_content(path: str, sha256: str) -> str:
+    """Return where a file can be read; refuse one that is not that which an experiment was planned with."""
+    if sha256 in COPIES:
+        return COPIES[sha256]
     found = file_sha256(path)
     if found != sha256:
         planned = f"is not that which the experiment was planned with ({sha256[:12]}…)"
         restore = "restore the file, or run the changed one as an experiment of its own"
         raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")
+    return path
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# A measured record with the loop that it was taken in
-
-#: Share of the moves of the input [-] that the controller may leave unexplained: what rounding in a file does.
-UNEXPLAINED = 0.05
-
-
-def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
-    """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
-    record, r = measured.record, measured.reference_values
-    assert r is not None
-    if isinstance(loop.controller, Relay):
-        raise DataError(
-            f"{record.name}: {_IGNORE.format('closed-loop instruments need a linear controller, no relay')}"
-        )
-    _check_units(measured, loop)
-    if record.interval is None:
-        why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
-        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
-    controller = loop.at(record.interval).controller
-    left = unexplained(record, r, controller, loop.enters)
-    if not left <= UNEXPLAINED:
-        made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
-        why = (
-            f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
-            "controller in continuous time, another sampling interval, sign or reference, or limits of the actuator "
-            "do that, and estimates with it would be wrong"
-        )
-        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
-    closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
-    return replace(measured, record=closed)
-
-
-_IGNORE = "{}; correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
-
-
-def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:
-    """Return the root mean square of ``A u - B e`` relative to that of its terms; ``C = B/A``, any initial state."""
-    a, b = controller.denominator, controller.numerator
-    b = np.concatenate((np.zeros(a.size - b.size), b))
-    at_controller = enters == "controller"
-    u, driven = record.input.values, (r if at_controller else 0.0) - record.y
-    own = u if at_controller else u - r
-    # From the first instant on at which all samples of the polynomials are there.
-    moves, made = np.convolve(own, a, "valid"), np.convolve(driven, b, "valid")
-    left = moves - made
-    present = np.isfinite(left)
-    scale = float(np.mean(moves[present] ** 2)) if present.any() else 0.0
-    return float(np.sqrt(np.mean(left[present] ** 2) / scale)) if scale > 0 else float("inf")
-
-
-def _check_units(measured: Measurement, loop: LoopOptions) -> None:
-    """Refuse a reference in another unit than the signal that it is compared with."""
-    assert measured.reference is not None
-    unit = split_header(measured.reference)[1]
-    what = "output" if loop.enters == "controller" else "input"
-    other = measured.output_unit if loop.enters == "controller" else measured.input_unit
-    if unit is not None and other is not None and unit != other:
-        column = f"the reference {measured.reference!r} is in {unit}, and the {what} that it enters with in {other}"
-        raise DataError(f"{measured.record.name}: {column}; name another column, or say where it enters (loop.enters)")
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Where estimates start: what a start is called, and what it is on a data set
-
-
-@dataclass(frozen=True)
-class StartPoint:
-    """A start: an initial delay, initial parameters, or none."""
-
-    label: str
-    #: What of an estimate it is a start of.
-    of: Literal["delay", "parameters"] | None = None
-    #: Initial delay [s], or the word random; None leaves it to the estimator.
-    initial_delay: float | str | None = None
-    #: Range of a random delay [s].
-    bounds: tuple[float, float] | None = None
-    #: Largest relative deviation of random parameters from those of the simulated system [-].
-    spread: float | None = None
-    model: AdditiveModel | None = field(default=None, compare=False)
-
-    def draw(
-        self, seed: int | None, replicate: int, true_model: TransferFunction | AdditiveModel | None = None
-    ) -> Start | None:
-        """Return the start on one data set.
-
-        Every random start stretches the same numbers of the replicate's stream over its own range, so that no start
-        depends on which others there are.
-        """
-        if seed is None and (self.bounds is not None or self.spread is not None):
-            raise ValueError("a random start needs the seed of the experiment")
-        if self.bounds is not None:
-            low, high = self.bounds
-            return Start(delay=low + (high - low) * float(stream(cast(int, seed), "start", replicate).random()))
-        if self.spread is not None:
-            centre = additive_form(cast(AdditiveModel, true_model))
-            numbers = stream(cast(int, seed), "parameters", replicate).uniform(-1.0, 1.0, centre.theta.size)
-            theta = centre.theta * (1 + self.spread * numbers)
-            return Start(model=AdditiveModel.from_theta(theta, centre.terms, centre.delay))
-        if self.of is None:
-            return None
-        return Start(delay=cast(float | None, self.initial_delay), model=self.model)
-
-
-#: The start of estimators that need none, and of every estimator where the specification names none.
-NO_START = StartPoint("none")
-
-
-def additive_form(model: TransferFunction | AdditiveModel) -> AdditiveModel:
-    """Return a model as a sum of submodels."""
-    return model if isinstance(model, AdditiveModel) else factored(model)
+def _as_planned(options: Any) -> Any:
+    """Return options that read a file with the path at which the planned file can be read."""
+    sha256 = None if is_custom(options) else getattr(options, "sha256", None)
+    return options if sha256 is None else replace(options, file=require_content(options.file, sha256))

@@ -9,27 +9,29 @@ Names of the measures, each with the number of the tone behind it where it is on
   They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
 - ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
 - ``false_alarms``: alarms with no step of a frequency or an amplitude in the last two periods of the lowest frequency,
-  of trackers that raise any;
+  of estimators that raise any;
 - ``valid_share``: share of the record with a valid estimate [%].
 
-An estimate of a whole record has ``omega``, ``rms`` and ``bias`` of this one error, and ``valid_share`` 0 or 100.
+A track of one row is an estimate of the whole record: it has ``omega``, ``rms``, ``bias`` and ``valid_share`` only.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.frequency.base import FrequencyTrack
-from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.errors import DataError
+from ctid_cli.frequency.base import Flag, FrequencyEstimator, FrequencyTrack
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb
-from ctid_cli.signals.streams import stream
+from ctid_cli.simulation.components import ComponentError, is_custom
 
 #: Units of the measures, in the order of columns.
 MEASURE_UNITS = {
@@ -46,8 +48,8 @@ MEASURE_UNITS = {
 ALARM_PERIODS = 2.0
 #: Length of the window of rms and bias, before the end of the record, if none is given [s].
 USUAL_WINDOW = 10.0
-#: Kinds of trackers that raise alarms.
-_ALARMING = ("restarting_least_squares",)
+#: Samples of the record that an estimator is compiled with.
+COMPILED_WITH = 16
 
 
 @dataclass(frozen=True)
@@ -71,37 +73,23 @@ def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, to
 
 
 def measure_track(
-    track: FrequencyTrack, true: Array, signal: SumOfSinusoids, measuring: Measuring, options: Any
+    track: FrequencyTrack, times: Array, true: Array, signal: SumOfSinusoids, measuring: Measuring, *, alarms: bool
 ) -> dict[str, float | None]:
-    """Measure the estimates of an online estimator."""
-    t, errors, valid = track.t, track.frequencies - true, track.valid
-    count = errors.shape[1]
+    """Measure estimates against the frequencies at the instants of the samples; alarms are counted where asked for."""
     found = _numbered("omega", track.frequencies[-1])
-    found["valid_from"] = float(t[np.argmax(valid)]) if valid.any() else None
-    if measuring.band is not None:
-        steps = [float(step) for step in signal.frequency_steps]
-        # The first sample of a piece may come before the instant of the step by a rounding error.
-        places = [0, *(int(np.searchsorted(t, step * (1.0 - 1e-9))) for step in steps), t.size]
-        inside = np.abs(errors) <= measuring.band
-        for k in range(count):
-            found[f"settling_time_{k + 1}"] = _settling(inside[:, k], t, 0, places[1], 0.0)
-            if steps:
-                after = _settling(inside[:, k], t, places[-2], places[-1], steps[-1])
-                found[f"settling_after_step_{k + 1}"] = after
-    chosen = errors[_in_window(t, measuring.window)]
+    # The one row of a whole record holds at all its instants.
+    errors = track.frequencies - true
+    if track.t.size > 1:
+        found["valid_from"] = float(times[np.argmax(track.valid)]) if track.valid.any() else None
+        if measuring.band is not None:
+            found |= _settling_times(np.abs(errors) <= measuring.band, times, signal)
+    chosen = errors[_in_window(times, measuring.window)]
     found |= _numbered("rms", np.sqrt(np.mean(chosen**2, axis=0)))
     found |= _numbered("bias", np.mean(chosen, axis=0))
-    if options.kind in _ALARMING:
+    if alarms:
         found["false_alarms"] = float(_false_alarms(track, signal))
-    found["valid_share"] = 100.0 * float(np.mean(valid))
+    found["valid_share"] = 100.0 * float(np.mean(track.valid))
     return {name: found[name] for name in measure_names([found])}
-
-
-def measure_estimate(estimate: FrequencyEstimate, true: Array, window: tuple[float, float] | None, times: Array) -> Any:
-    """Measure the estimate of a whole record."""
-    error = estimate.omega - true[_in_window(times, window)].mean(axis=0)
-    found = _numbered("omega", estimate.omega) | _numbered("rms", np.abs(error)) | _numbered("bias", error)
-    return found | {"valid_share": 100.0 if estimate.valid else 0.0}
 
 
 def measure_names(rows: Iterable[Mapping[str, Any] | None]) -> list[str]:
@@ -136,6 +124,20 @@ def _numbered(name: str, values: Array) -> dict[str, float | None]:
     return {f"{name}_{k + 1}": float(value) if np.isfinite(value) else None for k, value in enumerate(values)}
 
 
+def _settling_times(inside: BoolArray, times: Array, signal: SumOfSinusoids) -> dict[str, float | None]:
+    """Return when each error came into the band to stay, from the start and after the last step of a frequency."""
+    steps = [float(step) for step in signal.frequency_steps]
+    # The first sample of a piece may come before the instant of the step by a rounding error.
+    places = [0, *(int(np.searchsorted(times, step * (1.0 - 1e-9))) for step in steps), times.size]
+    found: dict[str, float | None] = {}
+    for k in range(inside.shape[1]):
+        found[f"settling_time_{k + 1}"] = _settling(inside[:, k], times, 0, places[1], 0.0)
+        if steps:
+            after = _settling(inside[:, k], times, places[-2], places[-1], steps[-1])
+            found[f"settling_after_step_{k + 1}"] = after
+    return found
+
+
 def _settling(inside: BoolArray, t: Array, first: int, last: int, since: float) -> float | None:
     place = first + int(np.flatnonzero(~inside[first:last]).max(initial=-1)) + 1
     # A difference of instants, without the last digits of either.
@@ -164,10 +166,15 @@ def _false_alarms(track: FrequencyTrack, signal: SumOfSinusoids) -> int:
 class SignalRecord:
     """What estimators of frequencies are given."""
 
-    #: Disturbed signal [signal unit], shape (N,).
+    #: Disturbed signal [signal unit], shape (N,); cannot be changed.
     samples: Array
     #: Sampling interval [s].
     interval: float
+
+    @property
+    def times(self) -> Array:
+        """Instants of the samples [s], shape (N,)."""
+        return self.interval * np.arange(self.samples.size, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,17 +188,12 @@ class SignalDataSet:
 
     def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
         """Return what is stored of a fit to the record."""
-        source, measuring = self.source, self.source.measuring
-        times = self.record.interval * np.arange(self.record.samples.size, dtype=float)
-        true = true_frequencies(source.signal, source.disturbance, fit.options.tones, times)
-        found = fit.found
-        reasons = found.reasons(-1) if isinstance(found, FrequencyTrack) else found.reasons
-        result: dict[str, Any] = {"status": "VALID", "message": "The last estimate is valid."}
-        if reasons:
-            result = {"status": "INVALID", "message": " ".join(reasons)}
-        if not isinstance(found, FrequencyTrack):
-            return result | {"measures": measure_estimate(found, true, measuring.window, times)}
-        return result | {"measures": measure_track(fit.found, true, source.signal, measuring, fit.options)}
+        signal, times, options = self.source.signal, self.record.times, fit.options
+        true = true_frequencies(signal, self.source.disturbance, options.tones, times)
+        reasons = " ".join(fit.track.reasons(-1))
+        measures = measure_track(fit.track, times, true, signal, self.source.measuring, alarms=options.raises_alarms)
+        status, message = ("INVALID", reasons) if reasons else ("VALID", "The last estimate is valid.")
+        return {"status": status, "message": message, "measures": measures}
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +211,7 @@ class SignalSource:
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
         signal = self.signal.generate(times)
         samples = disturb(signal, times, self.disturbance, stream(self.seed, "noise", replicate))
+        samples.setflags(write=False)
         return SignalDataSet(SignalRecord(samples, self.sampling.interval), self, replicate)
 
 
@@ -216,36 +219,64 @@ class SignalSource:
 class FrequencyEstimation:
     """An estimator of frequencies in the place of an estimator of models."""
 
-    options: Any
+    options: FrequencyEstimator
     start_from: ClassVar[None] = None
 
     def prepare(self, record: SignalRecord) -> PreparedFrequencies:
-        """Get ready for a record."""
+        """Compute nothing before the fit."""
         return PreparedFrequencies(self.options, record)
 
     def compile(self, interval: float) -> None:
-        """Compile the kernels of the estimator."""
-        if self.options.online:
-            self.options.start(interval).update(0.0)
+        """Compile the kernels of the estimator; those of custom ones are compiled where they are tried."""
+        if not is_custom(self.options):
+            # A record so short may be too short for it.
+            with suppress(ValueError, DataError):
+                self.options.track(np.zeros(COMPILED_WITH), interval)
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedFrequencies:
-    """An estimator of frequencies before the first sample of a record."""
+    """An estimator of frequencies with a record."""
 
-    options: Any
+    options: FrequencyEstimator
     record: SignalRecord
 
     def fit(self, start: None = None) -> FrequencyFit:
-        """Estimate the frequencies."""
-        if self.options.online:
-            return FrequencyFit(self.options, self.options.track(self.record.samples, self.record.interval))
-        return FrequencyFit(self.options, self.options.estimate(self.record.samples, self.record.interval))
+        """Estimate the frequencies with a copy of the options: no estimate depends on those before it."""
+        what = f"{type(self.options).__name__}.track"
+        try:
+            track = copy.deepcopy(self.options).track(self.record.samples, self.record.interval)
+        except ValueError as error:
+            if "read-only" in str(error):
+                change = f"{what} changes the samples that it is given; copy first: y = np.array(samples)"
+                raise ComponentError(change) from error
+            raise
+        _require_track(track, self.options, self.record, what)
+        return FrequencyFit(self.options, track)
+
+
+def _require_track(track: Any, options: FrequencyEstimator, record: SignalRecord, what: str) -> None:
+    """Refuse what an estimator returned if it is no track of the record."""
+    if not isinstance(track, FrequencyTrack):
+        expected = "a ctid_cli.FrequencyTrack(t, frequencies, flags) is expected"
+        raise ComponentError(f"{what} returned {type(track).__name__}, and {expected}")
+    times = record.times[-1:] if options.whole_record else record.times
+    shapes = {"t": (times.size,), "frequencies": (times.size, options.tones), "flags": (times.size,)}
+    for name, shape in shapes.items():
+        found = np.shape(getattr(track, name))
+        if found != shape:
+            raise ComponentError(f"{what} returned {name} of shape {found}, and {shape} is expected")
+    if np.asarray(track.flags).dtype.kind not in "iu":
+        raise ComponentError(f"{what} returned flags that are no whole numbers; combine those of ctid_cli.Flag")
+    if not np.allclose(track.t, times, rtol=1e-9, atol=1e-9 * record.interval):
+        raise ComponentError(f"{what} returned t that are not the instants of the samples, interval * np.arange(N)")
+    if not np.isfinite(track.frequencies[track.valid]).all():
+        raise ComponentError(f"{what} returned a row without flags whose frequencies are not finite; give it a flag")
 
 
 @dataclass(frozen=True, eq=False)
 class FrequencyFit:
     """Estimated frequencies."""
 
-    options: Any
-    found: FrequencyTrack | FrequencyEstimate
+    options: FrequencyEstimator
+    track: FrequencyTrack

@@ -1,9 +1,7 @@
 """What is wrong with a specification although every section is right by itself."""
 
-import itertools
 import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
@@ -12,31 +10,29 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json
+from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.frequency.drem import DremWindow
-from ctid_cli.frequency.esprit import Esprit
-from ctid_cli.inference.monte_carlo import requested
+from ctid_cli.frequency.base import FrequencyEstimator
+from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
-from ctid_cli.simulation.dataset import SimulatedSource, additive_form
+from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.frequency_measures import true_frequencies
+from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     MAX_COMBINATIONS,
-    Failure,
+    CustomMeasureSection,
     Section,
     Variant,
     case_count,
-    grouped,
     known_variants,
     over,
     place_of,
     replaced,
-    swept_in,
     variants,
 )
 from ctid_cli.specification.spec import OF_DATA, Spec
@@ -47,13 +43,12 @@ from ctid_cli.specification.yaml_source import KeyPath
 MAX_SAMPLES = 10_000_000
 #: Data cells times estimators with each of their settings that an experiment may have.
 MAX_SETTINGS = 1_000_000
-#: Data sets that are simulated when a specification is checked, and samples of all of them.
+#: Settings whose first data sets are tried.
 MAX_TRIALS = 64
-MAX_TRIAL_SAMPLES = 20_000_000
 
 _SIMULATED = ("system", "excitation", "sampling")
 #: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "recorder", "data", "starts")
+_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
@@ -81,7 +76,7 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
 
 
 def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise", "recorder"):
+    for name in (*_SIMULATED, "noise"):
         if name in present:
             yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
     if _reference(raw, "loop") is not None:
@@ -126,8 +121,7 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
     for name, (content, section) in parts.items():
         if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
             return name
-    recorder = raw.get("recorder")
-    return "recorder" if isinstance(recorder, Mapping) and recorder.get("missing") else ""
+    return ""
 
 
 def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
@@ -159,12 +153,29 @@ def too_many_cases(spec: Spec) -> str:
     return ""
 
 
-def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
-    """Say what the sections of a specification have against each other."""
+def joint_complaints(
+    spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
+) -> list[Complaint]:
+    """Return what the sections of a specification have against each other, and what a trial of them shows."""
+    found = list(_static_complaints(spec, broken, files_are_good=files_are_good))
+    places = {path[0] for path, _ in found if path}
+    of_data = {"data", *OF_DATA}
+    # A wrong level of the noise, or a wrong estimator, leaves the rest to be tried.
+    if files_are_good and not places & of_data - {"noise"}:
+        faulty = {path[1] for path, _ in found if path[:1] == ("estimators",)}
+        right = {name: section for name, section in spec.estimators.items() if name not in faulty}
+        # Estimators would refuse a record for what is wrong with its sections.
+        rest = replaced(spec, ("estimators",), {} if (places | broken) & of_data else right)
+        found += trial(replaced(rest, ("noise",), None) if "noise" in places else rest)
+    return found
+
+
+def _static_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool) -> Iterator[Complaint]:
     yield from _precision_complaints(spec, broken)
     yield from _same_estimators(spec)
     yield from _world_complaints(spec, broken)
-    samplings = known_variants(spec.sampling)
+    # A file of instants is read only once it is known to be good.
+    samplings = spec.samplings if files_are_good or not hasattr(spec.sampling, "sha256") else []
     key = "duration" if hasattr(spec.sampling, "duration") else "samples"
     too_long = over({(): samplings}, partial(_too_long, ("sampling", key)))
     yield from too_long
@@ -177,18 +188,20 @@ def joint_complaints(spec: Spec, broken: frozenset[str], *, files_are_good: bool
     if spec.starts is not None:
         yield from _start_complaints(spec, spec.starts, broken)
     yield from _success_complaints(spec)
-    of_data = list(_data_complaints(spec, [] if too_long else records))
-    yield from of_data
-    # A wrong level of the noise leaves the rest to be tried.
-    if not (too_long or spec.data) and files_are_good and {path[0] for path, _ in of_data} <= {"noise"}:
-        yield from _trial_complaints(replaced(spec, ("noise",), None) if of_data else spec)
+    yield from _data_complaints(spec, [] if too_long else records)
 
 
 def _precision_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     """Say which measures there are not, and which precision cannot be had."""
-    for k, name in enumerate(spec.measures or ()):
+    seen: set[str] = set()
+    for k, one in enumerate(spec.measures or ()):
+        if isinstance(one, CustomMeasureSection):
+            if one.name in seen | MEASURES.keys():
+                yield ("measures", k), f"another measure is called {one.name!r}; give this one another name"
+            seen.add(one.name)
+            continue
         try:
-            requested(name)
+            requested(one)
         except UsageError as error:
             yield ("measures", k), str(error)
     until = None if spec.monte_carlo is None else spec.monte_carlo.until
@@ -227,7 +240,7 @@ def _world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]
     if not on_signal:
         here, does = "a system; give signal, or one of", "estimates the frequencies of a signal"
     for name, section in spec.estimators.items():
-        if section.kind not in KINDS[wanted] and (on_signal or not section.custom):
+        if issubclass(section.target, FrequencyEstimator) is not on_signal:
             message = f"{section.kind} {does}, and this experiment has {here} {', '.join(KINDS[wanted])}"
             yield ("estimators", name, "kind"), message
     for name in _RULES_OF_SYSTEMS if on_signal else _RULES_OF_SIGNALS:
@@ -246,7 +259,7 @@ class Extent:
 
     interval: float
     samples: int
-    #: Instants of the samples of a measured record [s].
+    #: Instants of the samples from the first one on, where they are known [s].
     times: Array | None = None
 
     @property
@@ -267,13 +280,19 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
         return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
-    # Random intervals stand for themselves at their mean.
-    plans = [(case, case.options) for case in samplings]
-    return [Variant({}, case.swept, Extent(options.mean_interval, options.samples)) for case, options in plans]
+    return [Variant({}, case.swept, _extent_of(case.options)) for case in samplings]
+
+
+def _extent_of(sampling: Any) -> Extent:
+    """Return how long the records of a sampling scheme are; random intervals stand for themselves at their mean."""
+    if not isinstance(sampling, GivenInstants):
+        return Extent(sampling.mean_interval, sampling.length)
+    times = sampling.times(np.random.default_rng(0))
+    return Extent(float(np.ptp(times)) / (times.size - 1), times.size, times - times[0])
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
-    if sampling.samples > MAX_SAMPLES:
+    if sampling.length > MAX_SAMPLES:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
@@ -296,7 +315,7 @@ def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
     """Say what each estimator of a system has against the record, the loop and the initial delays."""
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"] or section.custom:
+        if section.custom or issubclass(section.target, FrequencyEstimator):
             continue
         at, cases = ("estimators", name), variants(section)
         yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
@@ -455,50 +474,6 @@ def _of_ratio(noise: Any) -> Iterator[Complaint]:
         yield ("noise", "snr_db"), f"in a loop the noise feeds back into the output; give the noise's variance{other}"
 
 
-def _trial_complaints(spec: Spec) -> Iterator[Complaint]:
-    """Say what only a simulation shows: the first data set of each distinct setting is made.
-
-    Sections that are missing because they are wrong by themselves have a stand-in, so that the others are tried. Custom
-    components are tried in a process of their own, before a run.
-    """
-    driven = spec.loop is not None if spec.generator is None else not spec.generator[1].custom
-    if spec.sampling is None or spec.sampling.custom or not driven:
-        return
-    sections = {name: section for name in OF_DATA if (section := getattr(spec, name)) is not None}
-    parts: dict[KeyPath, Sequence[Variant]]
-    parts = {(name,): variants(section) for name, section in sections.items() if not section.custom}
-    parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
-    # Levels of noise, and losses, decide on nothing else: they take turns.
-    turns = {at: parts.pop(at) for at in (("noise",), ("recorder",)) if at in parts}
-    failures: list[Failure] = []
-    tried: list[Mapping[KeyPath, Any]] = []
-    samples = 0
-    for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
-        case = dict(zip(parts, point, strict=True))
-        others = {at: found[k % len(found)] for at, found in turns.items()}
-        options = {str(at[0]): variant.options for at, variant in (case | others).items()}
-        samples += options["sampling"].samples
-        if samples > MAX_TRIAL_SAMPLES and tried:
-            break
-        tried.append(swept_in(case))
-        for place, message in trial(spec.simulated_source(options, spec.folder)):
-            failures.append((place, message, tried[-1]))
-    yield from grouped(failures, tried)
-
-
-def trial(source: SimulatedSource) -> Iterator[Complaint]:
-    """Say why the first data set of a source cannot be made, if its sections are to blame."""
-    try:
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            source.require_stable()
-            source.dataset(0)
-    except DataError as error:
-        yield tuple(error.section.split(".")) if error.section else (), str(error)
-    except Exception:  # of which a run says more: it is stored with every estimate
-        return
-
-
 # --------------------------------------------------------------------------------------------------------------------
 # Frequencies of a signal
 
@@ -513,8 +488,8 @@ def _signal_complaints(spec: Spec) -> Iterator[Complaint]:
     yield from over({("signal",): signals, ("sampling",): clocks}, partial(_of_tone_clock, spec))
     disturbances = [case.options for case in variants(spec.disturbance)] or [None]
     for name, section in spec.estimators.items():
-        if section.kind in KINDS["frequency_estimator"]:
-            at, cases = ("estimators", name), variants(section)
+        at, cases = ("estimators", name), variants(section)
+        if isinstance(cases[0].options, FrequencyEstimator):
             yield from over({(): cases, ("sampling",): clocks}, partial(_of_estimator, at))
             yield from over({(): cases, ("signal",): signals[:1]}, partial(_of_tones, at, disturbances))
 
@@ -547,42 +522,14 @@ def _of_tone_clock(spec: Spec, signal: SumOfSinusoids, clock: RegularSampling) -
 
 
 def _of_estimator(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    for path, message in (_of_online if options.online else _of_batch)(options, clock):
-        yield (*at, *path), message
-
-
-def _of_online(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    duration = clock.interval * clock.samples
-    # First of all, since the estimator would keep all the samples of such a time.
-    for name in ("prefilter", "difference", "d", "hold", *(("memory",) if options.kind == DremWindow.kind else ())):
-        value = getattr(options, name, 0.0)
-        if value > duration:
-            yield (name,), f"{name} = {value:g} s is longer than the record, {duration:g} s"
-            return
-    rows = options.first_row + options.tones - 1 if hasattr(options, "d") else 0
-    filled = 2 * options.tones * getattr(options, "h", 0.0) + rows * getattr(options, "d", 0.0)
-    filled += getattr(options, "prefilter", 0.0) + getattr(options, "difference", 0.0)
-    if filled >= duration:
-        yield ("h",), f"its delays are filled after {filled:g} s, the record ends at {duration:g} s; take a smaller h"
-        return
     try:
         with np.errstate(all="ignore"):
-            options.start(clock.interval)
+            options.check(clock.samples, clock.interval)
     except ArithmeticError:
-        yield (), "these values are too large or too small to compute with"
-    except ValueError as error:
-        yield place_of(error, vars(options)), str(error)
-
-
-def _of_batch(options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    initial = getattr(options, "initial_frequencies", None)
-    if initial is not None:
-        highest = math.pi / clock.interval
-        if max(initial) >= highest:
-            yield ("initial_frequencies",), f"must be below {highest:.4g} rad/s, pi over the sampling interval"
-        return
-    start = options if isinstance(options, Esprit) else Esprit(tones=options.tones, averaging=options.averaging)
-    try:
-        start.blocks(clock.samples, clock.interval)
+        yield at, "these values are too large or too small to compute with"
     except (ValueError, DataError) as error:
-        yield place_of(error, vars(options)), str(error)
+        yield (*at, *place_of(error, vars(options))), str(error)
+    except Exception as error:
+        if not is_custom(options):
+            raise
+        yield (*at, "kind"), f"cannot check these options: {reason(error)}"

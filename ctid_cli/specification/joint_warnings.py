@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import Term
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
-from ctid_cli.signals.send_on_delta import SendOnDelta
-from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
@@ -56,7 +56,7 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     noises, estimators = known_variants(spec.noise), {("estimators", n): s for n, s in spec.estimators.items()}
     for at, section in estimators.items():
         warnings += over({("noise",): noises, at: known_variants(section)}, partial(_of_white_formula, at))
-    samplings = known_variants(spec.sampling)
+    samplings = spec.samplings
     told: dict[KeyPath, list[Variant]]
     told = {("excitation",): known_variants(spec.excitation), ("sampling",): samplings}
     warnings += over(told, partial(_of_sampled_input, spec), MAX_TRIALS)
@@ -66,9 +66,8 @@ def _simulation_warnings(spec: Spec) -> list[Complaint]:
     fastest = float(np.abs(systems[0].options.poles).max(initial=0.0))
     warnings += over({(): samplings}, partial(_of_slow_sampling, fastest))
     lengths: dict[KeyPath, list[Variant]] = {("system",): systems, ("sampling",): extents(spec, samplings)}
-    warnings += over(
-        lengths, partial(_of_short_record, "duration" if hasattr(spec.sampling, "duration") else "samples")
-    )
+    key = next((name for name in ("duration", "times", "file") if hasattr(spec.sampling, name)), "samples")
+    warnings += over(lengths, partial(_of_short_record, key))
     for at, section in estimators.items():
         cases = known_variants(section)
         warnings += over({("system",): systems, at: cases}, partial(_of_delay, at, in_loop=spec.loop is not None))
@@ -99,8 +98,11 @@ def _of_short_record(key: str, system: Any, extent: Extent) -> Iterator[Complain
             f"a record of {extent.duration:.4g} s{delayed} shows little of the slowest pole, whose time constant is "
         )
         short += f"{slowest:.4g} s"
-        enough = f"{needed:.3g}" if key == "duration" else math.ceil(needed / extent.interval) + 1
-        yield ("sampling", key), f"{short}; write {key}: {enough} or more"
+        cures = {
+            "duration": f"write duration: {needed:.3g} or more",
+            "samples": f"write samples: {math.ceil(needed / extent.interval) + 1} or more",
+        }
+        yield ("sampling", key), f"{short}; {cures.get(key, f'it must last {needed:.3g} s or more')}"
 
 
 def _of_sampled_input(spec: Spec, excitation: Any, sampling: Any) -> Iterator[Complaint]:
@@ -115,12 +117,8 @@ def _of_sampled_input(spec: Spec, excitation: Any, sampling: Any) -> Iterator[Co
     edges = edges[edges < times[-1]]
     interval = sampling.mean_interval
     late = times[np.searchsorted(times, edges - ON_TIME * interval)] - edges
-    # Where the output says when it is sampled, the sensor's looks are only the earliest instants.
-    if late.size and (late.mean() > ON_TIME * interval or isinstance(sampling, SendOnDelta)):
-        wait = (
-            "not before the next one" if isinstance(sampling, SendOnDelta) else f"{late.mean():.2g} s late on average"
-        )
-        seen = f"the estimator sees the input at its samples only, each change {wait}"
+    if late.size and late.mean() > ON_TIME * interval:
+        seen = f"the estimator sees the input at its samples only, each change {late.mean():.2g} s late on average"
         biased = "which biases delay and parameters; write input_record: exact, unless that is the point"
         yield ("sampling", "input_record"), f"{seen}, {biased}"
 
@@ -178,23 +176,16 @@ def _fraction_degrees(terms: Sequence[Term]) -> tuple[int, int]:
 
 def _signal_warnings(spec: Spec) -> list[Complaint]:
     """Say what is allowed but unwise in an experiment on a signal."""
-    signal = variants(spec.signal)[0].options
+    signal, clocks = variants(spec.signal)[0].options, variants(spec.sampling)
     warnings: list[Complaint] = []
     for name, section in spec.estimators.items():
         at, cases = ("estimators", name), variants(section)
-        warnings += over({(): cases}, partial(_aliased, at, signal.highest_frequency))
-        warnings += over({(): cases, ("sampling",): variants(spec.sampling)}, partial(_rounded, at))
-        if not cases[0].options.online and signal.frequency_steps:
+        warnings += over({(): cases, ("sampling",): clocks}, partial(_unwise, at, signal.highest_frequency))
+        if cases[0].options.whole_record and signal.frequency_steps:
             warnings.append(((*at, "kind"), "gives one estimate of the whole record, in which a frequency steps"))
     return warnings
 
 
-def _aliased(at: KeyPath, highest: float, options: Any) -> Iterator[Complaint]:
-    if hasattr(options, "h") and highest > math.pi / options.h:
-        limit = f"with h = {options.h:g} s, frequencies above pi/h = {math.pi / options.h:.4g} rad/s"
-        yield (*at, "h"), f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
-
-
-def _rounded(at: KeyPath, options: Any, clock: RegularSampling) -> Iterator[Complaint]:
-    for name, note in options.warnings(clock.interval, 0.0) if hasattr(options, "warnings") else ():
-        yield (*at, name), note
+def _unwise(at: KeyPath, highest: float, options: FrequencyEstimator, clock: RegularSampling) -> Iterator[Complaint]:
+    for name, text in options.warnings(clock.interval, highest):
+        yield (*at, name), text

@@ -1,6 +1,6 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -8,10 +8,11 @@ from typing import Annotated, Any
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from ctid_cli.custom_code import is_shipped
 from ctid_cli.errors import DataError, RefusedError, SpecError
 from ctid_cli.kinds import KINDS
-from ctid_cli.signals.csv_file import read_held_signal
 from ctid_cli.signals.files import is_inside
+from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
@@ -34,11 +35,12 @@ def load_spec(
     *,
     allow_code: bool = False,
     allow_outside: bool = False,
+    trial: Callable[[Spec], Any] | None = None,
 ) -> Spec:
     """Read and check a specification, of a file or as a mapping.
 
     Code that it names is run, and data files outside its folder are read, only if that is allowed; whoever gives a
-    mapping names the files himself.
+    mapping names the files himself. A trial is given what is right, and returns what is wrong and odd about it.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
@@ -56,10 +58,17 @@ def load_spec(
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
-    joint = joint_complaints(spec, broken, files_are_good=not about_files)
+    odd: list[Complaint] = []
+
+    def tried(part: Spec) -> Sequence[Complaint]:
+        found = trial(part) if trial is not None else None
+        odd.extend(found.odd if found is not None else ())
+        return found.wrong if found is not None else ()
+
+    joint = joint_complaints(spec, broken, tried, files_are_good=not about_files)
     complaints += [(where, message, False) for where, message in (*about_files, *joint)]
     _require_none(source, complaints)
-    spec._warnings = tuple(str(source.problem(where, message)) for where, message in joint_warnings(spec))
+    spec._warnings = tuple(str(source.problem(where, message)) for where, message in (*joint_warnings(spec), *odd))
     return spec
 
 
@@ -104,14 +113,15 @@ def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
         raise SpecError(in_order)
 
 
-def _code_in(tree: Any) -> Iterator[KeyPath]:
-    """Return where kinds name code, anywhere in a tree, however deep."""
+def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
+    """Return where kinds name code that is not the program's own, anywhere in a tree, however deep."""
     waiting: list[tuple[KeyPath, Any]] = [((), tree)]
     while waiting:
         path, node = waiting.pop()
         items = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else ()
         waiting += (((*path, key), value) for key, value in items)
-        if path and path[-1] == "kind" and isinstance(node, str) and names_code(node):
+        named = path and path[-1] == "kind" and isinstance(node, str) and names_code(node)
+        if named and not is_shipped(node, folder):
             yield path
 
 
@@ -120,13 +130,14 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     tree = source.tree
     # A specification may come from anywhere.
     ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
-    code = [source.problem(path, ask) for path in _code_in(tree)]
+    code = [source.problem(path, ask) for path in _code_in(tree, folder)]
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     found: dict[str, Any] = {"experiment": "", "estimators": {}}
     complaints: list[Located] = []
+    given = {name for name, value in tree.items() if value is not None}
     for name, value in _pieces(tree):
-        right, wrong = _piece(name, value, folder, tree.keys())
+        right, wrong = _piece(name, value, folder, given)
         complaints += wrong
         if not wrong:
             found[name] = found[name] | right if name == "estimators" else right
@@ -158,7 +169,8 @@ def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 def _piece(name: str, value: Any, folder: Path, given: Set[str] = frozenset()) -> tuple[Any, list[Located]]:
     """Return a section, or some estimators, of a specification that has some sections, and what is wrong with it."""
     try:
-        return _adapter(name).validate_python(value, strict=True, context={"folder": folder}), []
+        context = {"folder": folder, "of_signal": "signal" in given}
+        return _adapter(name).validate_python(value, strict=True, context=context), []
     except ValidationError as error:
         details = error.errors(include_url=False)
     for detail in details:
@@ -180,15 +192,25 @@ def _about(key: str, error: str, value: Any) -> ErrorDetails:
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """Return the specification with the content hash of its file filled in, and what is wrong with the file.
+    """Return the specification with the content hashes of its files filled in, and what is wrong with the files."""
+    sections: dict[tuple[str, ...], Any] = {("data",): spec.data, ("sampling",): spec.sampling}
+    if spec.data is None and spec.generator is not None:
+        sections |= dict([spec.generator])
+    complaints: list[Complaint] = []
+    for place, section in sections.items():
+        if hasattr(section, "sha256") and not section.custom:
+            spec, found = _with_file(spec, place, section, own=own, anywhere=anywhere)
+            complaints += found
+    return spec, complaints
+
+
+def _with_file(
+    spec: Spec, place: tuple[str, ...], section: Any, *, own: bool, anywhere: bool
+) -> tuple[Spec, list[Complaint]]:
+    """Return the specification with the content hash of one file filled in, and what is wrong with the file.
 
     Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
     """
-    place: tuple[str, ...]
-    section: Any
-    place, section = (("data",), spec.data) if spec.data is not None else spec.generator or ((), None)
-    if not hasattr(section, "sha256") or section.custom:
-        return spec, []
     file = joined(spec.folder, section.file)
     open_to_all = own or is_inside(file, spec.folder)
     if not (anywhere or open_to_all):
@@ -201,8 +223,10 @@ def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Co
         if section.sha256 not in (None, content):
             return spec, [((*place, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?")]
         spec = replaced(spec, (*place, "sha256"), content)
-        if spec.measured is not None:
+        if place == ("data",) and spec.measured is not None:
             spec.measured.dataset(0)
+        elif place == ("sampling",):
+            spec.samplings[0].options.times(None)
         else:
             source = located(variants(section)[0].options, spec.folder)
             read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)

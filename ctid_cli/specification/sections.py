@@ -16,6 +16,7 @@ import re
 import types
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -39,10 +40,11 @@ from pydantic_core import CoreSchema
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import CustomCodeError, find_class, reason
 from ctid_cli.errors import CtidError, OptionError
+from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.kinds import classes
 from ctid_cli.signals.excitation import Excitation
 from ctid_cli.signals.sampling import Sampling, geometric_sizes
-from ctid_cli.simulation.components import Estimator, Noise, System
+from ctid_cli.simulation.components import Estimator, Measure, Noise, System
 from ctid_cli.specification.messages import HINT, TAG, Complaint, explained, option_docs, several_wrong, shown, wrong
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.text import did_you_mean
@@ -87,6 +89,10 @@ def matching(pattern: str, rule: str) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+#: Name of an estimator or of a custom measure.
+Name = Annotated[str, matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")]
 
 
 class OneOf:
@@ -298,7 +304,7 @@ class Kinds(OneOf):
 
     def __init__(self, *names: str, custom: str = "") -> None:
         forms: dict[str, Any] = {k: section_for(target, k) for name in names for k, target in classes(name).items()}
-        allowed = ", ".join(forms)
+        allowed = ", ".join(forms) or "./file.py:Class, package.module:Class"
         forms |= {"custom": custom_form(custom)} if custom else {}
 
         def choose(value: Any) -> str | None:
@@ -322,8 +328,9 @@ class WithKey(OneOf):
 
     def __init__(self, key: str, form: Any, otherwise: Any, **also: Any) -> None:
         def choose(value: Any) -> str:
-            given = isinstance(value, Mapping) and key in value and all(value.get(k) == v for k, v in also.items())
-            return key if given or key in getattr(type(value), "model_fields", {}) else "otherwise"
+            read = value.get if isinstance(value, Mapping) else partial(getattr, value)
+            keys = value if isinstance(value, Mapping) else getattr(type(value), "model_fields", {})
+            return key if key in keys and all(read(k, None) == v for k, v in also.items()) else "otherwise"
 
         super().__init__(choose, {key: form, "otherwise": otherwise})
 
@@ -383,7 +390,9 @@ def _default(option: dataclasses.Field[Any]) -> Any:
 #: The base class of custom components, and the methods of which it needs one, with what they are given.
 CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
     "estimator": (Estimator, {"fit": ("record", "start")}),
+    "measure": (Measure, {"value": ("fit", "data")}),
     "excitation": (Excitation, {"generate": ("times", "rng")}),
+    "frequency_estimator": (FrequencyEstimator, {"track": ("samples", "interval")}),
     "noise": (Noise, {"generate": ("output", "rng"), "generate_at": ("times", "output", "rng")}),
     "sampling": (Sampling, {"times": ("rng",)}),
     "system": (System, {"simulate": ("input", "times")}),
@@ -401,12 +410,15 @@ def custom_form(part: str) -> Any:
     def validated(value: Any, info: ValidationInfo) -> Section:
         if isinstance(value, Section):
             return value
+        context = info.context or {}
+        wanted = "frequency_estimator" if part == "estimator" and context.get("of_signal") else part
         try:
-            target = find_class(str(value["kind"]), (info.context or {}).get("folder", Path()))
-            form = _custom_section(target, part, value["kind"])
+            target = find_class(str(value["kind"]), context.get("folder", Path()))
+            form = _custom_section(target, wanted, value["kind"])
         except CustomCodeError as error:
             raise several_wrong("custom", [(("kind",), str(error), False)]) from None
-        return form.model_validate(value, context=info.context)
+        given = {"name": target.__name__, **value} if part == "measure" else value
+        return form.model_validate(given, context=info.context)
 
     schema = {
         "type": "object",
@@ -432,18 +444,24 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
             inspect.signature(call).bind(None, *methods[method])  # type: ignore[arg-type]
         except (TypeError, ValueError):
             raise CustomCodeError(f"{name}.{method} cannot be called so; this kind needs {wanted}") from None
-    if not dataclasses.is_dataclass(target):
-        if vars(target).get("__annotations__") or target.__init__ is not object.__init__:
+    if "__dataclass_fields__" not in vars(target):
+        inherited = dataclasses.is_dataclass(target)
+        if vars(target).get("__annotations__") or (target.__init__ is not object.__init__ and not inherited):
             raise CustomCodeError(f"{name} is no dataclass; write @dataclass(frozen=True) above it")
-        target = dataclass(frozen=True)(target)
+        target = target if inherited else dataclass(frozen=True)(target)
     start_from = getattr(target, "start_from", None)
     if part == "estimator" and start_from not in (None, "delay", "parameters"):
         raise CustomCodeError(f"{name}.start_from must be None, 'delay' or 'parameters', not {start_from!r}")
-    for option in target.__dataclass_fields__:
-        if option in {"kind", *dir(CustomSystemSection)} or option.startswith(("_", "model_")):
+    unit = getattr(target, "unit", None)
+    if part == "measure" and not isinstance(unit, str):
+        raise CustomCodeError(f"{name}.unit must be a text, such as '%' or 'rad/s', not {unit!r}")
+    forms: dict[str, type[CustomSection]] = {"system": CustomSystemSection, "measure": CustomMeasureSection}
+    form = forms.get(part, CustomSection)
+    for option in (option.name for option in dataclasses.fields(target)):
+        if option in {"kind", *form.model_fields, *dir(CustomSection)} or option.startswith(("_", "model_")):
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
-        return section_for(target, kind, base=CustomSystemSection if part == "system" else CustomSection)
+        return section_for(target, kind, base=form, sweeping=part != "measure")
     # Whatever is wrong with the annotations of a class that somebody wrote.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
@@ -462,6 +480,18 @@ class CustomSection(Section):
             dumps(variants(self)[0].options)
         except Exception as error:
             yield ("kind",), f"cannot be sent to worker processes: {reason(error)}; keep only plain data in options"
+
+
+class CustomMeasureSection(CustomSection):
+    """Options of a custom measure, and what it is called.
+
+    Parameters
+    ----------
+    name : str, optional
+        what tables call it; by default like its class
+    """
+
+    name: Name
 
 
 class CustomSystemSection(CustomSection):

@@ -4,6 +4,7 @@ Its canonical form has every default filled in and no trace of how the file was 
 identity of data and estimators.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,22 +15,28 @@ from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import OptionError, Problem
 from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
-from ctid_cli.signals.recorder import Recorder
-from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import (
     MAX_WHOLE,
+    ByShape,
+    CustomMeasureSection,
     Kinds,
+    Name,
     NotNegative,
+    Number,
     Options,
     Positive,
     Section,
     Swept,
     Text,
+    Variant,
     WithKey,
+    known_variants,
     matching,
+    section_for,
     variants,
 )
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
@@ -40,10 +47,8 @@ _EXPERIMENT = matching(
     EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
-#: Name of an estimator.
-NAME = matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digits, '-' and '_', at most 60 of them")
 #: Sections that data are simulated from; their lists combine to data cells.
-OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "recorder", "signal", "disturbance")
+OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
 
 
 def _usable(name: str) -> str:
@@ -88,10 +93,46 @@ class RegularDurationSection(Section):
         return RegularSampling(interval, int(min(round(duration / interval), 2**62)))
 
 
-SamplingSection = Annotated[Section, Kinds("sampling", custom="sampling")]
-AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, SamplingSection, kind="regular")]
+class ListedTimesSection(Section):
+    """Samples at instants that are listed.
+
+    Parameters
+    ----------
+    kind : {"irregular"}
+        Which one it is
+    times : list of float
+        The instants, strictly increasing [s]; the record begins at the first of them
+    input_record : {"sampled", "exact"}, default "exact"
+        What the estimator is told of the input: its samples at the output's instants, or its true edges
+    """
+
+    target: ClassVar[type | None] = ListedInstants
+    elsewhere = dict.fromkeys(
+        ("interval", "samples", "spread", "file", "time"), "gives the instants a second time, 'times' lists them"
+    )
+
+    kind: Literal["irregular"]
+    times: Annotated[list[Number], Field(min_length=2)]
+    input_record: Annotated[InputRecord | list[InputRecord], Swept(InputRecord)] = "exact"
+
+    def complaints(self) -> Iterator[Complaint]:
+        """Say which instant does not come after the one before it."""
+        for k, (before, now) in enumerate(itertools.pairwise(self.times), start=1):
+            if now <= before:
+                yield ("times", k), f"{now:.12g} s comes after {before:.12g} s; times must increase strictly"
+                return
+
+    def build(self) -> ListedInstants:
+        """Return the sampling scheme."""
+        return ListedInstants(tuple(self.times), self.part("input_record"))
+
+
+_DrawnSection = Annotated[Section, Kinds("sampling", custom="sampling")]
+_OfFile = section_for(InstantsFile, "irregular")
+_FileOrDrawn = Annotated[Section, WithKey("file", _OfFile, _DrawnSection, kind="irregular")]
+_IrregularSection = Annotated[Section, WithKey("times", ListedTimesSection, _FileOrDrawn, kind="irregular")]
+AnySamplingSection = Annotated[Section, WithKey("duration", RegularDurationSection, _IrregularSection, kind="regular")]
 NoiseSection = Annotated[Section, Kinds("noise", custom="noise")]
-RecorderSection = Annotated[Section, Options(Recorder)]
 #: A measured record in place of a simulated one.
 MeasuredSection = Annotated[Any, Options(MeasuredSource, without="loop", sweeping=False)]
 SignalSection = Annotated[Section, Options(SumOfSinusoids)]
@@ -99,6 +140,9 @@ DisturbanceOrNone = Annotated[
     Annotated[Section, Kinds("disturbance")] | None,
     BeforeValidator(lambda value: None if value == "none" else value),
 ]
+_CustomMeasure = Annotated[CustomMeasureSection, Kinds(custom="measure")]
+#: The name of a measure, or a custom one.
+MeasureName = Annotated[Any, ByShape(Text, "a mapping with a kind is allowed too", mapping=_CustomMeasure)]
 EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", custom="estimator")]
 
 
@@ -250,8 +294,6 @@ class Spec(Section):
         When the output is sampled
     noise : mapping, optional
         What is added to the output; none by default
-    recorder : mapping, optional
-        What becomes of the output when it is recorded: its resolution, and losses; nothing by default
     data : mapping, optional
         A measured record, in place of system, excitation, sampling and noise
     estimators : mapping of mappings
@@ -262,8 +304,9 @@ class Spec(Section):
         Number of data sets and their seed; needed where anything is random
     success : mapping, optional
         When an estimate counts as converged
-    measures : list of str, optional
-        What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success
+    measures : list of str or mapping, optional
+        What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success; a
+        mapping with a kind is a custom measure
     limits : mapping, optional
         Time and memory that one estimate may take; no limits by default
     """
@@ -276,13 +319,12 @@ class Spec(Section):
     disturbance: DisturbanceOrNone | None = None
     sampling: AnySamplingSection | None = None
     noise: NoiseSection | None = None
-    recorder: RecorderSection | None = None
     data: MeasuredSection | None = None
-    estimators: Annotated[dict[Annotated[str, NAME], EstimatorSection], Field(min_length=1)]
+    estimators: Annotated[dict[Name, EstimatorSection], Field(min_length=1)]
     starts: StartsSection | None = None
     monte_carlo: MonteCarloSection | None = None
     success: SuccessSection | None = None
-    measures: list[Text] | None = None
+    measures: list[MeasureName] | None = None
     limits: LimitsSection | None = None
 
     _warnings: tuple[str, ...] = PrivateAttr(default=())
@@ -299,6 +341,12 @@ class Spec(Section):
         return source
 
     @property
+    def samplings(self) -> list[Variant]:
+        """Variants of the sampling scheme, their files as seen from the working directory; none of a custom one."""
+        known = known_variants(self.sampling)
+        return [replace(variant, options=located(variant.options, self.folder)) for variant in known]
+
+    @property
     def generator(self) -> tuple[tuple[str, ...], Section] | None:
         """Key path and section of what drives the simulation: the excitation, or the reference of the loop."""
         if self.excitation is not None:
@@ -309,16 +357,21 @@ class Spec(Section):
 
     def simulated_source(self, options: Mapping[str, Any], folder: Path) -> SimulatedSource:
         """Return what simulates the data sets of one combination of the options of the sections."""
-        sampling, loop = options["sampling"], options.get("loop")
+        sampling, loop = located(options["sampling"], folder), options.get("loop")
         if loop is not None:
             loop = replace(loop, reference=located(loop.reference, folder))
             loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
-        excitation, recorder = located(options.get("excitation"), folder), options.get("recorder", Recorder())
+        excitation = located(options.get("excitation"), folder)
         # Any seed will do where nothing is random.
         seed = 0 if self.monte_carlo is None else self.monte_carlo.seed
         fresh = "fresh_fit" in (self.measures or ())
         noise = options.get("noise")
-        return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, recorder, fresh)
+        return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, fresh)
+
+    @property
+    def custom_measures(self) -> dict[str, CustomMeasureSection]:
+        """Sections of the custom measures, by their names."""
+        return {section.name: section for section in self.measures or () if isinstance(section, CustomMeasureSection)}
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -14,7 +14,8 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
-from ctid_cli.simulation.dataset import LoopOptions, StartPoint
+from ctid_cli.simulation.dataset import LoopOptions
+from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import (
     ByShape,

@@ -1,1 +1,1 @@
-"""Estimates on disk: journal, sealed file, manifest and their readers."""
+"""Estimates on disk: journal, exported file, manifest and their readers."""

@@ -1,4 +1,4 @@
-"""The columns of stored estimates: the one list that journal, sealed file, tables, export, JSON and documentation read.
+"""The columns of stored estimates: the one list that journal, runs.h5, tables, export, JSON and documentation read.
 
 A column that is added here, and given a value where estimates are made, appears in all of them; in results that were
 stored before, it is missing.
@@ -33,6 +33,11 @@ def measure_names(rows: Iterable[ByName | None]) -> list[str]:
     from ctid_cli.simulation import frequency_measures
 
     return frequency_measures.measure_names(rows)
+
+
+def sorted_names(rows: Iterable[ByName | None]) -> list[str]:
+    """Return all names that any estimate has."""
+    return sorted({name for row in rows if row for name in row})
 
 
 @dataclass(frozen=True)
@@ -111,6 +116,11 @@ COLUMNS = (
     Column("switches", "Int64", "how often that search went on behind another filter than before", of="systems"),
     Column("condition_number", "float64", "of the scaled normal equations", "-", of="systems"),
     Column("measures", "by name", "what was measured of the frequencies", of="signals", names=measure_names),
+    Column(
+        *("custom_measures", "by name", "values of custom measures; none where one raised what the message says"),
+        prefix="measure_",
+        names=sorted_names,
+    ),
     Column("seconds", "float64", "time of this estimate, as if it had been alone", "s", source="clock"),
     Column("cpu_seconds", "float64", "of the processor, called programs included", "s", source="clock"),
     Column("converged", "boolean", "whether it meets the success rule; null without one", source="truth"),

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,19 +27,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
-from ctid_cli.errors import DamageError, StorageError, UsageError
+from ctid_cli.errors import StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.export import (
-    ROWS,
-    AnyArray,
-    Export,
-    export_in_memory,
-    open_export,
-    sha256_of,
-)
+from ctid_cli.storage.column_arrays import ROWS, AnyArray
+from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
 from ctid_cli.storage.identity import Origin
-from ctid_cli.storage.journal import EXPORT
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -50,6 +43,7 @@ from ctid_cli.storage.manifest import (
     swept_names,
     true_values,
 )
+from ctid_cli.storage.sqlite_file import EXPORT
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,9 +60,8 @@ _OF_PARAMETERS = {
     "quantiles": "present",
 }
 _OF_ERRORS = ("standard_errors", "quantiles")
-#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both; None where
-#: they are not known.
-Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]] | None]
+#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both.
+Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]]]
 
 
 def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
@@ -84,24 +77,17 @@ def read_stored(folder: Path) -> Estimates:
             if not (folder / EXPORT).exists():
                 raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
             return Estimates(open_export(folder / EXPORT))
-        exported = log.exported()
+        exported, times = log.exported(), partial(_times_in, folder)
         if exported is not None and sha256_of(folder / EXPORT) == exported:
-            return Estimates(open_export(folder / EXPORT), _times_of(folder, exported))
+            return Estimates(open_export(folder / EXPORT), times)
         log.check()
-        export = export_in_memory(log)
-        parts = {(block.cell["hash"], block.hash) for block in Estimates(export).blocks}
-        times = {part: log.times(*part) for part in parts}
-        return Estimates(export, lambda *part: times[part])
+        return Estimates(export_in_memory(log), times)
 
 
-def _times_of(folder: Path, exported: str) -> Times:
-    """Return times out of a journal, as long as that is the one of ``runs.h5``."""
-
-    def read(data_hash: str, estimator_hash: str) -> Any:
-        with place.reading_journal(folder) as log:
-            return None if log is None or log.exported() != exported else log.times(data_hash, estimator_hash)
-
-    return read
+def _times_in(folder: Path, data_hash: str, estimator_hash: str) -> Any:
+    """Return the times that a journal holds."""
+    with place.reading_journal(folder) as log:
+        return {} if log is None else log.times(data_hash, estimator_hash)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +110,7 @@ class Estimates:
         self._times = times
         self._places = places
         #: All estimates where these are some, chosen one by one.
-        self._all: Estimates = self
+        self._all: Estimates | None = None
         self._read: dict[str, AnyArray] = {}
 
     @property
@@ -139,7 +125,7 @@ class Estimates:
     def chosen(self, which: BoolArray | IndexArray) -> Estimates:
         """Return some of them, whose columns are taken out of those of all."""
         some = self._some(np.asarray(self.places)[which])
-        some._all = self._all
+        some._all = self._all or self
         return some
 
     def _some(self, places: range | IndexArray) -> Estimates:
@@ -171,7 +157,7 @@ class Estimates:
 
     def column(self, name: str) -> AnyArray:
         """Return a column as an array."""
-        if self._all is not self:
+        if self._all is not None:
             return np.asarray(self._all.column(name)[self.places])
         if name not in self._read:
             if name in CLOCKS:
@@ -213,21 +199,16 @@ class Estimates:
     def _by_block(self, value: Callable[[Block], Any]) -> list[Any]:
         return [one for block in self.blocks for one in [value(block)] * (block.last - block.first)]
 
-    def _clocks(self) -> tuple[Array, Array]:
-        """Return times of the estimates [s]; NaN where they are not known."""
-        found = np.full((2, len(self)), np.nan)
+    def _clocks(self) -> Array:
+        """Return times of the estimates [s], shape (2, n); NaN where they are not known."""
+        found, unknown = np.full((2, len(self)), np.nan), (np.nan, np.nan)
         for block in self.blocks if self._times is not None else ():
             assert self._times is not None
             own, times = slice(block.first, block.last), self._times(block.cell["hash"], block.hash)
-            if times is not None:
-                starts = [start.decode() for start in self.column("start")[own].tolist()]
-                try:
-                    pairs = [times[key] for key in zip(self.column("replicate")[own].tolist(), starts, strict=True)]
-                except KeyError as error:
-                    lacking = f"the journal of {self.export.path} is damaged: it lacks an estimate that this holds"
-                    raise DamageError(f"{lacking}. {place.what_is_safe(self.export.path.parent)}") from error
-                found[:, own] = np.array(pairs, dtype=float).T
-        return found[0], found[1]
+            starts = [start.decode() for start in self.column("start")[own].tolist()]
+            keys = zip(self.column("replicate")[own].tolist(), starts, strict=True)
+            found[:, own] = np.array([times.get(key, unknown) for key in keys], dtype=float).T
+        return found
 
     @cached_property
     def blocks(self) -> list[Block]:
@@ -258,7 +239,7 @@ class Estimates:
     @cached_property
     def _truths(self) -> dict[str, dict[str, float]]:
         """Return True values by name of every data cell."""
-        if self._all is not self:
+        if self._all is not None:
             return self._all._truths
         try:
             return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
@@ -361,7 +342,15 @@ class Estimates:
     @cached_property
     def results(self) -> dict[Key, dict[str, Any]]:
         """Return all results by key."""
-        return dict(zip(self.export.keys(), self.export.results(0, self.export.count), strict=True))
+        return dict(self.by_key())
+
+    def by_key(self) -> Iterator[tuple[Key, dict[str, Any]]]:
+        """Yield the results as they were computed, each with its key."""
+        names = [column.name for column in columns.COLUMNS if column.source == "result"]
+        for block in self.blocks:
+            for row in self.part(block.first, block.last).rows("replicate", "start", *names):
+                key = Key(block.cell["hash"], row.pop("replicate"), block.hash, row.pop("start"))
+                yield key, row
 
     def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
         """Return all of them as a table, with the units of its columns; the types of swept fields may be given."""

@@ -19,8 +19,9 @@ from ctid_cli.estimators.identification import Identification, laid_out_validati
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.signals.held import Hold
-from ctid_cli.signals.measurement import ROLES, Measurement, read_measurement
+from ctid_cli.signals.measurement import Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
+from ctid_cli.signals.table import ROLES
 from ctid_cli.storage.result_file import (
     ResultKind,
     Source,

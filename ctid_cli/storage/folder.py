@@ -5,27 +5,24 @@ estimates that the latest plan asks for).
 """
 
 import fcntl
-import json
 import os
-import platform
 import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
+from ctid_cli.storage.announcement import who_runs
 from ctid_cli.storage.identity import Origin, origin_differences
-from ctid_cli.storage.journal import EXPORT, FILE_NAME, JournalReader, read_journal
+from ctid_cli.storage.journal import JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 from ctid_cli.written_files import TAKEN, is_leftover
 
 SPEC = "spec.yaml"
 CANONICAL = "spec.canonical.json"
-#: Present while a run goes on; says who runs.
-RUNNING = "running.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
@@ -90,14 +87,6 @@ def clear(folder: Path) -> None:
                 path.unlink()
 
 
-def retract(folder: Path) -> None:
-    """Take back what was announced, unless another process announced it."""
-    running = who_runs(folder)
-    if running is not None and (running["pid"], running["host"]) == (os.getpid(), platform.node()):
-        with suppress(OSError):
-            (folder / RUNNING).unlink(missing_ok=True)
-
-
 def _wait(folder: Path, deadline: float) -> None:
     """Give the process that has a folder a moment more, if there is time."""
     if time.monotonic() > deadline:
@@ -105,26 +94,6 @@ def _wait(folder: Path, deadline: float) -> None:
         owner = f"process {running['pid']} on {running['host']}" if running else "another process"
         raise InUseError(f"{folder} is in use by {owner}; wait until it ends") from None
     time.sleep(0.05)
-
-
-def who_runs(folder: Path) -> dict[str, Any] | None:
-    """Return what the run that writes to a folder says about itself."""
-    try:
-        running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
-        return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
-    except (OSError, ValueError):
-        return None
-
-
-def announce(folder: Path, experiment: str, started: str, done: int, total: int) -> None:
-    """Say who runs, for those who find the folder locked."""
-    running = {"experiment": experiment, "pid": os.getpid(), "host": platform.node()}
-    running |= {"started": started, "done": done, "total": total}
-    # A courtesy to readers, written over and over: neither worth a synchronisation nor worth failing for.
-    with suppress(OSError):
-        temporary = folder / f"{RUNNING}.tmp"
-        temporary.write_text(json.dumps(running), encoding="utf-8")
-        temporary.replace(folder / RUNNING)
 
 
 def check_free(
@@ -164,41 +133,32 @@ def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
 @contextmanager
 def reading_journal(folder: Path) -> Iterator[JournalReader | None]:
     """Read the folder's journal, while a run writes to it or not; if it is damaged, say what is safe."""
+    deadline = time.monotonic() + PATIENCE
     with saying_what_is_safe(folder), ExitStack() as stack:
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            try:
-                yield stack.enter_context(_open_to_read(folder))
-                return
-            except _NotYetError:
-                # A run is just opening the journal, or closing it.
-                _wait(folder, deadline)
+        while not (found := _opened(folder, stack)):
+            # A run is just opening the journal, or closing it.
+            _wait(folder, deadline)
+        yield found[0]
 
 
-class _NotYetError(Exception):
-    """A journal that another process is opening or closing at this moment."""
-
-
-@contextmanager
-def _open_to_read(folder: Path) -> Iterator[JournalReader | None]:
-    path = folder / FILE_NAME
-    with ExitStack() as stack:
+def _opened(folder: Path, stack: ExitStack) -> tuple[JournalReader | None] | None:
+    """Return the journal, if there is one; nothing while another process is opening or closing it."""
+    with ExitStack() as tried:
+        live = False
         try:
-            stack.enter_context(lock(folder, shared=True, patience=0.0))
-            live = False
+            tried.enter_context(lock(folder, shared=True, patience=0.0))
         except InUseError:
             live = True
         try:
-            log = stack.enter_context(read_journal(path, live=live))
-        except DamageError:
-            raise
+            log = tried.enter_context(read_journal(folder / FILE_NAME, live=live))
         except StorageError as error:
-            if live:
-                raise _NotYetError from error
-            raise
+            if isinstance(error, DamageError) or not live:
+                raise
+            return None
         if live and log is None:
-            raise _NotYetError
-        yield log
+            return None
+        stack.push(tried.pop_all())
+        return (log,)
 
 
 @contextmanager

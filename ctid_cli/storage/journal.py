@@ -12,8 +12,6 @@ Others may read while the run writes: each sees the file as it was when it began
 import hashlib
 import json
 import math
-import os
-import shutil
 import sqlite3
 import uuid
 from collections import Counter
@@ -21,29 +19,28 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import DamageError, RefusedError, StorageError
+from ctid_cli.errors import DamageError
+from ctid_cli.storage.announcement import reported
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_parts, read_json, require_manifest
-from ctid_cli.temporary import TemporaryFolder
+from ctid_cli.storage.sqlite_file import (
+    APPLICATION,
+    ERRORS,
+    FORMAT,
+    Places,
+    readable,
+    refuse,
+    require_journal,
+    require_whole,
+    set_up,
+)
 from ctid_cli.written_files import write_file
 
-#: The journal, and what is exported of it.
-FILE_NAME, EXPORT = "journal.sqlite", "runs.h5"
-#: Another one for every change after which another ctid could misread the file.
-FORMAT = 5
-#: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
-APPLICATION = 0x63746964
-#: What can go wrong while a file is read that may hold anything.
-ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
-#: What keeps SQLite from reading or writing a file that is in order; all else that it reports is damage.
-_HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
 #: How long a reader waits for a moment at which the file can be read [s].
 _PATIENCE = 2.0
-#: Bytes at the beginning of a write-ahead log.
-_LOG_HEADER = 32
 
 _KEY = "data_hash, estimator_hash, replicate, start"
 _IS_KEY = " AND ".join(f"{name} = ?" for name in _KEY.split(", "))
@@ -182,11 +179,6 @@ class JournalReader:
         """Return how many estimates are stored."""
         return int(self._rows("SELECT count(*) FROM estimates")[0][0])
 
-    def mean_seconds(self) -> float | None:
-        """Return mean time of an estimate [s]; None where none is known."""
-        mean: float | None = self._rows("SELECT avg(seconds) FROM estimates")[0][0]
-        return mean
-
     def counts(self) -> Counter[tuple[str, str]]:
         """Return number of estimates of each run with each status."""
         rows = self._rows("SELECT session, status, count(*) FROM estimates GROUP BY 1, 2")
@@ -198,9 +190,11 @@ class JournalReader:
         yield from self._selected("")
 
     def require_count(self) -> None:
-        """Refuse a file that lacks estimates which were written."""
-        written, there = self._meta(_COUNT) or "0", self.count()
-        if written != str(there):
+        """Refuse a file that lacks estimates which were written, or which a killed run has reported."""
+        written, there = int(self._meta(_COUNT) or 0), self.count()
+        # What a run reports while this is read can be more than there was when reading began.
+        written = written if self.live else max(written, reported(self.path.parent))
+        if written != there:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
@@ -269,9 +263,8 @@ class Journal(JournalReader):
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         super().__init__(connection, path)
-        #: The folder and its files as they were when it was opened, and the folder itself.
-        self._places: dict[Path, tuple[int, int] | None] = {}
-        self._folder: int | None = None
+        #: None until its tables are there.
+        self.places: Places | None = None
 
     def write_beside(self, name: str, data: bytes) -> None:
         """Write a file beside the journal, if it is not there already."""
@@ -330,36 +323,15 @@ class Journal(JournalReader):
 
     def require_in_place(self) -> None:
         """Refuse to go on in a file that its path does not lead to any more."""
-        for place, found in self._places.items():
-            if _identity(place) != found:
-                advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"
-                raise StorageError(f"{self._what_became_of(place)}. {advice}")
-
-    def _what_became_of(self, place: Path) -> str:
-        now = None
-        with suppress(OSError):
-            # Linux knows the present name of an open folder.
-            now = os.readlink(f"/proc/self/fd/{self._folder}")
-        moved = now is not None and now != str(place.resolve()) and not now.endswith(" (deleted)")
-        if moved and place == self.path.parent:
-            return f"{place} was renamed while a run wrote to it; it is {now} now"
-        return f"{place} was deleted or replaced while a run wrote to it"
-
-    def remember_place(self) -> None:
-        """Remember where the files are."""
-        folder = self.path.parent
-        self._folder = os.open(folder, os.O_RDONLY)
-        places = (folder, self.path, self.path.with_name(f"{self.path.name}-wal"))
-        self._places = {place: _identity(place) for place in places if place.exists()}
+        if self.places is not None:
+            self.places.require()
 
     def close(self) -> None:
         """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
         with suppress(sqlite3.Error):
             self._connection.close()
-        if self._folder is not None:
-            with suppress(OSError):
-                os.close(self._folder)
-            self._folder = None
+        if self.places is not None:
+            self.places.close()
 
     def _insert(self, table: str, *row: Any) -> None:
         """Store a row and its checksum, in place of one with the same key."""
@@ -378,34 +350,26 @@ class Journal(JournalReader):
 
 def open_journal(path: Path) -> Journal:
     """Open a journal for writing, and make it if there is none."""
-    _require_whole(path)
+    require_whole(path)
     with ExitStack() as stack:
         try:
             connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
             stack.callback(connection.close)
-            _set_up(connection)
+            set_up(connection)
             log = Journal(connection, path)
             if connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone():
-                _require_journal(connection, path)
+                require_journal(connection, path)
                 log.check()
             else:
+                require_whole(path, planned=False)
                 with log.transaction():
                     for statement in _SCHEMA:
                         connection.execute(statement)
-            log.remember_place()
+            log.places = Places(path)
         except (OSError, *ERRORS) as error:
             refuse(path, error, writing=True)
         stack.pop_all()
         return log
-
-
-def _set_up(connection: sqlite3.Connection) -> None:
-    """Make commits durable, and let others read meanwhile where the file system has shared memory for it."""
-    for locking in ("NORMAL", "EXCLUSIVE"):
-        connection.execute(f"PRAGMA locking_mode={locking}")
-        if connection.execute("PRAGMA journal_mode=WAL").fetchone() == ("wal",):
-            break
-    connection.execute("PRAGMA synchronous=FULL")
 
 
 @contextmanager
@@ -414,92 +378,25 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
     if not path.exists():
         yield None
         return
-    _require_whole(path)
+    require_whole(path)
     with ExitStack() as stack:
         try:
-            address = stack.enter_context(_readable(path, live=live))
+            address = stack.enter_context(readable(path, live=live))
             connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=_PATIENCE)
             stack.callback(connection.close)
             # All that is read from here on is of one moment.
             connection.execute("BEGIN")
             planned = connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
             if planned:
-                _require_journal(connection, path)
+                require_journal(connection, path)
                 planned = connection.execute("SELECT 1 FROM meta WHERE name = ?", (_MANIFEST,)).fetchone()
                 if not planned and connection.execute("SELECT 1 FROM sessions").fetchone():
                     raise DamageError(f"{path} is damaged: it holds no plan")
             log = JournalReader(connection, path, live=live)
         except (OSError, *ERRORS) as error:
             refuse(path, error)
-        _require_whole(path, planned=bool(planned))
+        require_whole(path, planned=bool(planned), live=live)
         yield log if planned else None
-
-
-def _require_whole(path: Path, *, planned: bool = True) -> None:
-    """Refuse a file that was emptied: beside what was made from it, or its log, which SQLite would remove."""
-    log, export = path.with_name(f"{path.name}-wal"), path.with_name(EXPORT)
-    emptied = path.exists() and path.stat().st_size == 0 and log.exists() and log.stat().st_size > _LOG_HEADER
-    if emptied or (not planned and export.exists()):
-        raise DamageError(f"{path} is damaged: it is empty, and was not")
-
-
-@contextmanager
-def _readable(path: Path, *, live: bool) -> Iterator[str]:
-    """Return an address at which SQLite reads a journal and changes nothing.
-
-    After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
-    index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
-    """
-    log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
-    # A log that was only begun holds nothing, and SQLite does not get on with its index.
-    empty = not log.exists() or log.stat().st_size <= _LOG_HEADER
-    if live or (index.exists() and not empty):
-        yield f"{path.resolve().as_uri()}?mode=ro&readonly_shm=1"
-    elif empty:
-        yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
-    else:
-        with TemporaryFolder() as folder:
-            copy = folder / path.name
-            shutil.copyfile(path, copy)
-            shutil.copyfile(log, copy.with_name(log.name))
-            yield copy.as_uri()
-
-
-def refuse(path: Path, error: Exception, *, writing: bool = False) -> NoReturn:
-    """Say what keeps a journal from being read or written."""
-    name = getattr(error, "sqlite_errorname", "") or ""
-    reason = (error.strerror if isinstance(error, OSError) else None) or error
-    if writing and name not in ("SQLITE_CORRUPT", "SQLITE_NOTADB"):
-        safe = "all that was reported as done is safe in it"
-        raise StorageError(f"{path} could not be written ({reason}); {safe}") from error
-    if isinstance(error, OSError) or name.removeprefix("SQLITE_").startswith(_HINDRANCES):
-        raise StorageError(f"{path} cannot be read ({reason})") from error
-    raise DamageError(f"{path} is damaged or not a journal ({error})") from error
-
-
-def _require_journal(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse an SQLite file that is no journal, or one of another format."""
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
-    (written,) = connection.execute("PRAGMA user_version").fetchone()
-    if application != APPLICATION:
-        raise DamageError(f"{path} is an SQLite file, but not a journal of ctid")
-    require_format(path, written, FORMAT)
-
-
-def require_format(path: Path, written: int, known: int) -> None:
-    """Refuse a file of another format than the one that this program reads."""
-    if written != known:
-        raise RefusedError(
-            f"{path} has format {written}; this ctid reads format {known}. Use the ctid that wrote it, another results "
-            "folder (--out), or --fresh to move the old results aside"
-        )
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    with suppress(OSError):
-        found = os.stat(path)
-        return found.st_dev, found.st_ino
-    return None
 
 
 def new_id() -> str:

@@ -231,28 +231,6 @@ def whole(manifest: Manifest) -> Manifest:
     return {name: value for name, value in manifest.items() if name != "shard"}
 
 
-def assemble(
-    slot: Slot, manifest: Manifest, result: Mapping[str, Any], seconds: float | None, cpu_seconds: float | None
-) -> dict[str, Any]:
-    """Return an estimate row."""
-    values = {**result, **plan_values(slot, manifest), "seconds": seconds, "cpu_seconds": cpu_seconds}
-    return {column.name: values.get(column.name) for column in row_columns(manifest)} | slot.swept
-
-
-def plan_values(slot: Slot, manifest: Manifest) -> dict[str, Any]:
-    """Return what the plan says of an estimate, apart from swept fields."""
-    return {
-        "id": slot.key.id,
-        "experiment": manifest["experiment"],
-        "estimator": slot.estimator["name"],
-        "kind": slot.estimator["kind"],
-        "cell": slot.key.data_hash,
-        "replicate": slot.key.replicate,
-        "start": slot.key.start,
-        "initial_delay": manifest["starts"].get(slot.key.start),
-    }
-
-
 def row_columns(manifest: Manifest) -> list[columns.Column]:
     """Return the columns of a row as it is computed, before it is compared with the truth."""
     return _row_columns(of_signal=is_of_signal(manifest))

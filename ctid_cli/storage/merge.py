@@ -9,37 +9,18 @@ import re
 import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
-from ctid_cli.errors import CtidError, RefusedError, StorageError, UsageError
+from ctid_cli.errors import RefusedError, StorageError, UsageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.export import ROWS, open_export, seal
-from ctid_cli.storage.identity import Origin, now, origin_differences
-from ctid_cli.storage.journal import (
-    EXPORT,
-    FILE_NAME,
-    Journal,
-    JournalReader,
-    Row,
-    Session,
-    new_id,
-    open_journal,
-    read_journal,
-)
-from ctid_cli.storage.manifest import (
-    Key,
-    Manifest,
-    Outcome,
-    Planned,
-    Shard,
-    owner,
-    shard_of,
-    slots,
-    whole,
-)
+from ctid_cli.storage.export import write_runs
+from ctid_cli.storage.identity import Origin, origin_differences
+from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, open_journal, read_journal
+from ctid_cli.storage.manifest import Key, Manifest, Planned, Shard, owner, shard_of, slots, whole
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 
 #: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
 LIMITED = ("TIMEOUT", "MEMORY")
@@ -86,8 +67,7 @@ def merge_all(
     """Merge folders, those of each experiment into the one of its name."""
     experiments: dict[str, list[Path]] = defaultdict(list)
     for folder in folders:
-        with _reading(folder) as log:
-            experiments[log.experiment()].append(folder)
+        experiments[_plan_of(folder)["experiment"]].append(folder)
     for name, places in experiments.items():
         yield merge(places, out / name, allow_mixed=allow_mixed, partial=partial)
 
@@ -101,7 +81,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
     # In the same order whatever the order they are named in.
     others.sort(key=lambda folder: (shard_of(plans[folder]) or Shard(0, 0), str(folder)))
     plan = _common_plan([(folder, plans[folder]) for folder in others])
-    shards = [shard_of(plans[folder]) for folder in others]
+    keys = dict.fromkeys(slot.key for slot in slots(plan))
     with _new_folder(target), place.lock(target):
         with place.saying_what_is_safe(target):
             _require_same_experiment(target, plan)
@@ -114,17 +94,19 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
                         other.check()
                         log.add_rows(taken.new_rows(folder, other))
                 taken.require_no_conflict()
-                missing = tuple(_missing(plan, shards, taken.missing()))
+                there = {row.key for row in log.rows()}
+                lacking = [key for key in keys if key not in there]
+                missing = tuple(_missing(plan, [shard_of(plans[folder]) for folder in others], lacking))
                 if missing and not partial:
                     raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
                 log.note_plan(plan)
             with _writing(target):
                 for name in (place.SPEC, place.CANONICAL):
                     log.write_beside(name, (others[0] / name).read_bytes())
-            count, checksum = seal(target, log)
+            count, checksum = write_runs(target, log)
             mixed = len(log.origins()) > 1
-    planned = len({slot.key for slot in slots(plan)})
-    return Merged(plan["experiment"], target, len(others), planned, count, taken.new, mixed, checksum, missing)
+    new = len(taken.changed)
+    return Merged(plan["experiment"], target, len(others), len(keys), count, new, mixed, checksum, missing)
 
 
 @contextmanager
@@ -182,18 +164,14 @@ class _Taken:
     """What has been taken over from several folders into a journal, in one transaction."""
 
     def __init__(self, target: Path, log: Journal, plan: Manifest, *, allow_mixed: bool) -> None:
-        self._log, self._plan, self._planned, self._allow_mixed = log, plan, Planned(plan), allow_mixed
+        self._log, self._planned, self._allow_mixed = log, Planned(plan), allow_mixed
         #: Where the runs of the journal come from, by their ids.
         self._places = {session.id: (target, session) for session in log.sessions()}
-        self._conflicts: list[tuple[Key, Path, Path]] = []
-        self._changed: set[Key] = set()
         cells = {cell["hash"] for cell in plan["data_cells"]}
         self._origins = {origin: target for data, origin in log.made() if data in cells}
-
-    @property
-    def new(self) -> int:
-        """Return estimates that were not there before, or exceeded a limit there."""
-        return len(self._changed)
+        self._conflicts: list[tuple[Key, Path, Path]] = []
+        #: Estimates that were not there before, or exceeded a limit there.
+        self.changed: set[Key] = set()
 
     def new_rows(self, folder: Path, other: JournalReader) -> Iterator[Row]:
         """Yield the rows of a folder that are to be stored; their runs are noted."""
@@ -206,7 +184,7 @@ class _Taken:
             if present is None or self._is_better(row, session, present, folder):
                 if row.session not in self._places:
                     self._places[self._log.note_session(session)] = (folder, session)
-                self._changed.add(row.key)
+                self.changed.add(row.key)
                 yield row
 
     def _require_origin(self, folder: Path, origin: Origin) -> None:
@@ -233,7 +211,7 @@ class _Taken:
         return False
 
     def require_no_conflict(self) -> None:
-        """Return name the estimates that are one thing here and another there."""
+        """Name the estimates that are one thing here and another there."""
         if self._conflicts:
             key, one, other = self._conflicts[0]
             count = len(self._conflicts)
@@ -243,11 +221,6 @@ class _Taken:
                 f"estimate {key.id} is one thing in {one} and another in {other}; 'ctid show {key.id}' prints each, "
                 f"and --fresh computes one of the folders anew{more}"
             )
-
-    def missing(self) -> list[Key]:
-        """Return estimates of the plan that are in none of the folders."""
-        there = {row.key for row in self._log.rows()}
-        return list({slot.key: None for slot in slots(self._plan) if slot.key not in there})
 
 
 def _rank(row: Row, session: Session) -> tuple[bool, list[float], str]:
@@ -300,70 +273,3 @@ def _writing(target: Path) -> Iterator[None]:
         raise StorageError(
             f"{error.filename or target}: {error.strerror or error}; the same merge again goes on"
         ) from error
-
-
-# --- keeping what can be read of a damaged folder -------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Kept:
-    """What was kept of a folder that was moved aside."""
-
-    planned: int
-    #: Estimates out of its journal, and out of ``runs.h5``.
-    from_journal: int
-    from_export: int
-
-    def __str__(self) -> str:
-        text = f"{self.from_journal + self.from_export} of {self.planned} estimates could be read and are kept"
-        return f"{text}, {self.from_export} of them from {EXPORT}" if self.from_export else text
-
-
-def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, allow_mixed: bool = False) -> Kept:
-    """Copy what can be read of a folder that was moved aside into a new journal.
-
-    Row by row: what SQLite still reads of the old journal and agrees with its checksum; where a row is lost, that of
-    ``runs.h5`` if this is whole. Results of other code or arithmetic are left out unless they may be mixed.
-    """
-    keys = dict.fromkeys(slot.key for slot in slots(plan))
-    kept, noted = set[Key](), set[str]()
-
-    def chosen(found: Iterator[tuple[Row, Session]]) -> Iterator[Row]:
-        for row, session in found:
-            if row.key in keys and row.key not in kept and (allow_mixed or session.origin == origin):
-                if session.id not in noted:
-                    noted.add(log.note_session(session))
-                kept.add(row.key)
-                yield row
-
-    with log.transaction():
-        log.note_plan(plan)
-        log.add_rows(chosen(_readable(aside, keys)))
-        from_journal = len(kept)
-        if from_journal < len(keys):
-            log.add_rows(chosen(_exported(aside)))
-    return Kept(len(keys), from_journal, len(kept) - from_journal)
-
-
-def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
-    """Yield the rows of a journal that can be read, each with its run."""
-    with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
-        for key in keys if old is not None else ():
-            # Whatever a damaged page hides, the other rows are worth reading.
-            with suppress(CtidError, ValueError):
-                assert old is not None
-                if (row := old.row(key)) is not None:
-                    yield row, old.session(row.session)
-
-
-def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
-    """Yield the estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
-    with suppress(CtidError):
-        export = open_export(aside / EXPORT)
-        export.verify()
-        if len(export.origins) == 1:
-            session = Session(new_id(), export.origins[0], now(), None, None, {"kept_from": str(aside / EXPORT)})
-            for first in range(0, export.count, ROWS):
-                part = (first, min(first + ROWS, export.count))
-                for key, result in zip(export.keys(*part), export.results(*part), strict=True):
-                    yield Row.of(Outcome(key, result, None), session.id), session

@@ -16,6 +16,7 @@ import numpy as np
 from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
+from ctid_cli.storage.announcement import who_runs
 from ctid_cli.storage.estimates import Estimates, read_stored
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.storage.identity import as_text
@@ -161,7 +162,7 @@ def experiment_status(folder: Path) -> ExperimentStatus:
 
 def _running(folder: Path) -> dict[str, Any]:
     """Return who runs, how far it is, how fast, and when it will have ended at that speed."""
-    running = place.who_runs(folder)
+    running = who_runs(folder)
     if running is None:
         return {"pid": None, "host": None}
     about: dict[str, Any] = {"data_sets_per_second": None, "expected_end": None}

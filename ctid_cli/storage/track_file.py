@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
 from ctid_cli.storage.result_file import (
     ResultKind,
@@ -25,8 +24,9 @@ from ctid_cli.storage.result_file import (
     result_text,
     texts,
 )
+from ctid_cli.tones.track import Track
 
-TRACK = ResultKind("ctid track", 1, "track", "ctid track", "track again")
+TRACK = ResultKind("ctid track", 2, "track", "ctid track", "track again")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Reading:
 
 
 def track_file_text(
-    track: RecordTrack, content: Mapping[str, Any], record: Path, reading: Reading, folder: Path, command: str | None
+    track: Track, content: Mapping[str, Any], record: Path, reading: Reading, folder: Path, command: str | None
 ) -> str:
     """Return the file's text: what is said of a track, its record as seen from the folder of the file, and its rows."""
     source = {
@@ -83,7 +83,7 @@ class StoredTrack:
     path: Path
     #: What the file says, as in the documentation of machine-readable output.
     content: Mapping[str, Any]
-    track: RecordTrack
+    track: Track
     source: SignalSource
 
 
@@ -92,7 +92,7 @@ def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | No
     file = os.fspath(path)
     content = content_of(file, TRACK)
     try:
-        track = decoded(content["result"], RecordTrack)
+        track = decoded(content["result"], Track)
         _require_said(content)
         moved = None if record is None else os.fspath(record)
         source = SignalSource(TRACK, file, str(content["file"]), content["record"], moved)

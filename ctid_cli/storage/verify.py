@@ -8,9 +8,11 @@ from typing import Literal
 
 from ctid_cli.errors import CtidError, DamageError
 from ctid_cli.storage import folder as place
+from ctid_cli.storage.announcement import RUNNING
 from ctid_cli.storage.export import open_export, sha256_of
-from ctid_cli.storage.journal import EXPORT, FILE_NAME, JournalReader
+from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import Planned, slots
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 from ctid_cli.written_files import is_leftover
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
@@ -56,7 +58,7 @@ def verify(folder: Path) -> Verification:
         findings.append(Finding(FILE_NAME, "damaged", str(error)))
     findings += _export(folder, noted, known=bool(findings) and findings[0].state == "intact")
     if not live:
-        left = sorted(path.name for path in folder.glob("*") if is_leftover(path.name) or path.name == place.RUNNING)
+        left = sorted(path.name for path in folder.glob("*") if is_leftover(path.name) or path.name == RUNNING)
         findings += [Finding(name, "left over", "of a run that was killed; it does no harm") for name in left]
     return Verification(folder, tuple(findings))
 

@@ -12,8 +12,9 @@ import numpy as np
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.job import DataCell, EstimatorCell
-from ctid_cli.running.plan import build_plan
+from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.specification.load import spec_from_canonical
 
 #: What estimators are called that the paper compares with, but that are not theirs.
@@ -58,9 +59,15 @@ def figure_4(results: Results) -> bytes:
     return errors_svg(rows, (1.4, 4.2), (1e-17, 20.0), title)
 
 
+def plan_of(results: Results) -> Plan:
+    """Return the plan of stored results; kinds that name files are seen from the folder of the specifications."""
+    folder = data_folder("configs") / "finite_time_frequency"
+    return build_plan(spec_from_canonical(dict(results.settings), folder))
+
+
 def _row(results: Results, title: str = "", *, reference: bool = False, **swept: str) -> Row:
     """Tracks of the first data set, with the truth."""
-    plan = build_plan(spec_from_canonical(dict(results.settings)))
+    plan = plan_of(results)
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
     parts, source = {part.name: part for part in plan.estimators}, cell.source
     groups = []
@@ -78,9 +85,9 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
 
 
 def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: float) -> FrequencyTrack:
-    """Return the track of an online estimator on a data set, its rows an interval [s] apart."""
+    """Return the track of an estimator on a data set, its rows an interval [s] apart."""
     record = cell.dataset(replicate).record
-    track = part.estimator.prepare(record).fit().found
+    track = part.estimator.prepare(record).fit().track
     every = max(1, round(interval / record.interval))
     return FrequencyTrack(track.t[::every], track.frequencies[::every], track.flags[::every])
 

@@ -9,11 +9,9 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.reporting.results import Results
-from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.frequency_measures import SignalSource
-from ctid_cli.specification.load import spec_from_canonical
 
-from .figures import DERIVED, GROUPS, track_of
+from .figures import DERIVED, GROUPS, plan_of, track_of
 
 Row = dict[str, Any]
 
@@ -34,7 +32,7 @@ def is_derived(estimator: str) -> bool:
 
 def sources(results: Results) -> dict[str, tuple[str, SignalSource]]:
     """Reading of the step (empty if there is none) and signal of every data cell, by its hash."""
-    cells = build_plan(spec_from_canonical(dict(results.settings))).data_cells
+    cells = plan_of(results).data_cells
     return {cell.hash: (str(cell.swept.get("phase_at_steps", "")), cell.source) for cell in cells}
 
 
@@ -51,13 +49,13 @@ def grouped(results: Results) -> Iterator[tuple[Row, list[Row]]]:
 
 
 def followed(results: Results) -> Iterator[tuple[Row, list[tuple[SignalSource, FrequencyTrack]]]]:
-    """The same with the signals and tracks of the first data sets, of online estimators."""
-    plan = build_plan(spec_from_canonical(dict(results.settings)))
+    """The same with the signals and tracks of the first data sets, of estimators that give one estimate per sample."""
+    plan = plan_of(results)
     cells, parts = {cell.hash: cell for cell in plan.data_cells}, {part.name: part for part in plan.estimators}
     runs = TRACKED.get(results.experiment.rpartition("/")[2], 0)
     for common, rows in grouped(results):
         part = parts[common["estimator"]]
-        if part.estimator.options.online and runs:
+        if runs and not part.estimator.options.whole_record:
             tracked = [(cells[row["cell"]], row["replicate"]) for row in rows if row["replicate"] < runs]
             yield common, [(cell.source, track_of(cell, k, part, TRACK_INTERVAL)) for cell, k in tracked]
 

@@ -66,12 +66,12 @@ def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, c
 
 def test_a_command_tells_it_in_a_pipe_and_with_a_filled_cache_never(tmp_path):
     """Real compilation, announced at once: JSON stays JSON, and what is loaded from disk is no compilation."""
-    t = 0.001 * np.arange(2000)
+    t = 0.001 * np.arange(500)
     np.savetxt(
-        tmp_path / "mains.csv", np.column_stack((t, np.cos(100 * np.pi * t))), header="t,u", delimiter=",", comments=""
+        tmp_path / "signal.csv", np.column_stack((t, np.cos(100 * np.pi * t))), header="t,u", delimiter=",", comments=""
     )
     program = "from ctid_cli.cli import _compiling, main; _compiling.SILENT = 0.0; main.main()"
-    command = [sys.executable, "-c", program, "track", "mains.csv", "--pmu", "50", "--json"]
+    command = [sys.executable, "-c", program, "track", "signal.csv", "--tones", "1", "--json"]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     told = []
     for _ in range(2):

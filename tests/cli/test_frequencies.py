@@ -7,18 +7,21 @@ import re
 
 import pytest
 
-SPEC = """\
+from ctid_cli.custom_code import STUDIES
+
+COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
+SPEC = f"""\
 experiment: beat
 signal:
-  tones: [{frequency: [{until: 8, value: 1.8}, {value: 2.2}]}, {frequency: 3.0, phase: 1.5}]
-disturbance: {kind: uniform, half_width: [0.001, 0.01]}
-sampling: {kind: regular, interval: 0.02, duration: 20}
+  tones: [{{frequency: [{{until: 8, value: 1.8}}, {{value: 2.2}}]}}, {{frequency: 3.0, phase: 1.5}}]
+disturbance: {{kind: uniform, half_width: [0.001, 0.01]}}
+sampling: {{kind: regular, interval: 0.02, duration: 20}}
 estimators:
-  restarting: {kind: restarting_least_squares, tones: 2, h: [0.6, 0.7], prefilter: 0.5}
-  finite: {kind: drem_finite_time, tones: 2, h: 0.7, d: 0.4, epsilon: 0.1, gamma: 1.0, initial_frequencies: [2, 4]}
-  whole: {kind: esprit, tones: 2}
-success: {band: 0.05, by: 8, window: [18, 20]}
-monte_carlo: {runs: 3, seed: 1}
+  restarting: {{kind: restarting_least_squares, tones: 2, h: [0.6, 0.7], prefilter: 0.5}}
+  finite: {{kind: drem_finite_time, tones: 2, h: 0.7, d: 0.4, epsilon: 0.1, gamma: 1.0, initial_frequencies: [2, 4]}}
+  whole: {{kind: "{COMPARATORS}/whole_record.py:Esprit", tones: 2}}
+success: {{band: 0.05, by: 8, window: [18, 20]}}
+monte_carlo: {{runs: 3, seed: 1}}
 """
 SETTLING = ("settling_time_1", "settling_time_2", "settling_after_step_1", "settling_after_step_2")
 

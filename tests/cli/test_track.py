@@ -7,8 +7,6 @@ import pandas as pd
 import pytest
 from scipy.io import wavfile
 
-from ctid_cli.kinds import ONLINE
-
 T = 0.002 * np.arange(3000)
 
 
@@ -29,11 +27,6 @@ def record(tmp_path):
     return write(tmp_path / "record.csv", T, signal())
 
 
-def test_names_of_the_methods(ctid):
-    text = ctid("track", "--help").stdout
-    assert all(name in text for name in ("automatic", *ONLINE))
-
-
 def test_table_track_and_figure(ctid, record, tmp_path):
     out = tmp_path / "new"
     text = ctid("track", record, "--tones", 2, "--out", out).stdout
@@ -49,11 +42,11 @@ def test_table_track_and_figure(ctid, record, tmp_path):
 
 def test_json_and_hdf5(ctid, record, tmp_path):
     out = tmp_path / "new"
-    options = ("--tones", 2, "--method", "restarting_least_squares", "--every", 0.05, "--json", "--format", "h5")
+    options = ("--tones", 2, "--every", 0.05, "--json", "--format", "h5")
     options = (*options, "--out", out)
     done = ctid("track", record, *options)
     content = json.loads(done.stdout)
-    assert content["method"] == "restarting_least_squares"
+    assert content["method"] == "tone_windows"
     assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.05)
     assert content["every"] == pytest.approx(0.05, rel=0.1)
     assert content["written"] == [str(out / name) for name in ("track.h5", "track.svg", "track.json")]
@@ -107,7 +100,6 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T, np.random.default_rng(1).standard_normal(T.size), ("--tones", "auto"), "no tone stands out"),
         (T**1.1, signal(), (), "clock is not regular"),
         (T, signal(), ("--tones", 21), "--tones must be a number from 0 to 20, or auto"),
-        (T, signal(), ("--tones", 9, "--method", "drem_window"), "tones must be an integer from 1 to 8"),
         (T, signal(), ("--every", -1), "--every"),
         (T, signal(), ("--window", 1000), "the longest window must be from"),
         (T, signal(), ("--rate", 0), "--rate"),
@@ -135,9 +127,8 @@ def test_mistakes_are_one_sentence(ctid, tmp_path, t, y, options, message):
 
 
 @pytest.mark.parametrize("every", [50, 1e308])
-@pytest.mark.parametrize("method", ["automatic", "restarting_least_squares"])
-def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, method, every):
-    done = ctid("track", record, "--tones", 2, "--every", every, "--method", method, "--out", tmp_path)
+def test_rows_farther_apart_than_the_record_is_long_are_one(ctid, record, tmp_path, every):
+    done = ctid("track", record, "--tones", 2, "--every", every, "--out", tmp_path)
     assert len(pd.read_csv(tmp_path / "track.csv")) == 1
     # A slow machine may be told how far the record has been read.
     assert {line.split(": ")[0] for line in done.stderr.splitlines()} <= {record.name}
@@ -164,14 +155,6 @@ def test_an_output_that_cannot_be_written(ctid, record, tmp_path):
     (tmp_path / "file").write_text("", encoding="utf-8")
     done = ctid("track", record, "--tones", 2, "--out", tmp_path / "file" / "deeper", code=6)
     assert "cannot be written" in done.stderr
-
-
-def test_an_online_method_that_finds_nothing_says_what_to_try(ctid, tmp_path):
-    y = signal() + 3.0 * np.random.default_rng(1).standard_normal(T.size)
-    options = ("--tones", 2, "--method", "drem_finite_time", "--out", tmp_path)
-    text = ctid("track", write(tmp_path / "a.csv", T, y), *options).stdout
-    assert "No row of tone 1 is valid" in text
-    assert "leave --method out" in " ".join(text.split())
 
 
 def test_an_unknown_unit_of_time(ctid, tmp_path):
@@ -201,7 +184,6 @@ def test_a_page_is_made_of_a_track_and_its_record(ctid, record, tmp_path):
         (("--tones", -1), "--tones must be a number from 0 to 20"),
         (("--tones", 21), "--tones must be a number from 0 to 20"),
         (("--tones", 2, "--accuracy", 0), "--accuracy must be a positive number of hertz"),
-        (("--tones", 2, "--method", "esprit"), "'esprit' is not one of"),
     ],
 )
 def test_what_cannot_be_asked_for(ctid, record, tmp_path, options, message):

@@ -9,12 +9,11 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DataError, RefusedError, SpecError, UsageError
-from ctid_cli.signals.csv_file import read_csv_table
-from ctid_cli.signals.mat_file import read_mat_table
+from ctid_cli.signals.array_file import read_array_table
 from ctid_cli.signals.measurement import read_measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.specification.load import load_spec
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.journal import open_journal
 from tests.storage.made_results import ORIGIN, SPEC, outcomes_of, plan_of
 
@@ -100,6 +99,20 @@ def test_nothing_of_a_file_elsewhere_is_repeated(inside):
     assert asked("validate", inside / ("x" * 300)) == 2
 
 
+def test_instants_from_a_file_elsewhere(inside):
+    file = specification(inside, "none.csv")
+    sampled = "sampling: {kind: irregular, file: ../outside.csv}"
+    simulated = f"system: {{numerator: [1], denominator: [1, 1]}}\nexcitation: {{kind: step}}\n{sampled}\n"
+    file.write_text("\n".join(simulated if "data:" in line else line for line in MEASURED.splitlines()))
+    with pytest.raises(SpecError, match=r"sampling.file: lies outside the folder.*--allow-outside"):
+        load_spec(file)
+    assert load_spec(file, allow_outside=True).sampling.sha256
+    (inside.parent / "outside.csv").write_text("t,rooster\n0,1\nsecret,2\n")
+    with pytest.raises(SpecError, match="'ctid check' says what is wrong") as refused:
+        load_spec(file, allow_outside=True)
+    assert "secret" not in str(refused.value)
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_name_that_no_file_can_have(command, inside, monkeypatch):
     monkeypatch.chdir(inside)
@@ -115,7 +128,7 @@ def test_what_is_no_ordinary_file(name, inside, monkeypatch):
     monkeypatch.chdir(inside)
     os.mkfifo("pipe.csv")
     (inside / "link.csv").symlink_to("/dev/zero")
-    for read in (read_csv_table, read_mat_table, read_measurement):
+    for read in (read_array_table, read_measurement):
         with pytest.raises(DataError, match=r"is not a file|are not read"):
             read(name)
     with pytest.raises(UsageError, match=r"is not a file|is a folder"):
@@ -143,8 +156,8 @@ def test_messages_do_not_steer_the_terminal(inside):
 @pytest.mark.parametrize("header", ["," * 20_000, "x" * 2_000_000, "t\0,u,y"])
 def test_first_lines_that_name_no_columns(header, inside):
     (inside / "record.csv").write_text(header + "\n" + ROWS)
-    with pytest.raises(DataError, match=r"first line has|not a text file"):
-        read_csv_table(inside / "record.csv")
+    with pytest.raises(DataError, match=r"names no columns|more than 1000000 bytes|not a text file"):
+        read_measurement(inside / "record.csv")
 
 
 @pytest.mark.parametrize(
@@ -203,7 +216,7 @@ def stored(inside):
     place.mkdir(parents=True)
     manifest, log = plan_of(1).manifest(), open_journal(place / "journal.sqlite")
     log.add(outcomes_of(manifest), log.begin(manifest, ORIGIN, "now", {}))
-    seal(place, log)
+    write_runs(place, log)
     log.close()
     return place
 

@@ -6,9 +6,8 @@ from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.noise import WhiteNoise
+from ctid_cli.signals.noise import WhiteNoise, stream
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.streams import stream
 
 CASE_1 = TransferFunction([2.0], [0.25, 0.7, 1.0], 8.0)
 #: The system of Rao and Garnier: a right-half-plane zero, two frequencies a decade apart.

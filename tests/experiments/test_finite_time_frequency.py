@@ -101,7 +101,7 @@ def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = list(measured.settling(study["two-tones"]))
     y = acceptance.signal("A", 0.01, 60.0)
     for name, kind in (("finite_time", acceptance.DremFiniteTime), ("gradient", acceptance.DremGradient)):
-        track = acceptance.drem(kind, "A").start(0.01).run(y)
+        track = acceptance.drem(kind, "A").track(y, 0.01)
         row = one(rows, estimator=name)
         for band in measured.BANDS:
             assert row[f"within_{band:g}"] == pytest.approx(acceptance.settle(track, acceptance.TRUTH, band))
@@ -123,9 +123,9 @@ def test_a_step_is_measured_piece_by_piece_and_what_is_valid_but_wrong_is_found(
     plan = STUDY.plan("step", COARSE)
     (cell,) = (cell for cell in plan.data_cells if cell.swept["phase_at_steps"] == "continuous")
     (part,) = (part for part in plan.estimators if part.name == row["estimator"])
-    track = part.estimator.prepare(cell.dataset(0).record).fit().found
+    track = part.estimator.prepare(cell.dataset(0).record).fit().track
     truth = np.where((track.t > 29.999)[:, None], [2.0, 3.0], [1.8, 3.2])
-    wrong = track.valid & (np.abs(track.omega - truth) > 0.05).any(axis=1)
+    wrong = track.valid & (np.abs(track.frequencies - truth) > 0.05).any(axis=1)
     assert wrong.any()
     assert row["valid_but_off_by_0.05"] == pytest.approx(0.01 * wrong.sum())
 

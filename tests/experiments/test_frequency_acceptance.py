@@ -15,7 +15,6 @@ SHORT = {
     "quiet": lambda: acceptance.quiet(seeds=1),
     "efficient": lambda: acceptance.efficient(seeds=12),
     "coarse": acceptance.coarse,
-    "comparators": acceptance.comparators,
 }
 
 

@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from ctid_cli.frequency.adaptive_observer import AdaptiveObserver
 from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.drem_gradient import DremGradient
 from ctid_cli.frequency.drem_window import DremWindow
-from ctid_cli.frequency.filter_regression import FilterRegression
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.frequency_kernels import decode, decoding_memory
 from ctid_cli.frequency.regression import delay_table
@@ -36,9 +34,6 @@ def online_estimators(n=2):
         DremWindow(d=0.3, memory=1.5, difference=0.7, **common),
         RestartingLeastSquares(prefilter=0.5, **common),
         RestartingLeastSquares(solution="total_least_squares", memory=5.0, **common),
-        AdaptiveObserver(tones=n, initial_frequencies=initial),
-        FilterRegression(tones=n, pole=4.0, initial_frequencies=initial),
-        FilterRegression(tones=n, pole=4.0, algorithm="gradient", initial_frequencies=initial),
     ]
 
 

@@ -11,7 +11,7 @@ from ctid_cli.frequency.drem_finite_time import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.frequency.tracking import FrequencyEstimate
-from ctid_cli.kinds import KINDS, classes, resolve
+from ctid_cli.kinds import KINDS, classes
 from ctid_cli.specification.messages import option_docs
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
@@ -174,25 +174,14 @@ def test_rounded_delays_are_noted():
 
 def test_the_table_of_estimators_names_all_kinds():
     assert sorted(KINDS["frequency_estimator"]) == [
-        "adaptive_observer",
         "drem_finite_time",
         "drem_gradient",
         "drem_window",
-        "esprit",
-        "filter_regression",
-        "nonlinear_least_squares",
         "restarting_least_squares",
     ]
     for kind, estimator in classes("frequency_estimator").items():
         assert estimator.kind == kind
-        assert estimator.online == hasattr(estimator, "start") != hasattr(estimator, "estimate")
         assert set(option_docs(estimator)) == {item.name for item in fields(estimator) if item.init}
-
-
-def test_comparators_say_that_they_are_derived():
-    for kind in ("adaptive_observer", "filter_regression"):
-        text = resolve("frequency_estimator", kind).__doc__
-        assert text.count("erived, not the published algorithm") == 2
 
 
 def test_a_state_may_go_through_a_text_file():

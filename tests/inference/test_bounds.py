@@ -20,8 +20,8 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
+from ctid_cli.signals.noise import stream
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.streams import stream
 
 INTERVAL = 0.05
 

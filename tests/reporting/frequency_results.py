@@ -1,6 +1,7 @@
 """Results of studies computed in this process."""
 
-from ctid_cli.running.job import Job
+import itertools
+
 from ctid_cli.storage.identity import Origin
 from ctid_cli.studies.catalogue import find_study
 from tests.running.fakes import outcomes_of
@@ -12,11 +13,9 @@ STUDY = find_study("finite-time-frequency")
 def run_here(name, out, overrides, study=STUDY):
     """Run an experiment of a study with some settings replaced, and store it as ``ctid run`` would."""
     plan = study.plan(name, overrides)
-    seed = plan.spec.canonical()["monte_carlo"]["seed"]
     results = {}
-    for task in plan.tasks():
-        job = Job(plan.data_cells[task.cell], task.replicate, seed, tuple(plan.keys(task)))
-        results |= {outcome.key: outcome.result for outcome in outcomes_of(job)}
+    for cell, replicate in itertools.product(range(len(plan.data_cells)), range(plan.runs)):
+        results |= {outcome.key: outcome.result for outcome in outcomes_of(plan.job(cell, replicate))}
     folder = out / plan.experiment
     folder.mkdir(parents=True)
     (folder / "runs.h5").write_bytes(export_image(plan.manifest(), (Origin("c", "p", ()),), results))

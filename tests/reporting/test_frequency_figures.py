@@ -68,8 +68,8 @@ def test_lines_are_the_tracks_of_the_first_data_set_and_thick_where_valid(out, d
             above, below = panels[2 * k : 2 * k + 2, column]
             for place, name in enumerate(names):
                 (part,) = (part for part in plan.estimators if part.name == name)
-                track = part.estimator.prepare(cell.dataset(0).record).fit().found
-                t, omega, valid = track.t[::10], track.omega[::10], track.valid[::10]
+                track = part.estimator.prepare(cell.dataset(0).record).fit().track
+                t, omega, valid = track.t[::10], track.frequencies[::10], track.valid[::10]
                 truth = np.where((t >= 30 - 1e-9)[:, None], [2.0, 3.0], [1.8, 3.2])
                 for tone in (0, 1):
                     thin = lines_of(above, error_plot.FAINT)[2 * place + tone]
@@ -135,9 +135,9 @@ def test_figures_are_those_of_the_specifications():
     for name in NAMES:
         parts = {part.name: part.estimator.options for part in STUDY.plan(name).estimators}
         shown = {estimator for labels in figures.GROUPS.values() for estimator in labels}
-        assert shown == {estimator for estimator, options in parts.items() if options.online}
+        assert shown == {estimator for estimator, options in parts.items() if not options.whole_record}
         derived = {
-            part for part, options in parts.items() if options.kind in ("adaptive_observer", "filter_regression")
+            part for part, options in parts.items() if "derived, not the published algorithm" in type(options).__doc__
         }
         assert derived == set(figures.GROUPS[figures.DERIVED])
     assert figures.DERIVED == "derived, not the published algorithm"

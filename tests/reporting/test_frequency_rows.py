@@ -2,6 +2,7 @@
 
 import pytest
 
+from ctid_cli.custom_code import STUDIES
 from ctid_cli.reporting.percentages import experiment_rows, measures_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_blocks import success_sentence
@@ -12,15 +13,16 @@ from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import slots
 from tests.storage.made_results import MadeResults
 
-SPEC = """\
+COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
+SPEC = f"""\
 experiment: made
-signal: {tones: [{frequency: 2.0}, {frequency: [{until: 10, value: 3.0}, {value: 3.5}]}]}
-sampling: {kind: regular, interval: 0.05, duration: 20}
+signal: {{tones: [{{frequency: 2.0}}, {{frequency: [{{until: 10, value: 3.0}}, {{value: 3.5}}]}}]}}
+sampling: {{kind: regular, interval: 0.05, duration: 20}}
 estimators:
-  tracker: {kind: restarting_least_squares, tones: 2, h: 0.7}
-  whole: {kind: esprit, tones: 2}
-success: {band: 0.1, by: 4}
-monte_carlo: {runs: 4, seed: 1}
+  tracker: {{kind: restarting_least_squares, tones: 2, h: 0.7}}
+  whole: {{kind: "{COMPARATORS}/whole_record.py:Esprit", tones: 2}}
+success: {{band: 0.1, by: 4}}
+monte_carlo: {{runs: 4, seed: 1}}
 """
 
 

@@ -1,7 +1,7 @@
 """What is said of data cells that are to be known with a given precision."""
 
+from ctid_cli.inference.monte_carlo import CellPrecision, Widest
 from ctid_cli.reporting.precision_words import LISTED, block_sentence, precision_lines, precision_table
-from ctid_cli.running.precision import CellPrecision, Widest
 
 
 def percentage(half_width):

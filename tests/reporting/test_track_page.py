@@ -1,16 +1,17 @@
 """The page of a track: complete in itself, and safe whatever names files and columns have."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import MissingLine, Procedure, RecordTrack
 from ctid_cli.reporting.pages.track_page import track_page
 from ctid_cli.reporting.track_report import track_object
 from ctid_cli.reporting.track_residual import spectra_of
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.track import MissingLine, Track
 from tests.reporting.parsed_page import Page
 
 HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
@@ -33,12 +34,11 @@ def track(**known):
     lines = (MissingLine(2 * np.pi * 19.0, 0.9, 0.1),)
     parts = {"error": np.full(shape, 0.01), "amplitudes": np.full(shape, 2.0), "window": np.full(shape, 0.2)}
     parts |= {"phase": phase, "missing": lines} | known
-    return RecordTrack.of(ROWS, np.full(shape, 2 * np.pi * 12.0), flags, 0.05, **parts)
+    return Track.of(ROWS, np.full(shape, 2 * np.pi * 12.0), flags, 0.05, **parts)
 
 
 def page_of(followed, name=HOSTILE):
-    procedure = Procedure("esprit", False, (f"A reason, {name}.",), (), {})
-    content = track_object(signal(name), procedure, followed)
+    content = track_object(signal(name), replace(followed, reasons=(f"A reason, {name}.",)))
     source = SOURCE | {"columns": {"time": None, "signal": name}}
     content |= {"ctid": "1", "command": "ctid track /far/away.csv", "checksum": "x", "record": source}
     return track_page(followed, signal(name), content)
@@ -64,7 +64,7 @@ def test_a_page_says_all_and_needs_nothing_but_itself():
         "--tones 2",
         "std. error",
         "line that is missing",
-        "@article{roy1989",
+        "@article{rife1976",
         "17.2 %",
     ):
         assert words in text
@@ -73,7 +73,7 @@ def test_a_page_says_all_and_needs_nothing_but_itself():
 
 
 def test_a_record_without_tones_and_one_of_unknown_phases_have_pages_too():
-    nothing = RecordTrack.of(ROWS, np.empty((ROWS.size, 0)), np.zeros(ROWS.size, np.uint16), 0.05)
+    nothing = Track.of(ROWS, np.empty((ROWS.size, 0)), np.zeros(ROWS.size, np.uint16), 0.05)
     assert "No tone was asked for" in page_of(nothing, "a.csv")
     unknown = page_of(track(phase=np.full((ROWS.size, 1), np.nan)), "a.csv")
     assert "Nowhere are all tones known" in unknown

@@ -8,15 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli.frequency.automatic import choose_settings
-from ctid_cli.frequency.estimator_rows import procedure_of
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import MissingLine, RecordTrack
 from ctid_cli.reporting.track_columns import flag_words, track_bytes, track_table
 from ctid_cli.reporting.track_plot import track_drawing
 from ctid_cli.reporting.track_report import track_object, track_text
 from ctid_cli.reporting.track_summary import missing_lines, summarise, track_warnings
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.track import MissingLine, Track
 
 ROWS = 40
 HERTZ = np.column_stack((np.linspace(9.0, 11.0, ROWS), np.full(ROWS, 30.0)))
@@ -27,15 +25,14 @@ def make_track(flags=None, **known):
     omega = 2 * np.pi * HERTZ
     omega[(flags & int(Flag.GAP)) > 0] = np.nan
     amplitudes = np.full((ROWS, 2), [2.0, 0.5])
-    return RecordTrack.of(0.1 * np.arange(ROWS), omega, flags, 0.1, amplitudes=amplitudes, **known)
+    return Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, amplitudes=amplitudes, **known)
 
 
 @pytest.fixture(scope="module")
 def chosen():
     t = 0.002 * np.arange(2000)
     y = 2 * np.sin(2 * np.pi * 10 * t) + 0.5 * np.sin(2 * np.pi * 30 * t)
-    signal = SampledSignal(y, 0.002, 5.0, "string.csv", "y", "t", "s", "Pa", ("A note.",))
-    return signal, procedure_of(choose_settings(y, 0.002, 2, method="drem_window"), 0.002)
+    return SampledSignal(y, 0.002, 5.0, "string.csv", "y", "t", "s", "Pa", ("A note.",))
 
 
 def some_invalid():
@@ -56,23 +53,23 @@ def test_summary_is_over_valid_rows():
 
 
 def test_without_valid_rows_there_are_no_numbers(chosen):
-    signal, procedure = chosen
+    signal = chosen
     track = make_track(np.full(ROWS, int(Flag.UNCERTAIN), np.uint16))
     assert summarise(track)[0]["frequency_hz"] is None
-    assert "No row is valid" in track_warnings(track, procedure)[0]
-    assert "  -  " in track_text(signal, procedure, track)
-    json.dumps(track_object(signal, procedure, track), allow_nan=False)
+    assert "No row is valid" in track_warnings(track)[0]
+    assert "  -  " in track_text(signal, track)
+    json.dumps(track_object(signal, track), allow_nan=False)
 
 
-def test_warnings_name_the_reasons_the_most_frequent_first(chosen):
-    words = track_warnings(make_track(some_invalid()), chosen[1])
+def test_warnings_name_the_reasons_the_most_frequent_first():
+    words = track_warnings(make_track(some_invalid()))
     assert words[0] == "30 % of the rows are not valid."
     assert words[1].startswith("25 %: A sample")
-    assert track_warnings(make_track(), chosen[1]) == []
+    assert track_warnings(make_track()) == []
 
 
 def test_text(chosen):
-    text = track_text(*chosen, make_track(some_invalid()))
+    text = track_text(chosen, make_track(some_invalid()))
     assert all(len(line) <= 100 for line in text.splitlines())
     for part in ("string.csv: 2000 samples", "A note.", "30.0000", "amplitude [Pa]", "70 %", "Warnings:", "from 5 to"):
         assert part in text
@@ -106,10 +103,10 @@ def test_csv_and_hdf5_hold_the_same():
 
 
 def test_object_has_its_keys(chosen):
-    content = track_object(*chosen, make_track())
-    assert content["method"] == "drem_window"
+    content = track_object(chosen, make_track())
+    assert content["method"] == "tone_windows"
     assert content["tones"][1]["frequency_hz"] == pytest.approx(30.0)
-    assert content["settings"]["estimator"]["tones"] == 2
+    assert set(content["settings"]) == {"interval", "kept_of", "filter_samples", "longest_window"}
     assert {"warnings", "notes", "chosen", "rows", "every", "missing"} <= content.keys()
 
 
@@ -121,24 +118,24 @@ def test_words_of_flags():
 def test_figure(tones):
     flags = some_invalid()
     omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
-    track = RecordTrack.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, amplitudes=1.0 / omega)
+    track = Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, amplitudes=1.0 / omega)
     one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
     assert one == two
     assert one.startswith(b"<?xml")
     assert b"#e4e4e4" in one  # the shade of what is not valid
-    plain = RecordTrack.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
+    plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
     assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
 
 
 def test_figure_without_anything_valid():
     nothing = np.full((3, 2), np.nan)
-    track = RecordTrack.of(np.arange(3.0), nothing, np.full(3, 2, np.uint16), 1.0)
+    track = Track.of(np.arange(3.0), nothing, np.full(3, 2, np.uint16), 1.0)
     assert track_drawing(track, 0.0, None, "title").saved().startswith(b"<?xml")
 
 
 def test_a_record_without_tones_has_a_text_a_file_and_a_figure(chosen):
-    track = RecordTrack.of(np.arange(3.0), np.empty((3, 0)), np.zeros(3, np.uint16), 1.0)
-    assert "No tone was asked for" in track_text(*chosen, track)
+    track = Track.of(np.arange(3.0), np.empty((3, 0)), np.zeros(3, np.uint16), 1.0)
+    assert "No tone was asked for" in track_text(chosen, track)
     assert track_bytes(track_table(track, 0.0), "csv") == b"t\n0\n1\n2\n"
     assert track_drawing(track, 0.0, None, "title").saved().startswith(b"<?xml")
 
@@ -163,11 +160,11 @@ def test_tones_have_their_own_rows_that_are_not_valid(chosen):
     track = make_track(error=np.full((ROWS, 2), 0.01))
     omega = track.omega.copy()
     omega[:20, 1] = np.nan
-    track = RecordTrack.of(track.t, omega, flags, 0.1, error=track.error, amplitudes=track.amplitudes)
+    track = Track.of(track.t, omega, flags, 0.1, error=track.error, amplitudes=track.amplitudes)
     first, second = summarise(track)
     assert (first["valid_percent"], second["valid_percent"]) == (100.0, 75.0)
     assert (second["begins"], second["ends"]) == (pytest.approx(2.0), pytest.approx(3.9))
-    text = track_text(*chosen, track)
+    text = track_text(chosen, track)
     assert "25 % of the rows of tone 2 are not valid. 25 %: A further line" in text
     assert "of tone 1" not in text
     assert "from [s]" in text

@@ -20,7 +20,7 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.running.job import Job, run_job
-from ctid_cli.running.plan import Plan, Task
+from ctid_cli.running.plan import Plan
 from ctid_cli.simulation.dataset import DataSet
 from ctid_cli.storage.manifest import Key, Outcome, Shard
 
@@ -77,6 +77,7 @@ class FakeData:
 class FakeCell:
     content: dict[str, Any]
     swept: dict[str, Any]
+    measures: tuple[()] = ()
 
     @property
     def source(self) -> FakeCell:
@@ -194,9 +195,9 @@ class FakeSpec:
 class FakePlan:
     """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
 
-    terms = None
+    terms, files = None, ()
     shard: Shard | None = None
-    manifest, runs, tasks, asked = Plan.manifest, Plan.runs, Plan.tasks, Plan.asked
+    manifest, runs, job, asked = Plan.manifest, Plan.runs, Plan.job, Plan.asked
     data_sets, monte_carlo = Plan.data_sets, Plan.monte_carlo
 
     def __init__(
@@ -243,13 +244,18 @@ class FakePlan:
         other.shard = Shard(number, of)
         return other
 
-    def keys(self, task: Task) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
-        data_hash = self.data_cells[task.cell].hash
+    def keys(self, cell: int, replicate: int) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
+        data_hash = self.data_cells[cell].hash
         return [
-            (Key(data_hash, task.replicate, cell.hash, label), cell, STARTS[label])
-            for cell in self.estimators
-            for label in cell.starts
+            (Key(data_hash, replicate, part.hash, label), part, STARTS[label])
+            for part in self.estimators
+            for label in part.starts
         ]
+
+    def all_keys(self) -> list[Key]:
+        """Every estimate that is asked for."""
+        places = [(cell, replicate) for cell in range(len(self.data_cells)) for replicate in range(self.runs)]
+        return [key for place in places for key, _, _ in self.keys(*place)]
 
 
 def outcomes_of(job: Job) -> list[Outcome]:

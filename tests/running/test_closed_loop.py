@@ -13,9 +13,8 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.excitation import Gaussian, InputFile
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.noise import ArmaNoise, WhiteNoise
+from ctid_cli.signals.noise import ArmaNoise, WhiteNoise, stream
 from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
-from ctid_cli.signals.streams import stream
 from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource, SimulatedSource, file_sha256
 from ctid_cli.specification.load import load_spec
 

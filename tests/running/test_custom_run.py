@@ -7,12 +7,9 @@ from dataclasses import replace
 import pytest
 
 from ctid_cli.errors import RefusedError, SpecError
-from ctid_cli.running.custom_check import check_components
 from ctid_cli.running.engine import run_experiment
-from ctid_cli.running.job import Job
-from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
+from ctid_cli.running.trial import load_tried
 from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import outcomes_of
 
@@ -80,13 +77,11 @@ def planned(folder, *changes):
         assert old in text
         text = text.replace(old, new)
     (folder / "spec.yaml").write_text(text, encoding="utf-8")
-    return build_plan(load_spec(folder / "spec.yaml", allow_code=True))
+    return build_plan(load_tried(folder / "spec.yaml", allow_code=True))
 
 
 def jobs(plan):
-    return [
-        Job(plan.data_cells[task.cell], task.replicate, 5, tuple(plan.keys(task)), plan.terms) for task in plan.tasks()
-    ]
+    return [plan.job(0, replicate) for replicate in range(plan.runs)]
 
 
 def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(folder, tmp_path, capfd):
@@ -137,9 +132,8 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fol
     ],
 )
 def test_what_shows_on_the_first_data_set_is_said_before_the_run(changes, place, words, folder):
-    plan = planned(folder, *changes)
     with pytest.raises(SpecError) as caught:
-        check_components(plan, Limits(), print)
+        planned(folder, *changes)
     assert f"spec.yaml:{place}" in str(caught.value)
     assert words in str(caught.value)
 
@@ -160,17 +154,16 @@ RULE = ("seed: 5}", "seed: 5}\nsuccess: {delay_relative_error: 0.1}")
         (
             (("[raise, die, nan]", "fail"),),
             "estimators.",
-            ["fails on the first data set: LookupError: never (", "true"],
+            ["true", "fails on the first data set: LookupError: never ("],
         ),
     ],
 )
 def test_what_is_odd_on_the_first_data_set_is_a_warning(changes, at, words, folder):
-    heard = []
-    assert check_components(planned(folder, *changes), Limits(), heard.append)
+    heard = [text for text in planned(folder, *changes).spec.warnings if "estimators." in text]
     for text, expected in zip(heard, words, strict=True):
         assert at in text
         assert expected in text
 
 
 def test_a_component_that_ends_the_process_is_left_to_the_run(folder):
-    assert check_components(planned(folder, ("[raise, die, nan]", "always")), Limits(), print)
+    assert planned(folder, ("[raise, die, nan]", "always")).data_sets == 4

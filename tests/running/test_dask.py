@@ -6,15 +6,16 @@ import hashlib
 import os
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ctid_cli.errors import RefusedError, UsageError
-from ctid_cli.running import dask_cluster
+from ctid_cli.errors import DataError, RefusedError, UsageError
 from ctid_cli.running.engine import Progress, run_experiment
+from ctid_cli.running.workers import packed, unpacked
+from ctid_cli.signals.files import COPIES
+from ctid_cli.simulation.dataset import require_content
 from tests.running.fakes import FakePlan, Toy
 from tests.running.hostile import Hostile
 
@@ -72,26 +73,18 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "toys").exists()
 
 
-@dataclass(frozen=True)
-class Replayed:
-    file: str
-    sha256: str
-
-
-@dataclass(frozen=True)
-class Source:
-    excitation: Replayed
-    seed: int = 1
-
-
-def test_data_files_come_by_content(tmp_path: Path) -> None:
+def test_data_files_come_by_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = b"t,u\n0,1\n"
     digest = hashlib.sha256(content).hexdigest()
-    (tmp_path / "here.csv").write_bytes(content)
-    source = Source(Replayed(str(tmp_path / "here.csv"), digest))
-    assert dask_cluster.files_of(source) == {digest: str(tmp_path / "here.csv")}
-    assert dask_cluster.located(source, {digest: content}) is source
-    (tmp_path / "here.csv").write_bytes(b"something else")
-    elsewhere = dask_cluster.located(source, {digest: content})
-    assert Path(elsewhere.excitation.file).read_bytes() == content
-    assert (elsewhere.seed, elsewhere.excitation.sha256) == (1, digest)
+    file = tmp_path / "here.csv"
+    file.write_bytes(content)
+    assert require_content(str(file), digest) == str(file)
+    file.write_bytes(b"something else")
+    with pytest.raises(DataError, match="is not that which"):
+        require_content(str(file), digest)
+    monkeypatch.setitem(COPIES, digest, "the copy")
+    # Also in the process that computes a suspect alone.
+    sent = packed()
+    monkeypatch.delitem(COPIES, digest)
+    unpacked(sent)
+    assert require_content(str(file), digest) == "the copy"

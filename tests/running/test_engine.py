@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from ctid_cli.errors import DataError, RefusedError, StorageError
+from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
 from ctid_cli.running.plan import build_plan, current_origin
 from ctid_cli.running.states import States
-from ctid_cli.running.stopping import StopAt
+from ctid_cli.running.stopping import StopRequest
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import folder
 from ctid_cli.storage.estimates import read_estimates
@@ -132,7 +132,7 @@ def test_the_longest_of_a_replicate_comes_first() -> None:
 def test_every_estimate_of_the_plan_is_stored_once_in_its_order(tmp_path: Path) -> None:
     plan = FakePlan()
     summary = run(plan, tmp_path)
-    expected = {(k.data_hash, k.replicate, k.estimator_hash, k.start) for t in plan.tasks() for k, _, _ in plan.keys(t)}
+    expected = set(plan.all_keys())
     listed = [slot.key for slot in slots(plan.manifest())]  # type: ignore[arg-type]
     assert set(listed) == expected
     assert len(listed) == len(expected) == summary.planned == summary.computed
@@ -247,12 +247,6 @@ def test_a_worker_that_dies_once_costs_nothing(tmp_path: Path) -> None:
     assert (summary.computed, summary.failed) == (12, 0)
 
 
-def test_a_first_record_that_cannot_be_used_writes_nothing(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="the input is constant"):
-        run(FakePlan(Toy(), Toy("unusable")), tmp_path / "a" / "toys")
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_workers_use_one_blas_thread(tmp_path: Path, jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
@@ -331,7 +325,7 @@ def test_the_callers_event_stops_a_run(tmp_path: Path) -> None:
         if progress.stored:
             stop.set()
 
-    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopAt(stop))
+    summary = run(FakePlan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopRequest(stop))
     assert summary.stopped_by == "stop"
     assert summary.exit_code == 5
     assert 0 < summary.computed < summary.planned
@@ -540,7 +534,7 @@ def test_the_shipped_quickstart_gives_the_same_bytes_from_any_number_of_jobs(tmp
         summary = run_experiment(plan, tmp_path / str(jobs), jobs=jobs)
         assert (summary.missing, summary.failed) == (0, 0)
     assert sealed(tmp_path / "1") == sealed(tmp_path / "2")
-    keys = [key for task in plan.tasks() for key, _, _ in plan.keys(task)]
+    keys = [key for cell in range(2) for replicate in range(2) for key in plan.job(cell, replicate).keys]
     assert {key.id for key in keys} == set(read_estimates(tmp_path / "1")["id"])
     assert (tmp_path / "1" / "spec.yaml").read_text() == (ROOT / "configs" / "quickstart.yaml").read_text()
 

@@ -13,7 +13,7 @@ from ctid_cli.errors import MachineError
 from ctid_cli.running import workers
 from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
 from ctid_cli.running.limits import advice
-from ctid_cli.running.stopping import StopAt
+from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage.estimates import read_estimates
 from tests.running.fakes import FakePlan, Toy
 from tests.running.hostile import Hostile
@@ -169,7 +169,7 @@ def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_p
 @pytest.mark.parametrize(("at_most", "least"), [(1, 1), (3, 3)])
 def test_a_run_stops_after_so_many_failures(tmp_path: Path, at_most: int, least: int) -> None:
     plan = FakePlan(*[Toy("raise", at=k, order=2 + k) for k in range(8)], Toy(seconds=0.3, order=12), runs=20)
-    summary = run(plan, tmp_path, stop=StopAt(failures=at_most))
+    summary = run(plan, tmp_path, stop=StopRequest(failures=at_most))
     assert summary.stopped_by == "failures"
     assert summary.exit_code == 5
     assert least <= summary.failed

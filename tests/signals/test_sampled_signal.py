@@ -128,13 +128,8 @@ def test_sound(tmp_path):
 def test_other_refusals(tmp_path):
     with pytest.raises(DataError, match="does not exist"):
         read_sampled_signal(tmp_path / "none.csv")
-    with pytest.raises(DataError, match=r"\.mp3"):
-        read_sampled_signal(tmp_path / "a.mp3")
     with pytest.raises(DataError, match="no sample of 'y'"):
         read_sampled_signal(write(tmp_path / "a.csv", (np.arange(9.0), np.full(9, np.nan)), "t,y"))
-    (tmp_path / "b.csv").write_text("t;y\n1;2\n", encoding="utf-8")
-    with pytest.raises(DataError, match="semicolons"):
-        read_sampled_signal(tmp_path / "b.csv")
 
 
 def test_a_flac_file_is_read_as_a_wav_file_is(tmp_path):
@@ -156,5 +151,5 @@ def test_a_flac_file_is_read_as_a_wav_file_is(tmp_path):
 def test_without_soundfile_it_is_said_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     (tmp_path / "a.flac").write_bytes(b"fLaC")
-    with pytest.raises(DataError, match=r"needs the package soundfile: pip install 'ctid\[sound\]' .* as \.wav"):
+    with pytest.raises(DataError, match=r"with the package soundfile: pip install 'ctid\[sound\]' .* \(\.csv\)"):
         read_sampled_signal(tmp_path / "a.flac")

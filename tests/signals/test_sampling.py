@@ -1,80 +1,106 @@
-"""Sampling schemes and the random streams that drive them."""
+"""Sampling schemes: the distributions of their intervals, given instants, and sizes of records."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import kstest
 
-from ctid_cli.signals.regularity import regular_interval
-from ctid_cli.signals.sampling import RegularSampling, UniformIntervals, geometric_sizes
-from ctid_cli.signals.streams import ROLES, stream
+from ctid_cli.errors import DataError
+from ctid_cli.kinds import classes
+from ctid_cli.signals.noise import stream
+from ctid_cli.signals.sampling import (
+    InstantsFile,
+    IrregularSampling,
+    JitteredSampling,
+    RegularSampling,
+    UniformIntervals,
+    geometric_sizes,
+)
+
+#: Below this p-value a distribution is another one; the seeds are fixed.
+LEVEL = 1e-3
 
 
 def rng(replicate=0):
-    return stream(3, "sampling", replicate)
+    return stream(5, "sampling", replicate)
 
 
-@given(st.floats(1e-6, 1e3), st.integers(2, 5000))
-def test_regular_times_are_multiples_of_the_interval(interval, samples):
-    times = RegularSampling(interval, samples).times(rng())
-    assert times.size == samples
-    assert all(times[k] == k * interval for k in (0, 1, samples // 2, samples - 1))
-    assert regular_interval(times) == pytest.approx(interval, rel=1e-12)
+@pytest.mark.parametrize(
+    "scheme",
+    [IrregularSampling(0.1, 300), JitteredSampling(0.1, 300, 0.04), UniformIntervals(0.05, 0.15, 300)],
+    ids=lambda scheme: scheme.kind,
+)
+def test_every_drawn_clock_starts_at_zero_repeats_and_has_its_mean(scheme):
+    times = scheme.times(rng())
+    assert (times.size, times[0]) == (scheme.length, 0.0)
+    assert (np.diff(times) > 0).all()
+    assert np.array_equal(times, scheme.times(rng()))
+    assert not np.array_equal(times, scheme.times(rng(1)))
+    ends = np.array([scheme.times(rng(k))[-1] for k in range(400)]) / 299
+    assert abs(ends.mean() - scheme.mean_interval) < 4 * ends.std() / 20
+    # Longer records begin with the shorter ones.
+    longer = type(scheme)(**vars(scheme) | {"samples": 500}).times(rng())
+    np.testing.assert_allclose(longer[:300], times, atol=1e-12)
 
 
-@given(st.floats(1e-3, 1), st.floats(1, 3), st.integers(2, 500), st.integers(0, 50))
-def test_uniform_intervals_keep_their_bounds(low, ratio, samples, replicate):
-    times = UniformIntervals(low, low * ratio, samples).times(rng(replicate))
-    assert times.size == samples
-    assert times[0] == 0.0
-    rounding = 1e-12 * times[-1]
-    assert np.diff(times).min() >= low - rounding
-    assert np.diff(times).max() <= low * ratio + rounding
+def test_irregular_clocks_tell_the_exact_input_unless_asked_for_samples():
+    told = {kind: scheme.input_record for kind, scheme in classes("sampling").items()}
+    assert told.pop("regular") == "sampled"
+    assert set(told.values()) == {"exact"}
 
 
-def test_uniform_intervals_are_uniform():
+def test_a_regular_clock_does_not_add_up_rounding():
+    assert np.array_equal(RegularSampling(0.1, 5000).times(rng()), 0.1 * np.arange(5000))
+
+
+def test_intervals_are_uniform_between_their_bounds():
     intervals = np.diff(UniformIntervals(0.01, 0.09, 20_001).times(rng()))
-    assert regular_interval(UniformIntervals(0.01, 0.09, 100).times(rng())) is None
-    counts, _ = np.histogram(intervals, bins=20, range=(0.01, 0.09))
-    # 43.8 is exceeded by a chi-square variable of 19 degrees of freedom in one case of a thousand.
-    assert ((counts - 1000) ** 2 / 1000).sum() < 43.8
+    assert kstest(intervals, "uniform", (0.01, 0.08)).pvalue > LEVEL
+    by_mean = IrregularSampling(0.1, 50, spread=0.2).times(rng())
+    np.testing.assert_allclose(by_mean, UniformIntervals(0.08, 0.12, 50).times(rng()), rtol=1e-12)
 
 
-def test_equal_bounds_are_regular_sampling():
-    np.testing.assert_allclose(
-        UniformIntervals(0.5, 0.5, 200).times(rng()), RegularSampling(0.5, 200).times(rng()), rtol=1e-13
-    )
+def test_jitter_is_uniform_around_the_clock_and_does_not_add_up():
+    shifts = JitteredSampling(0.1, 20_001, 0.03).times(rng())[1:] - RegularSampling(0.1, 20_001).times(rng())[1:]
+    assert kstest(shifts, "uniform", (-0.03, 0.06)).pvalue > LEVEL
 
 
-def test_replicates_have_times_of_their_own():
-    scheme = UniformIntervals(0.01, 0.09, 50)
-    assert np.array_equal(scheme.times(rng(4)), scheme.times(rng(4)))
-    assert not np.array_equal(scheme.times(rng(4)), scheme.times(rng(5)))
+def test_instants_come_from_a_column_of_a_file(tmp_path):
+    file = tmp_path / "stamps.csv"
+    file.write_text("time,u\n12.5,0\n12.6,0\n13,0\n")
+    scheme = InstantsFile(str(file), time="time")
+    assert scheme.times(None).tolist() == [12.5, 12.6, 13.0]
+    assert (scheme.length, scheme.mean_interval) == (3, 0.25)
+    file.write_text("t\n0\n0.2\n0.1\n")
+    with pytest.raises(DataError, match=r"stamps\.csv:4: time 't' goes back to 0\.1 s after 0\.2 s on line 3"):
+        InstantsFile(str(file)).times(None)
+    file.write_text("t\n0\n")
+    with pytest.raises(DataError, match="there is one instant"):
+        InstantsFile(str(file)).times(None)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: RegularSampling(0.0, 10), r"interval must be a positive number \[s\], not 0.0"),
-        (lambda: RegularSampling(0.1, 1), "samples must be an integer of at least 2, not 1"),
         (lambda: RegularSampling(0.1, 10.5), "samples must be an integer of at least 2, not 10.5"),
-        (
-            lambda: RegularSampling(0.1, 10, "guessed"),
-            "input_record must be 'sampled' or 'exact', not 'guessed'",
-        ),
+        (lambda: RegularSampling(0.1, 10, "guessed"), "input_record must be 'sampled' or 'exact', not 'guessed'"),
         (lambda: UniformIntervals(0.2, 0.1, 10), "low must not exceed high; they are 0.2 s and 0.1 s"),
         (lambda: UniformIntervals(0.0, 0.1, 10), "low must be a positive number"),
         (lambda: UniformIntervals(0.1, float("inf"), 10), "high must be a positive number"),
         (lambda: UniformIntervals(0.1, 0.2, 1), "samples must be an integer of at least 2, not 1"),
-        (lambda: UniformIntervals(0.1, 0.2, 10, ""), "input_record must be"),
+        (lambda: IrregularSampling(0.1, 9, spread=1.0), r"spread must be a number above 0 and below 1 \[-\], not 1.0"),
+        (lambda: JitteredSampling(0.1, 9, 0.05), r"largest_shift must be less than half the interval, 0\.05 s"),
+        (lambda: InstantsFile("a.csv", input_record=""), "input_record must be"),
+        (lambda: geometric_sizes(500, 500, 3), "the first size must be below the last; they are 500 and 500"),
+        (lambda: geometric_sizes(2, 5, 9), "no 9 different sizes from 2 to 5"),
+        (lambda: geometric_sizes(0, 5, 2), "the first size must be an integer of at least 1, not 0"),
     ],
 )
 def test_impossible_options_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
-
-
-# --- sizes ----------------------------------------------------------------------------------------
 
 
 @given(st.integers(50, 1000), st.floats(1.5, 300), st.integers(2, 30))
@@ -95,34 +121,3 @@ def test_sizes_of_the_published_studies_of_additive_models(first, last, count, u
     exact = [first * (last / first) ** (k / (count - 1)) for k in range(count)]
     assert round(sum(exact)) == unrounded
     assert sum(geometric_sizes(first, last, count)) == rounded
-
-
-@pytest.mark.parametrize(
-    ("sizes", "message"),
-    [
-        ((500, 500, 3), "the first size must be below the last; they are 500 and 500"),
-        ((2, 5, 9), "no 9 different sizes from 2 to 5"),
-        ((0, 5, 2), "the first size must be an integer of at least 1, not 0"),
-        ((1, 5.5, 2), "the last size must be an integer of at least 1, not 5.5"),
-        ((1, 5, 1), "the count must be an integer of at least 2, not 1"),
-    ],
-)
-def test_impossible_sizes_are_refused(sizes, message):
-    with pytest.raises(ValueError, match=message):
-        geometric_sizes(*sizes)
-
-
-# --- streams --------------------------------------------------------------------------------------
-
-
-def test_streams_are_those_of_the_spawn_keys():
-    # Stored results are repeatable only as long as these numbers stay what they are.
-    assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4, "recorder": 5}
-    sequence = np.random.SeedSequence(20170331, spawn_key=(2, 5))
-    expected = np.random.default_rng(sequence).standard_normal(3)
-    assert np.array_equal(stream(20170331, "noise", 5).standard_normal(3), expected)
-
-
-def test_streams_differ_by_seed_role_and_replicate():
-    draws = {float(stream(s, role, k).random()) for s in (0, 1) for role in ROLES for k in range(5)}
-    assert len(draws) == 2 * len(ROLES) * 5

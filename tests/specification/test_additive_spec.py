@@ -88,7 +88,7 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
     ]
     plan = build_plan(load(tmp_path, CLOSED, *overrides))
     labels = {}
-    for _, cell, start in plan.keys(plan.tasks()[0]):
+    for _, cell, start in plan.keys(0, 0):
         labels.setdefault(cell.name, []).append(start.label)
     assert labels == {
         "both": ["parameters(5%)", "parameters(20%)"],
@@ -98,7 +98,7 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
     }
     # An estimator that takes parameters makes its own where none are named, and needs no delay.
     plan = build_plan(load(tmp_path, CLOSED, "starts={initial_delay: 0.1}", *overrides[1:2]))
-    assert [(cell.name, start.label) for _, cell, start in plan.keys(plan.tasks()[0])] == [
+    assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
         ("both", "none"), ("one", "none"), ("search", "0.1"),
     ]  # fmt: skip
 

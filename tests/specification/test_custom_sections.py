@@ -49,7 +49,7 @@ def test_options_are_swept_validated_and_canonical(folder):
     assert first.estimator.options.bounds == (0.0, 1.0)
     assert first.estimator.options.inner.size == 2.0
     assert [cell.swept for cell in plan.estimators] == [{"cutoff": 1.0}, {"cutoff": 2.0}, {}]
-    assert [start.label for _, cell, start in plan.keys(plan.tasks()[0]) if cell is first] == [
+    assert [start.label for _, cell, start in plan.keys(0, 0) if cell is first] == [
         "0.3",
         "uniform(0.2, 0.5)",
     ]

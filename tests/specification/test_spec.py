@@ -8,13 +8,14 @@ import shutil
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctid_cli.canonical import canonical_json, content_hash
-from ctid_cli.errors import SpecError
+from ctid_cli.errors import DataError, SpecError
 from ctid_cli.kinds import KINDS, classes
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
@@ -51,7 +52,7 @@ def test_files_that_hold_no_mapping(tmp_path, name, text, message):
 
 def test_nothing_random_needs_no_monte_carlo(tmp_path):
     changes = [
-        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n"),
+        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n  time: 1.0\n"),
         ("monte_carlo: {runs: 10, seed: 1}\n", ""),
         (", {uniform: [0, 9]}]", "]"),
     ]
@@ -209,6 +210,28 @@ def test_an_input_file(tmp_path):
     assert build_plan(load(elsewhere, text)).spec_hash == build_plan(spec).spec_hash
     (tmp_path / "record.csv").write_text(RECORD + "5.1,1,1\n")
     assert build_plan(load(tmp_path, text)).data_cells[0].hash != cell.hash
+
+
+def test_a_file_of_instants(tmp_path):
+    text = changed(SIMULATED, ("{kind: regular, interval: 0.05, samples: 4000}", "{kind: irregular, file: stamps.csv}"))
+    stamps = np.round(np.cumsum(np.random.default_rng(0).uniform(0.1, 0.9, 300)), 3)
+    for folder in (tmp_path, tmp_path / "elsewhere"):
+        folder.mkdir(exist_ok=True)
+        (folder / "stamps.csv").write_text("t\n" + "\n".join(map(str, stamps)) + "\n")
+    cell = build_plan(load(tmp_path, text)).data_cells[0]
+    record = cell.dataset(0).record
+    assert record.t.tolist() == stamps.tolist()
+    assert record.input.t[0] == stamps[0]
+    assert "file" not in cell.content["sampling"], "the place of a file is no part of its identity"
+    assert build_plan(load(tmp_path / "elsewhere", text)).data_cells[0].hash == cell.hash
+    with (tmp_path / "stamps.csv").open("a") as file:
+        file.write("500\n")
+    assert build_plan(load(tmp_path, text)).data_cells[0].hash != cell.hash
+    with pytest.raises(DataError, match="is not that which the experiment was planned with"):
+        cell.dataset(0)
+    listed = f"{{kind: irregular, times: {stamps.tolist()}}}"
+    text = changed(text, ("{kind: irregular, file: stamps.csv}", listed))
+    np.testing.assert_array_equal(build_plan(load(tmp_path, text)).data_cells[0].dataset(0).record.y, record.y)
 
 
 # -- what is shipped --------------------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.streams import ROLES, stream
-from ctid_cli.simulation.dataset import StartPoint, additive_form
+from ctid_cli.signals.noise import ROLES, stream
+from ctid_cli.simulation.start_points import StartPoint, additive_form
 from ctid_cli.specification.system_sections import StartsSection, start_points
 
 TRUE = AdditiveModel([Submodel([0.5], [1.0], 2), Submodel([1.0], [0.025, 0.01, 1.0])], 0.3)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import SpecError
-from ctid_cli.specification.load import load_spec
+from ctid_cli.running.trial import load_tried
 
 SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP, CUSTOM, CUSTOM_PARTS, RECORD = (
     Path(__file__).with_name(name).read_text(encoding="utf-8")
@@ -19,7 +19,7 @@ SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP, CUSTOM, CUST
 def load(folder, text, *overrides, allow_code=False):
     file = folder / "spec.yaml"
     file.write_text(text, encoding="utf-8")
-    return load_spec(file, overrides, allow_code=allow_code)
+    return load_tried(file, overrides, allow_code=allow_code)
 
 
 def problems(folder, text, *overrides):

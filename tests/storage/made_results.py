@@ -58,7 +58,7 @@ class MadeResults(Estimates):
     def __init__(self, manifest, results, origins=ORIGINS, seconds=0.02):
         self.plan, self.given_origins, self.results = manifest, origins, results
         self.usual, self.seconds = seconds, {}
-        self._all, self._places, self._read = self, None, {}
+        self._all, self._places, self._read = None, None, {}
 
     @property
     def manifest(self):

@@ -11,7 +11,7 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.storage.columns import failed, parameter_names
 from ctid_cli.storage.estimates import export_rows, is_converged, read_estimates, read_stored
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import slots, true_values
@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place.mkdir(parents=True)
     log = open_journal(place / "journal.sqlite")
     log.add(outcomes_of(MANIFEST), log.begin(MANIFEST, ORIGIN, "now", {}))
-    seal(place, log)
+    write_runs(place, log)
     log.close()
     return place
 
@@ -87,7 +87,7 @@ def test_two_names_share_their_estimates(place: Path) -> None:
     again = {**MANIFEST, "estimators": [*MANIFEST["estimators"], MANIFEST["estimators"][1] | {"name": "again"}]}
     log = open_journal(place / "journal.sqlite")
     log.replan(again)
-    assert (experiment_status(place).done, seal(place, log)[0]) == (40, 40)
+    assert (experiment_status(place).done, write_runs(place, log)[0]) == (40, 40)
     log.close()
     frame = read_estimates(place)
     assert frame["estimator"].value_counts().to_dict() == {"search": 20, "known": 10, "again": 10}

@@ -16,7 +16,8 @@ import pytest
 
 from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.storage.columns import failed, no_result
-from ctid_cli.storage.export import open_export, seal, sha256_of
+from ctid_cli.storage.estimates import Estimates
+from ctid_cli.storage.export import open_export, sha256_of, write_runs
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import slots
 from tests.storage.made_results import ORIGIN, export_image, outcomes_of, plan_of
@@ -35,7 +36,7 @@ def path(tmp_path: Path) -> Path:
 def read(path: Path) -> dict[Any, Any]:
     export = open_export(path)
     export.verify()
-    return dict(zip(export.keys(), export.results(0, export.count), strict=True))
+    return Estimates(export).results
 
 
 def test_it_holds_what_was_computed_and_explains_itself(path: Path) -> None:
@@ -165,16 +166,16 @@ def test_content_that_no_run_has_written_is_refused(case: str, path: Path) -> No
 def test_it_is_written_once_and_again_when_it_is_not_what_was_written(tmp_path: Path) -> None:
     log = open_journal(tmp_path / "journal.sqlite")
     log.add(outcomes_of(MANIFEST), log.begin(MANIFEST, ORIGIN, "now", {}))
-    count, sha256 = seal(tmp_path, log)
+    count, sha256 = write_runs(tmp_path, log)
     path = tmp_path / "runs.h5"
     assert (count, sha256, log.exported()) == (30, sha256_of(path), sha256)
     intact, before = path.read_bytes(), path.stat().st_mtime_ns
     assert intact == export_image(MANIFEST, [ORIGIN], RESULTS)
-    assert seal(tmp_path, log) == (30, sha256)
+    assert write_runs(tmp_path, log) == (30, sha256)
     assert path.stat().st_mtime_ns == before
     for damage in (intact[:-9], b""):
         path.write_bytes(damage)
-        assert seal(tmp_path, log) == (30, sha256)
+        assert write_runs(tmp_path, log) == (30, sha256)
         assert path.read_bytes() == intact
     log.close()
 
@@ -190,7 +191,7 @@ log = journal.open_journal(folder / "journal.sqlite")
 for size in range(0, int(sys.argv[2]), 4001):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
     try:
-        export.seal(folder, log)
+        export.write_runs(folder, log)
         print("written")
     except Exception as error:
         print(error)

@@ -17,11 +17,11 @@ from typer.testing import CliRunner
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DamageError
 from ctid_cli.storage.estimates import read_estimates
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import reading_journal
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import open_journal
-from ctid_cli.storage.merge import keep_readable
+from ctid_cli.storage.keeping import keep_readable
 from ctid_cli.storage.verify import verify
 from tests.storage.made_results import ORIGIN, SPEC, outcomes_of, plan_of
 
@@ -42,7 +42,7 @@ def place(tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     log = open_journal(folder / "journal.sqlite")
     log.add(outcomes_of(MANIFEST), log.begin(MANIFEST, ORIGIN, "now", {}))
-    seal(folder, log)
+    write_runs(folder, log)
     log.close()
     return folder
 
@@ -110,7 +110,7 @@ def test_what_can_be_read_of_damaged_results_is_kept(place: Path, export: bool) 
     assert 120 < kept.from_journal < 240
     assert kept.from_export == (240 - kept.from_journal if export else 0)
     assert str(kept).startswith(f"{240 if export else kept.from_journal} of 240 estimates could be read and are kept")
-    seal(place, log)
+    write_runs(place, log)
     log.close()
     found = read_estimates(place).drop(columns=["seconds", "cpu_seconds"])
     assert found.equals(whole[whole["id"].isin(found["id"])].reset_index(drop=True))

@@ -14,7 +14,7 @@ from ctid_cli.errors import DamageError, RefusedError, UsageError
 from ctid_cli.reporting.overview import overview_text, status_text
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.estimates import read_estimates
-from ctid_cli.storage.export import seal
+from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import open_journal, read_journal
 from ctid_cli.storage.manifest import Manifest, Outcome, Shard
@@ -35,7 +35,7 @@ def run(
         log.write_beside(name, b"# toys\n")
     session = log.begin(manifest, origin, f"began {place.name}", info)
     log.add(outcomes_of(manifest) if outcomes is None else outcomes, session)
-    seal(place, log)
+    write_runs(place, log)
     log.end(session, "ended", "finished")
     log.close()
     return place

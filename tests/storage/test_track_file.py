@@ -8,12 +8,12 @@ import pytest
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.record_track import MissingLine, Procedure, RecordTrack
 from ctid_cli.reporting.track_report import track_object
 from ctid_cli.storage.track_file import Reading, read_track, track_file_text
+from ctid_cli.tones.track import MissingLine, Track
 
 ROWS = 5
-PROCEDURE = Procedure("esprit", False, ("A reason.",), ("A warning.",), {"window_seconds": 0.5})
+SAID = {"reasons": ("A reason.",), "warnings": ("A warning.",)}
 
 
 def track():
@@ -21,7 +21,7 @@ def track():
     flags = np.zeros((ROWS, 2), np.uint16)
     flags[:2, 1] = int(Flag.ABSENT)
     lines = (MissingLine(120.0, 0.9, 0.1),)
-    return RecordTrack.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, missing=lines)
+    return Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, missing=lines, **SAID)
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def written(tmp_path):
     lines = ["t [ms],y,z", *(f"{k},{np.sin(k):.6f},1" for k in range(100))]
     record.write_text("\n".join(lines) + "\n", encoding="utf-8")
     reading = Reading(None, "y", None, 10.0, 80.0)
-    content = track_object(reading.read(record), PROCEDURE, track(), 0.5)
+    content = track_object(reading.read(record), track(), 0.5)
     file = tmp_path / "track.json"
     file.write_text(track_file_text(track(), content, record, reading, tmp_path, "ctid track"), encoding="utf-8")
     return file, record

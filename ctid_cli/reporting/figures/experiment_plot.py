@@ -7,7 +7,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.estimate_plot import box_drawing, delays_drawing, errors_drawing
 from ctid_cli.reporting.figures.measure_plot import convergence_drawing, measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
-from ctid_cli.reporting.measures import default_measures
+from ctid_cli.reporting.measures import asked_measures, default_measures
 from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.manifest import true_values
@@ -35,7 +35,7 @@ def kinds_of(results: Results) -> list[Kind]:
 
 def main_measure(results: Results) -> str:
     """What is measured where nothing is said: what the specification asks for, its rule of success, or the errors."""
-    asked = results.settings.get("measures")
+    asked = asked_measures(results)
     if not asked and results.settings.get("success"):
         return "percent"
     # The last one of bias and root mean square error tells more.

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.monte_carlo import MEASURES
 from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, scale_of, settings_in, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.measures import measure_of, measure_rows
 from ctid_cli.reporting.percentages import Row
 from ctid_cli.reporting.results import Results
 
@@ -184,7 +183,7 @@ def _lost(rows: Sequence[Row], method: str) -> str:
 def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
     runs = [row["n"] for row in rows]
     sets = count(max(runs), "data set") if min(runs) == max(runs) else f"{min(runs)} to {max(runs)} data sets"
-    return f"{results.experiment}: {MEASURES[measure.partition(':')[0]].meaning}\n{sets} a point, 95 % intervals"
+    return f"{results.experiment}: {measure_of(measure, results).meaning}\n{sets} a point, 95 % intervals"
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -216,7 +215,7 @@ def convergence_drawing(results: Results, measure: str) -> Drawing:
             axes.set_title(settings.words(point) or plain(name or ""), loc="left", fontsize=8)
             axes.set_xlabel("data sets")
         _legend(figure, last, settings)
-        what = MEASURES[measure.partition(":")[0]].meaning + (f" of {plain(name)}" if name else "")
+        what = measure_of(measure, results).meaning + (f" of {plain(name)}" if name else "")
         figure.suptitle(
             f"{results.experiment}: {what}\nfrom the first data sets{part_of(points, settings.points)}, 95 % bands"
         )

@@ -13,11 +13,11 @@ from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
 from ctid_cli.reporting.percentages import Row, settings_of
 from ctid_cli.reporting.results import Results
-from ctid_cli.signals.recorder import Recorder
+from ctid_cli.signals.sampling import InstantsFile
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource
 from ctid_cli.specification.messages import option_docs
-from ctid_cli.specification.spec import RegularDurationSection
+from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSection
 from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
 
 if TYPE_CHECKING:
@@ -27,9 +27,14 @@ _SECTIONS = {
     "system": SystemSection,
     "starts": StartsSection,
     "loop": LoopSection,
-    "recorder": Recorder,
     "signal": SumOfSinusoids,
     "data": MeasuredSource,
+}
+#: Forms of the sampling that a key tells apart from others of the same kind.
+_SAMPLING_FORMS: dict[str, type] = {
+    "duration": RegularDurationSection,
+    "times": ListedTimesSection,
+    "file": InstantsFile,
 }
 #: Values of the settings that vary, in the order of their names.
 Point = tuple[Any, ...]
@@ -96,16 +101,13 @@ def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[s
     """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
     kind = content.get("kind")
     if kind in KINDS.get(section, {}):
-        target: type | None = RegularDurationSection if _has_duration(section, content) else resolve(section, kind)
+        forms = [form for key, form in _SAMPLING_FORMS.items() if section == "sampling" and key in content]
+        target: type | None = forms[0] if forms else resolve(section, kind)
     else:
         target = AdditiveSystemSection if "additive" in content else _SECTIONS.get(section) if kind is None else None
     if target is None:
         return "", {}
     return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)
-
-
-def _has_duration(section: str, content: Mapping[str, Any]) -> bool:
-    return section == "sampling" and content["kind"] == "regular" and "duration" in content
 
 
 def unit_in(text: str) -> str:

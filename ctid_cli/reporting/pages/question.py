@@ -19,7 +19,6 @@ TITLES = {
     "sampling": "Sampling",
     "noise": "Noise",
     "disturbance": "Disturbance",
-    "recorder": "Recorder",
     "starts": "Starts",
 }
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import ctid_cli
-from ctid_cli.frequency.record_track import RecordTrack
 from ctid_cli.reporting.citations import track_bibtex
 from ctid_cli.reporting.layout import Report, Table, count, number
 from ctid_cli.reporting.pages.page import Chapter, figure, shown, shown_command, written
@@ -14,9 +13,10 @@ from ctid_cli.reporting.track_plot import track_drawing
 from ctid_cli.reporting.track_report import signal_line, tones_block
 from ctid_cli.reporting.track_residual import Spectra, spectra_of
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.track import Track
 
 
-def track_page(track: RecordTrack, signal: SampledSignal, content: Mapping[str, Any]) -> str:
+def track_page(track: Track, signal: SampledSignal, content: Mapping[str, Any]) -> str:
     """The page as HTML, of a track, its record and what its file says."""
     signal = replace(signal, file=shown(signal.file))
     spectra = spectra_of(signal, track)
@@ -36,11 +36,11 @@ def track_page(track: RecordTrack, signal: SampledSignal, content: Mapping[str, 
         titles=[("tones", "Tones"), *((chapter.name, chapter.title) for chapter in chapters)],
         provenance=_provenance(content),
         command=shown_command(content["command"]),
-        bibtex=track_bibtex(content["method"]),
+        bibtex=track_bibtex(),
     )
 
 
-def _lead(track: RecordTrack, content: Mapping[str, Any]) -> str:
+def _lead(track: Track, content: Mapping[str, Any]) -> str:
     tones = count(track.omega.shape[1], "tone")
     share = 100.0 * float(track.valid.sum() / max(track.there.sum(), 1))
     valid = f", {number(share, 4)} % of whose rows are valid" if track.omega.shape[1] else ""
@@ -52,12 +52,12 @@ def _chosen(content: Mapping[str, Any]) -> list[list[str]]:
     return [["chosen" if k == 0 else "", sentence] for k, sentence in enumerate(content["chosen"])]
 
 
-def _caption(track: RecordTrack) -> str:
+def _caption(track: Track) -> str:
     bands = ", with bands of one standard error" if track.states_errors and track.omega.size else ""
     return f"Frequencies and amplitudes over time{bands}; grey where no tone that is drawn is valid"
 
 
-def _left(track: RecordTrack, signal: SampledSignal, spectra: Spectra | None) -> Chapter:
+def _left(track: Track, signal: SampledSignal, spectra: Spectra | None) -> Chapter:
     """What the tones leave of the signal."""
     title = "What the tones leave"
     if spectra is None:

@@ -1,0 +1,318 @@
+"""The trial of a specification: what only its first data sets show is found before anything is stored.
+
+The first data set of each setting is made, and every estimator is prepared on it. Custom components are tried in a
+process of their own, under limits and twice, with the global random generators in two states: what comes out otherwise
+the second time could not be repeated. Custom estimators are fitted to the first data set as well. A component that ends
+its process, or takes too long, is left to the run, which stores that for every estimate.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ctid_cli.canonical import canonical_json, plain
+from ctid_cli.custom_code import reason
+from ctid_cli.errors import DataError
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.running.job import MEASURE, with_measures
+from ctid_cli.running.limits import Limits
+from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
+from ctid_cli.running.workers import call_alone
+from ctid_cli.simulation.components import ComponentError, is_custom
+from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
+from ctid_cli.simulation.start_points import StartPoint
+from ctid_cli.specification.joint_checks import MAX_TRIALS
+from ctid_cli.specification.load import load_spec
+from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.sections import Failure, Variant, grouped, swept_in, variants
+from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.system_sections import start_points
+from ctid_cli.specification.yaml_source import KeyPath
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.manifest import found_values, true_values
+from ctid_cli.temporary import TemporaryFolder
+
+#: Samples of the data sets that are made, and time after which no other is begun [s].
+MAX_TRIAL_SAMPLES = 20_000_000
+MAX_SECONDS = 30.0
+#: Wall time that the process of custom components may take where there is no limit [s].
+PATIENCE = 600.0
+#: Errors of a program, which no other data set would mend.
+MISTAKES = (NameError, AttributeError, TypeError, ImportError)
+#: What depends on the state of the global generators is another thing each time that it is computed.
+GLOBAL = "depends on the global random state, so that no run could be repeated; draw from"
+
+
+def load_tried(
+    given: Path | Mapping[str, Any],
+    overrides: Sequence[str] = (),
+    *,
+    allow_code: bool = False,
+    allow_outside: bool = False,
+) -> Spec:
+    """Read, check and try a specification, for a run."""
+    return load_spec(given, overrides, allow_code=allow_code, allow_outside=allow_outside, trial=try_out)
+
+
+class Setting(NamedTuple):
+    """One combination of what data sets are made from."""
+
+    source: Any
+    swept: Mapping[KeyPath, Any]
+    #: True values of the parameters by name.
+    truth: Mapping[str, float]
+    #: Custom measures with their names.
+    measures: Sequence[tuple[str, Any]]
+
+
+class Candidate(NamedTuple):
+    """An estimator with one combination of its swept options, and a start that it takes."""
+
+    name: str
+    estimator: Any
+    swept: Mapping[KeyPath, Any]
+    start: StartPoint
+
+    @property
+    def is_custom(self) -> bool:
+        """Whether its class is not one of ctid's."""
+        return is_custom(getattr(self.estimator, "options", None))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a trial has found."""
+
+    #: What must be mended, and what may be right with other data.
+    wrong: list[Complaint] = field(default_factory=list)
+    odd: list[Complaint] = field(default_factory=list)
+
+
+def try_out(spec: Spec) -> Found:
+    """Try the settings and estimators of a specification; sections that have mistakes are not in it."""
+    settings, candidates = _settings(spec), list(_candidates(spec))
+    if not settings:
+        return Found()
+    custom = [candidate for candidate in candidates if candidate.is_custom]
+    own = [candidate for candidate in candidates if candidate not in custom]
+    all_apart = bool(spec.custom_measures) or any(_custom_parts(setting.source) for setting in settings)
+    success = {} if spec.success is None else spec.success.model_dump()
+    found = Found() if all_apart else _try_all(settings, own, success)
+    if all_apart or custom:
+        limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
+        given = (settings, candidates) if all_apart else (settings[:1], custom)
+        # What ends its process, or cannot be sent to one, is left to the run.
+        with TemporaryFolder() as folder, suppress(Exception):
+            more = call_alone(folder, _try_under_limits, limits, folder / "late", *given, success)[0]
+            found = found if more is None else Found(found.wrong + more.wrong, found.odd + more.odd)
+    return found
+
+
+def _settings(spec: Spec) -> list[Setting]:
+    """Return the distinct settings; levels of noise decide on nothing else and take turns."""
+    parts: dict[KeyPath, Sequence[Variant]]
+    parts = {(name,): variants(section) for name in OF_DATA if (section := getattr(spec, name)) is not None}
+    if spec.signal is None and spec.data is None:
+        if spec.loop is None and spec.excitation is None:
+            return []
+        # The other sections are tried although the system is wrong.
+        parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
+    if spec.data is None and spec.sampling is None:
+        return []
+    turns = {at: parts.pop(at) for at in (("noise",),) if at in parts}
+    measures = [(name, variants(section)[0].options) for name, section in spec.custom_measures.items()]
+    settings: list[Setting] = []
+    samples = 0
+    for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
+        case = dict(zip(parts, point, strict=True))
+        chosen = case | {at: found[k % len(found)] for at, found in turns.items()}
+        options = {str(at[0]): variant.options for at, variant in chosen.items()}
+        source = source_of(spec, options)
+        if not isinstance(source, MeasuredSource) and not is_custom(source.sampling):
+            samples += source.sampling.length
+        if samples > MAX_TRIAL_SAMPLES and settings:
+            break
+        system = chosen.get(("system",))
+        truth = true_values({"content": {"system": system_content(system)}}) if system and system.values else {}
+        settings.append(Setting(source, swept_in(case), truth, measures))
+    return settings
+
+
+def _candidates(spec: Spec) -> Iterator[Candidate]:
+    points = start_points(spec.starts)
+    for name, section in spec.estimators.items():
+        for variant in variants(section):
+            estimator = estimation(variant)
+            swept = swept_in({("estimators", name): variant})
+            yield Candidate(name, estimator, swept, starts_of(estimator.start_from, points)[0])
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# In this process, or in that of custom components
+
+
+def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
+    """Try custom components within the limits of an estimate."""
+    if limits.wall_seconds is None:
+        limits = replace(limits, wall_seconds=PATIENCE)
+    with late.open("wb") as watched:
+        limits.begin(watched)
+        found = _try_all(*given)
+        limits.end()
+    return found
+
+
+def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
+    """Make the first data set of each setting, and prepare every estimator on it."""
+    found, end = Found(), time.monotonic() + MAX_SECONDS
+    failures: list[Failure] = []
+    tried: list[Mapping[KeyPath, Any]] = []
+    of_estimators: dict[str, tuple[list[Failure], list[Mapping[KeyPath, Any]]]] = {}
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for setting in settings:
+            if tried and time.monotonic() > end:
+                break
+            data, complaints = _first_data(setting.source)
+            failures += [(path, text, setting.swept) for path, text in complaints]
+            for candidate in candidates if data is not None else ():
+                custom, complaints = candidate.is_custom, []
+                if not custom:
+                    its_failures, its_tried = of_estimators.setdefault(candidate.name, ([], []))
+                    its_tried.append({**setting.swept, **candidate.swept})
+                    complaints = list(_prepared(candidate, data))
+                    its_failures += [(path, text, its_tried[-1]) for path, text in complaints]
+                if (custom or setting.measures) and not (tried or failures or complaints):
+                    _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
+            tried.append(setting.swept)
+    found.wrong.extend(grouped(failures, tried))
+    for its_failures, its_tried in of_estimators.values():
+        found.wrong.extend(grouped(its_failures, its_tried))
+    return found
+
+
+def _custom_parts(source: Any) -> dict[str, Any]:
+    """Return the custom components that make a data set, by their places, in the order of their work."""
+    parts = source.parts if isinstance(source, SimulatedSource) else {}
+    return {place: part for place, part in parts.items() if is_custom(part)}
+
+
+def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
+    """Return the first data set of a source; or None, and why it cannot be made if its sections are to blame."""
+    custom = _custom_parts(source)
+    try:
+        if isinstance(source, SimulatedSource):
+            source.require_stable()
+        first, second = _twice(partial(source.dataset, 0)) if custom else (source.dataset(0),) * 2
+    except DataError as error:
+        at = tuple(error.section.split(".")) if error.section else ()
+        return None, [((*at, "kind") if error.section in custom else at, str(error))]
+    except Exception:  # of which a run says more: it is stored with every estimate
+        return None, []
+    made: dict[str, Callable[[Any], Any]] = {
+        "sampling": lambda r: r.t,
+        "excitation": lambda r: r.input.values,
+        "loop.reference": lambda r: None if r.loop is None else r.loop.reference,
+        "system": lambda r: r.noise_free,
+        "noise": lambda r: r.y,
+    }
+    for place in custom:
+        one, other = (np.asarray(made[place](data.record), dtype=np.float64) for data in (first, second))
+        if not np.array_equal(one, other, equal_nan=True):
+            return None, [((*place.split("."), "kind"), f"{GLOBAL} the rng that it is given")]
+    return first, []
+
+
+def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
+    """Return what is computed with the global generators in two states; only once what takes long."""
+    results = []
+    for seed in (0, 1):
+        begun = time.monotonic()
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+        results.append(compute())
+        if time.monotonic() - begun > MAX_SECONDS:
+            break
+    return results[0], results[-1]
+
+
+def _prepared(candidate: Candidate, data: Any) -> Iterator[Complaint]:
+    """Say why an estimator cannot use a record at all."""
+    with suppress(Exception):  # of which a run says more: it is stored with every estimate
+        try:
+            candidate.estimator.prepare(data.record)
+        except DataError as error:
+            yield ("estimators", candidate.name), str(error)
+
+
+def _fit(
+    candidate: Candidate,
+    data: Any,
+    setting: Setting,
+    estimators: Sequence[Any],
+    success: Mapping[str, Any],
+    found: Found,
+) -> None:
+    """Fit an estimator to the first data set, with custom measures, as a run does."""
+    path: KeyPath = ("estimators", candidate.name, "kind")
+    terms = structure(setting.source, estimators)
+
+    def fit() -> dict[str, Any]:
+        start = candidate.start.draw(getattr(setting.source, "seed", 0), 0, data.true_model)
+        fitted = candidate.estimator.prepare(data.record).fit(start)
+        row = plain(data.result_of(fitted, start, terms))
+        return with_measures(row, setting.measures, fitted, data, Limits())
+
+    try:
+        first, second = _twice(fit)
+        one, other = (row.pop("custom_measures") or {} for row in (first, second))
+        text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
+        found.wrong.extend((("measures", name), text) for name in one if one[name] != other[name])
+        if canonical_json(first) != canonical_json(second):
+            raise ComponentError(text)
+    except ComponentError as error:
+        found.wrong.append((path, str(error)))
+    except MISTAKES as error:
+        found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
+    except BaseException as error:
+        # Of another kind of failure others may be free.
+        text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
+        found.odd.append((path, text))
+    else:
+        found.odd.extend(_without_measures(candidate.name, first["message"]))
+        if first["status"] not in FAILURES and candidate.is_custom:
+            found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
+
+
+def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
+    """Say which custom measures raised an exception, which the message of the estimate tells."""
+    for line in message.splitlines():
+        name, colon, why = line.removeprefix(MEASURE).partition(": ")
+        if line.startswith(MEASURE) and colon:
+            text = f"fails on the first data set, with the estimator {estimator!r}: {why}"
+            yield ("measures", name), f"{text}; such estimates are stored without it"
+
+
+def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:
+    """Say that an estimate has nothing that a true value, or the rule of success, can be compared with."""
+    values = found_values(row, truth)[0]
+    if truth and all(value is None for value in values.values()):
+        names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
+        yield f"returns {names}; true values are known of {', '.join(truth)} only"
+    others = [name for name in truth if name != "delay"]
+    asked = {"delay_relative_error": ["delay"] if "delay" in truth else [], "parameter_relative_error": others}
+    for rule, wanted in asked.items():
+        lacking = [each for each in wanted if values[each] is None]
+        if lacking and success.get(rule) is not None:
+            yield f"returns no {', '.join(lacking)}, so that it never meets success.{rule}"

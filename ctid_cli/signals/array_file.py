@@ -1,0 +1,194 @@
+"""Columns from MATLAB and HDF5 files that hold plain arrays, read in a process of its own.
+
+Some damaged files crash the libraries that read them.
+"""
+
+import faulthandler
+import json
+import math
+import multiprocessing
+import os
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError
+from ctid_cli.signals.files import require_file, require_values
+from ctid_cli.signals.hdf5 import hdf5_arrays, text_of
+from ctid_cli.signals.table import Columns, Table
+from ctid_cli.temporary import TemporaryFolder
+
+MATLAB, HDF5 = (".mat",), (".h5", ".hdf5")
+#: Seconds that reading may take, and bytes a second of the slowest disk.
+LEAST_PATIENCE, SLOWEST = 50.0, 5e6
+
+
+def read_array_table(path: str | os.PathLike[str]) -> Table:
+    """Read the variables of a MATLAB file, or the data sets of an HDF5 file, which has a unit as attribute ``unit``."""
+    file = require_file(path, f" the file is empty; {_how_to_save(path)}")
+    content = _read_in_own_process(path, file)
+    if "refused" in content:
+        raise DataError(content["refused"])
+    vectors, wrong, objects = content["vectors"], content["wrong"], content["objects"]
+    hint = " ".join(_how_to_export(path, name, kind) for name, kind in objects.items())
+    if not vectors and not wrong:
+        raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
+
+    def read(names: Sequence[str]) -> Columns:
+        for name in names:
+            if name in wrong:
+                raise DataError(f"{file}: {noun} {name!r} {wrong[name]}")
+        return Columns(file, {name: vectors[name] for name in names})
+
+    noun = "variable" if Path(path).suffix.lower() in MATLAB else "data set"
+    return Table(file, tuple(content["names"]), read, head=file, noun=noun, hint=hint)
+
+
+def _read_in_own_process(path: str | os.PathLike[str], file: str) -> dict[str, Any]:
+    """Return what ``_write_content`` has found; refuse a file that crashes it, or takes too long."""
+    patience = LEAST_PATIENCE + Path(path).stat().st_size / SLOWEST
+    with TemporaryFolder() as folder:
+        with warnings.catch_warnings():
+            # The process does nothing but this, so that threads of others do not matter.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            process = multiprocessing.get_context("fork").Process(target=_write_content, args=(path, file, folder))
+            process.start()
+        process.join(patience)
+        if process.is_alive():
+            process.kill()
+            process.join()
+        if process.exitcode != 0:
+            raise _damaged(path, file)
+        content: dict[str, Any] = json.loads((folder / "content.json").read_text(encoding="utf-8"))
+        stored = {name: k for k, name in enumerate(content.get("names", ())) if name not in content["wrong"]}
+        content["vectors"] = {name: np.load(folder / f"{k}.npy", allow_pickle=False) for name, k in stored.items()}
+    return content
+
+
+def _write_content(path: str | os.PathLike[str], file: str, folder: Path) -> None:
+    """Write the vectors of a file to a folder, and why other variables are none."""
+    faulthandler.disable()  # a crash is no news
+    content: dict[str, Any]
+    try:
+        arrays, objects = _arrays(path, file)
+        content = {"names": list(arrays), "objects": objects, "wrong": {}}
+        for k, (name, value) in enumerate(arrays.items()):
+            try:
+                np.save(folder / f"{k}.npy", _vector(value), allow_pickle=False)
+            except ValueError as error:
+                content["wrong"][name] = str(error)
+    except DataError as error:
+        content = {"refused": str(error)}
+    except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
+        raise SystemExit(1) from None
+    (folder / "content.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def _arrays(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return arrays by name, and the classes of objects by name."""
+    import scipy.io
+
+    try:
+        if Path(path).suffix.lower() in HDF5:
+            return hdf5_arrays(path)
+        with warnings.catch_warnings():
+            # Two objects in one file share a placeholder name, which is no concern of the arrays next to them.
+            warnings.simplefilter("ignore")
+            for name, shape in _shapes(path).items():
+                require_values(file, name, math.prod(shape))
+            return _flat(scipy.io.loadmat(path))
+    except DataError as error:
+        raise DataError(str(error) if str(error).startswith(file) else f"{file}: {error}") from None
+    except NotImplementedError:  # version 7.3 is HDF5
+        try:
+            return hdf5_arrays(path)
+        except DataError as error:
+            raise DataError(f"{file}: {error}") from None
+    except PermissionError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+
+
+def _shapes(path: str | os.PathLike[str]) -> dict[str, tuple[int, ...]]:
+    """Return what the headers of a file claim; nothing where objects are in it, which have no such headers."""
+    import scipy.io
+
+    try:
+        return {name: tuple(shape) for name, shape, _ in scipy.io.whosmat(path)}
+    except NotImplementedError:
+        raise
+    except Exception:  # the reader itself says what is wrong
+        return {}
+
+
+def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the arrays of structs by their full names, and the classes of objects by name."""
+    from scipy.io.matlab import MatlabObject, MatlabOpaque
+
+    arrays: dict[str, Any] = {}
+    objects: dict[str, str] = {}
+
+    def visit(name: str, value: Any) -> None:
+        if isinstance(value, MatlabOpaque):
+            objects[text_of(value.flat[0]["s0"]) or name] = text_of(value.flat[0]["s2"])
+        elif isinstance(value, MatlabObject):
+            objects[name] = str(value.classname)
+        elif isinstance(value, np.ndarray) and value.dtype.names is not None and value.size == 1:
+            for field in value.dtype.names:
+                visit(f"{name}.{field}", value.flat[0][field])
+        else:
+            arrays[name] = value
+
+    for name, value in content.items():
+        if not name.startswith("__"):
+            visit(name, value)
+    return arrays, objects
+
+
+def _vector(value: Any) -> Array:
+    """Return an array as a vector of real numbers; a ValueError says why it is none."""
+    if hasattr(value, "toarray"):
+        try:
+            # Indices are looked at before anything is written to where they say.
+            value.tocsc().check_format(full_check=True)
+            value = value.toarray()
+        except (ValueError, MemoryError):
+            raise ValueError("is a damaged sparse matrix") from None
+    array = np.asarray(value)
+    if array.dtype.kind not in "biufc":
+        raise ValueError("does not hold numbers")
+    if array.size == 0:
+        raise ValueError("is empty")
+    if array.size != max(array.shape, default=1):
+        shape = "x".join(str(n) for n in array.shape)
+        raise ValueError(f"is a {shape} array; save the columns you mean as vectors of their own")
+    if array.dtype.kind == "c":
+        if np.any(array.imag != 0):
+            raise ValueError("holds complex numbers; save its real or imaginary part")
+        array = array.real
+    return np.array(array, dtype=float).reshape(-1)
+
+
+def _damaged(path: str | os.PathLike[str], file: str) -> DataError:
+    kind = "a MATLAB file" if Path(path).suffix.lower() in MATLAB else "an HDF5 file"
+    return DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(path)}")
+
+
+def _how_to_save(path: str | os.PathLike[str]) -> str:
+    if Path(path).suffix.lower() in HDF5:
+        return "save each column as a data set of its own, with its unit as the attribute 'unit'"
+    return f"in MATLAB, save plain vectors: save('{Path(path).stem}.mat', 't', 'u', 'y', '-v7')"
+
+
+def _how_to_export(path: str | os.PathLike[str], name: str, kind: str) -> str:
+    if kind != "iddata":
+        return f"{name!r} is a MATLAB {kind} object, which only MATLAB can read; {_how_to_save(path)}"
+    target = f"{Path(path).stem}_plain.mat"
+    return (
+        f"{name!r} is a MATLAB iddata object, which only MATLAB can read; there, write its arrays to {target} with\n"
+        f"  s = struct('t', {name}.SamplingInstants, 'u', {name}.InputData, 'y', {name}.OutputData); "
+        f"save('{target}', '-struct', 's', '-v7')"
+    )

@@ -1,0 +1,340 @@
+"""Columns of numbers in text files, whose layout is found in their first lines."""
+
+import codecs
+import csv
+import io
+import itertools
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+from ctid_cli.errors import DataError
+from ctid_cli.signals.files import quoted, require_file
+from ctid_cli.signals.table import Columns, Table, split_header
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+#: Lines that decide on separator and decimal sign, and the bytes at the beginning of a file in which they lie.
+HEAD_LINES, HEAD_BYTES = 50, 1_000_000
+#: Columns of the widest file.
+MAX_COLUMNS = 10_000
+#: Rows that are converted at a time: memory is needed for them and for the numbers of the columns that are used.
+ROWS = 1 << 17
+#: Separators in the order in which they are preferred if several fit; the blank stands for any blanks and tabs.
+SEPARATORS = ("\t", ";", ",", " ")
+#: How comments begin, which may stand before the data.
+COMMENTS = ("#", "%", "//")
+#: What stands for a missing sample.
+MISSING = ("", "nan", "NaN", "NAN", "na", "NA")
+#: Digits, a sign and digits again, as in 2024-03-01, 1/3/24 or 12:30.
+DATE = re.compile(r"\d[-/.]\d{1,2}[-/.]\d|\d:\d\d")
+#: A number by its decimal sign.
+NUMBERS = {
+    sign: re.compile(rf"[+-]?(\d+{mark}?\d*|{mark}\d+)(e[+-]?\d+)?|[+-]?inf(inity)?|true|false", re.IGNORECASE)
+    for sign, mark in ((".", r"\."), (",", ","))
+}
+EMPTY = "1: the file is empty; its first line must name the columns"
+NO_TEXT = "this is not a text file; records are read from text (.csv, .txt), MATLAB files (.mat) and HDF5 files (.h5)"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a file is written, its columns, and the lines of their names and of the first sample."""
+
+    encoding: str
+    separator: str
+    decimal: str
+    columns: tuple[str, ...]
+    header: int
+    first: int
+    notes: tuple[str, ...]
+
+
+def read_text_table(path: str | os.PathLike[str]) -> Table:
+    """Open a text file with one line per instant, whose first line names the columns."""
+    file = require_file(path, EMPTY)
+    layout = _layout(path, file)
+
+    def read(names: Sequence[str]) -> Columns:
+        return _read_columns(path, file, layout, names)
+
+    head = f"{file}:{layout.header}"
+    return Table(file, tuple(filter(None, layout.columns)), read, head=head, is_text=True, notes=layout.notes)
+
+
+# --- the first lines ------------------------------------------------------------------------------
+
+
+def _layout(path: str | os.PathLike[str], file: str) -> Layout:
+    """Find out how a file is written."""
+    text, encoding = _head(path, file)
+    comments, content = [], []
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if line.lstrip().startswith(COMMENTS):
+            comments.append((number, line))
+        elif line.strip():
+            content.append((number, line))
+        if len(content) == HEAD_LINES:
+            break
+    if not content:
+        raise DataError(f"{file}:{EMPTY}")
+    separator = _separator([line for _, line in content])
+    rows = [(k, _fields(line, separator)) for k, line in content]
+    header, names = rows[0]
+    if not names:
+        raise DataError(f"{file}:{header}: the line names no columns; it must name them, as in t,u,y")
+    if _all_numbers(names):
+        # Some programs write the names of the columns as a comment.
+        before, comment = next(((k, line) for k, line in reversed(comments) if k < header), (0, ""))
+        named = _fields(comment.lstrip().lstrip("#%/"), separator)
+        if len(named) != len(names) or _all_numbers(named):
+            raise DataError(
+                f"{file}:{header}: the first line holds numbers; it must name the columns, for example t,u,y"
+            )
+        header, names, rows = before, named, [(before, named), *rows]
+    notes = []
+    if encoding == "cp1252":
+        notes.append("The file is not UTF-8; it was read as Windows-1252.")
+    if _is_units(rows):
+        names = [_with_unit(*pair) for pair in itertools.zip_longest(names, rows[1][1], fillvalue="")]
+        notes.append(f"Line {rows[1][0]} was taken as the units of the columns.")
+        del rows[1]
+    if len(names) > MAX_COLUMNS:
+        raise DataError(f"{file}:{header}: the line names {len(names)} columns; at most {MAX_COLUMNS} are read")
+    if len(rows) < 2:
+        raise DataError(f"{file}:{header + 1}: the file has a header and no data")
+    decimal = _decimal(itertools.chain.from_iterable(fields for _, fields in rows[1:]))
+    if decimal == ",":
+        notes.append("Numbers were read with decimal commas.")
+    return Layout(encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes))
+
+
+def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
+    """Return the whole lines at the beginning of a file, and its encoding."""
+    try:
+        with open(path, "rb") as content:
+            head = content.read(HEAD_BYTES)
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encodings = ["utf-16"]
+    else:
+        encodings = ["utf-8-sig", "cp1252"] if b"\0" not in head else []
+    for encoding in encodings:
+        try:
+            # The last letter may be cut.
+            text = codecs.getincrementaldecoder(encoding)().decode(head)
+        except UnicodeDecodeError:
+            continue
+        if len(head) == HEAD_BYTES:
+            text = text[: max(text.rfind("\n"), text.rfind("\r")) + 1]
+            if not text:
+                raise DataError(f"{file}:1: the line has more than {HEAD_BYTES} bytes; it must name the columns")
+        return text, encoding
+    raise DataError(f"{file}: {NO_TEXT}")
+
+
+def _fields(line: str, separator: str) -> list[str]:
+    """Return the fields of a line up to the last one that is not empty."""
+    line = line.strip("\r\n")
+    if separator == " ":
+        # The unit of a name stays with it.
+        line = re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
+    try:
+        fields = [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+    except csv.Error:  # a field of more than 131072 letters
+        return []
+    while fields and not fields[-1]:
+        del fields[-1]
+    return fields
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return the separator that gives most lines one field for each of several columns."""
+    sizes, single = {}, []
+    agreeing = {}
+    for separator in SEPARATORS:
+        names, *rows = (_fields(line, separator) for line in lines)
+        sizes[separator] = len(names)
+        agreeing[separator] = sum(len(row) == len(names) for row in rows) if len(names) > 1 else 0
+        if len(names) == 1 and all(_all_numbers(row) for row in rows):
+            single.append(separator)
+    best = max(SEPARATORS, key=lambda separator: agreeing[separator])
+    if agreeing[best]:
+        return best
+    # A file of one column has no separator; what fits none is refused where its fields are counted.
+    marked = [separator for separator in SEPARATORS if separator in lines[0] and separator != " "]
+    return single[0] if single and not marked else max(marked or SEPARATORS, key=lambda separator: sizes[separator])
+
+
+def _decimal(fields: Iterable[str]) -> str:
+    """Return the sign that more of the numbers have that have one."""
+    votes = dict.fromkeys(NUMBERS, 0)
+    for field in fields:
+        for sign, number in NUMBERS.items():
+            votes[sign] += sign in field and number.fullmatch(field) is not None
+    return "," if votes[","] > votes["."] else "."
+
+
+def _is_units(rows: Sequence[tuple[int, list[str]]]) -> bool:
+    """Return whether the line below the names holds units: words, followed by a line with numbers."""
+    if len(rows) < 3 or len(rows[1][1]) > len(rows[0][1]):
+        return False
+    words = [field for field in rows[1][1] if field not in MISSING]
+    return bool(words) and not any(map(_has_number, words)) and any(map(_has_number, rows[2][1]))
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """Return the name of a column with its unit, unless it has one already."""
+    unit = unit.strip("[]()").strip()
+    return f"{name} [{unit}]" if name and unit and split_header(name)[1] is None else name
+
+
+def _has_number(field: str) -> bool:
+    return DATE.search(field) is not None or any(number.fullmatch(field) for number in NUMBERS.values())
+
+
+def _all_numbers(fields: Sequence[str]) -> bool:
+    return all(field in MISSING or _has_number(field) for field in fields)
+
+
+# --- the columns ----------------------------------------------------------------------------------
+
+
+def _read_columns(path: str | os.PathLike[str], file: str, layout: Layout, names: Sequence[str]) -> Columns:
+    """Read some columns; a line without a single field is left out."""
+    places = [layout.columns.index(name) for name in names]
+    parts: list[Any] = []
+    try:
+        for frame in _chunks(path, layout, places, dtype=float):
+            if frame[len(layout.columns)].notna().any():
+                _refuse_fields(path, file, layout, places)
+            parts.append(frame[places].to_numpy().T)
+    except ValueError:  # some field is no number, or a quotation mark is never closed
+        _refuse_fields(path, file, layout, places)
+    values = np.concatenate(parts, axis=1)
+    parts.clear()
+    last = values.shape[1] - 1
+    lines: Any = range(layout.first, layout.first + last + 1)
+    missing = np.isnan(values)
+    doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist()) | ({last} if missing[:, last:].any() else set())
+    left_out, notes = [], []
+    for k, line in _lines(path, layout, doubtful):
+        fields = _fields(line, layout.separator)
+        if not fields:
+            left_out.append(k)
+        elif k == last and not line.endswith(("\r", "\n")) and _is_short(line, layout):
+            left_out.append(k)
+            notes.append(f"Line {lines[k]}, the last, breaks off before its last field; it was left out.")
+    if left_out:
+        values, lines = np.delete(values, left_out, axis=1), np.delete(np.array(lines), left_out)
+    if not len(lines):
+        raise DataError(f"{file}:{layout.header + 1}: the file has a header and no data")
+    return Columns(file, dict(zip(names, values, strict=True)), lines, tuple(notes))
+
+
+def _is_short(line: str, layout: Layout) -> bool:
+    """Return whether a line has fewer fields, empty ones included, than there are columns."""
+    fields = _fields(line, " ") if layout.separator == " " else line.split(layout.separator)
+    return len(fields) < len(layout.columns)
+
+
+class _Widened:
+    """A text with a line in front that has a field more than there are columns.
+
+    pandas then gives all lines that many: the last column is empty unless a line has too many fields.
+    """
+
+    def __init__(self, text: io.TextIOBase, layout: Layout) -> None:
+        self._text = text
+        fields = len(layout.columns) + 1
+        self._front = ("nan " * fields if layout.separator == " " else layout.separator * (fields - 1)) + "\n"
+
+    def read(self, size: int = -1) -> str:
+        """Read the line in front, then the text."""
+        front, self._front = self._front, ""
+        return front or self._text.read(size)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._text)
+
+
+def _opened(path: str | os.PathLike[str], layout: Layout) -> io.TextIOBase:
+    """Open a file at its first sample."""
+    # What cannot be decoded there can be no number, and need not be one where it is not used.
+    text = open(path, encoding=layout.encoding, errors="replace", newline="")  # noqa: SIM115
+    for _ in range(layout.first - 1):
+        text.readline()
+    return text
+
+
+def _chunks(path: str | os.PathLike[str], layout: Layout, places: Sequence[int], dtype: type) -> Iterator["DataFrame"]:
+    """Read columns by their places, and one more that is empty if no line has too many fields."""
+    import pandas as pd  # a second of start-up time that only a command that reads a file should pay
+
+    width = len(layout.columns)
+    options: Any = {"header": None, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
+    options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
+    options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
+    options |= {"skipinitialspace": True, "dtype": dtype, "chunksize": ROWS, "engine": "c"}
+    with _opened(path, layout) as text:
+        widened: Any = _Widened(text, layout)
+        for k, frame in enumerate(pd.read_csv(widened, **options)):
+            yield frame if k else frame.iloc[1:]
+
+
+def _lines(path: str | os.PathLike[str], layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
+    """Return lines of a file as they are."""
+    if rows:
+        with _opened(path, layout) as text:
+            yield from ((k, line) for k, line in enumerate(text) if k in rows)
+
+
+def _refuse_fields(path: str | os.PathLike[str], file: str, layout: Layout, places: Sequence[int]) -> NoReturn:
+    """Refuse the first line with too many fields or without a number, and say which."""
+    number, width, row = NUMBERS[layout.decimal], len(layout.columns), 0
+    try:
+        for frame in _chunks(path, layout, places, dtype=str):
+            wrong = frame.notna()
+            for place in places:
+                wrong[place] &= ~frame[place].str.strip().str.fullmatch(number).fillna(False).astype(bool)
+            for k in np.flatnonzero(wrong.any(axis=1))[:1]:
+                line = layout.first + row + int(k)
+                if wrong[width].iloc[k]:
+                    _refuse_long(file, line, next(_lines(path, layout, {row + int(k)}))[1], layout)
+                place = next(place for place in places if wrong[place].iloc[k])
+                text = str(frame[place].iloc[k]).strip()
+                found = f"column {layout.columns[place]!r} holds {quoted(text)}"
+                raise DataError(f"{file}:{line}: {found}, which is {_instead_of_number(text, layout)}")
+            row += len(frame)
+    except ValueError as error:
+        opened = re.search(r"inside string starting at row (\d+)", str(error))
+        where = "" if opened is None else f":{layout.first + int(opened[1]) - 1}"
+        why = "a quotation mark is opened and never closed" if opened else f"not a table of text ({error})"
+        raise DataError(f"{file}{where}: {why}; export the file anew, or correct the line") from None
+    raise DataError(f"{file}: the columns cannot be read as numbers; write them with digits and one decimal sign")
+
+
+def _refuse_long(file: str, line: int, text: str, layout: Layout) -> NoReturn:
+    """Refuse a line with more fields than there are columns."""
+    seen = len(_fields(text, layout.separator))
+    there = f"the line has {seen} fields where line {layout.header} names {len(layout.columns)}"
+    commas = "; numbers with decimal commas need another separator, such as the semicolon"
+    raise DataError(f"{file}:{line}: {there}{commas if layout.separator == ',' else ''}")
+
+
+def _instead_of_number(text: str, layout: Layout) -> str:
+    """Say what stands where a number should, and what to do about it."""
+    if DATE.search(text):
+        return "a date or a time of day; write times as numbers, such as seconds since the first sample"
+    if text.startswith(COMMENTS):
+        return "a comment; move comments above the names of the columns, or delete them"
+    other, name = (",", "comma") if layout.decimal == "." else (".", "point")
+    if NUMBERS[other].fullmatch(text):
+        return f"a number with a decimal {name}, unlike the first {HEAD_LINES} lines; write all with one decimal sign"
+    return "not a number; leave the field empty if the sample is missing"

@@ -1,0 +1,71 @@
+"""A measured record with the loop that it was taken in."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError
+from ctid_cli.models.controller import DiscreteController, Relay
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.record import Loop, Record
+from ctid_cli.signals.table import split_header
+from ctid_cli.simulation.dataset import LoopOptions
+
+#: Share of the moves of the input [-] that the controller may leave unexplained: what rounding in a file does.
+UNEXPLAINED = 0.05
+
+
+def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
+    """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
+    record, r = measured.record, measured.reference_values
+    assert r is not None
+    if isinstance(loop.controller, Relay):
+        raise DataError(
+            f"{record.name}: {_IGNORE.format('closed-loop instruments need a linear controller, no relay')}"
+        )
+    _check_units(measured, loop)
+    if record.interval is None:
+        why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
+        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
+    controller = loop.at(record.interval).controller
+    left = unexplained(record, r, controller, loop.enters)
+    if not left <= UNEXPLAINED:
+        made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
+        why = (
+            f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
+            "controller in continuous time, another sampling interval, sign or reference, or limits of the actuator "
+            "do that, and estimates with it would be wrong"
+        )
+        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
+    closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
+    return replace(measured, record=closed)
+
+
+_IGNORE = "{}; correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
+
+
+def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:
+    """Return the root mean square of ``A u - B e`` relative to that of its terms; ``C = B/A``, any initial state."""
+    a, b = controller.denominator, controller.numerator
+    b = np.concatenate((np.zeros(a.size - b.size), b))
+    at_controller = enters == "controller"
+    u, driven = record.input.values, (r if at_controller else 0.0) - record.y
+    own = u if at_controller else u - r
+    # From the first instant on at which all samples of the polynomials are there.
+    moves, made = np.convolve(own, a, "valid"), np.convolve(driven, b, "valid")
+    left = moves - made
+    present = np.isfinite(left)
+    scale = float(np.mean(moves[present] ** 2)) if present.any() else 0.0
+    return float(np.sqrt(np.mean(left[present] ** 2) / scale)) if scale > 0 else float("inf")
+
+
+def _check_units(measured: Measurement, loop: LoopOptions) -> None:
+    """Refuse a reference in another unit than the signal that it is compared with."""
+    assert measured.reference is not None
+    unit = split_header(measured.reference)[1]
+    what = "output" if loop.enters == "controller" else "input"
+    other = measured.output_unit if loop.enters == "controller" else measured.input_unit
+    if unit is not None and other is not None and unit != other:
+        column = f"the reference {measured.reference!r} is in {unit}, and the {what} that it enters with in {other}"
+        raise DataError(f"{measured.record.name}: {column}; name another column, or say where it enters (loop.enters)")

@@ -1,0 +1,135 @@
+"""Journals as SQLite files: their format, how they are opened, and what keeps one from being read or written."""
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import NoReturn
+
+from ctid_cli.errors import DamageError, RefusedError, StorageError
+from ctid_cli.storage.announcement import reported
+from ctid_cli.temporary import TemporaryFolder
+
+#: The journal, and what is exported of it.
+FILE_NAME, EXPORT = "journal.sqlite", "runs.h5"
+#: Another one for every change after which another ctid could misread the file.
+FORMAT = 5
+#: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
+APPLICATION = 0x63746964
+#: What can go wrong while a file is read that may hold anything.
+ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
+#: What keeps SQLite from reading or writing a file that is in order; all else that it reports is damage.
+_HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
+#: Bytes at the beginning of a write-ahead log.
+_LOG_HEADER = 32
+
+
+def set_up(connection: sqlite3.Connection) -> None:
+    """Make commits durable, and let others read meanwhile where the file system has shared memory for it."""
+    for locking in ("NORMAL", "EXCLUSIVE"):
+        connection.execute(f"PRAGMA locking_mode={locking}")
+        if connection.execute("PRAGMA journal_mode=WAL").fetchone() == ("wal",):
+            break
+    connection.execute("PRAGMA synchronous=FULL")
+
+
+def require_whole(path: Path, *, planned: bool = True, live: bool = False) -> None:
+    """Refuse a file that was emptied: SQLite would remove its log, and a run would begin anew."""
+    log, folder = path.with_name(f"{path.name}-wal"), path.parent
+    emptied = path.exists() and path.stat().st_size == 0 and log.exists() and log.stat().st_size > _LOG_HEADER
+    if emptied or (not planned and ((folder / EXPORT).exists() or (not live and reported(folder)))):
+        raise DamageError(f"{path} is damaged: it is empty, and was not")
+
+
+@contextmanager
+def readable(path: Path, *, live: bool) -> Iterator[str]:
+    """Return an address at which SQLite reads a journal and changes nothing.
+
+    After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
+    index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
+    """
+    log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
+    # A log that was only begun holds nothing, and SQLite does not get on with its index.
+    empty = not log.exists() or log.stat().st_size <= _LOG_HEADER
+    if live or (index.exists() and not empty):
+        yield f"{path.resolve().as_uri()}?mode=ro&readonly_shm=1"
+    elif empty:
+        yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+    else:
+        with TemporaryFolder() as folder:
+            copy = folder / path.name
+            shutil.copyfile(path, copy)
+            shutil.copyfile(log, copy.with_name(log.name))
+            yield copy.as_uri()
+
+
+def refuse(path: Path, error: Exception, *, writing: bool = False) -> NoReturn:
+    """Say what keeps a journal from being read or written."""
+    name = getattr(error, "sqlite_errorname", "") or ""
+    reason = (error.strerror if isinstance(error, OSError) else None) or error
+    if writing and name not in ("SQLITE_CORRUPT", "SQLITE_NOTADB"):
+        safe = "all that was reported as done is safe in it"
+        raise StorageError(f"{path} could not be written ({reason}); {safe}") from error
+    if isinstance(error, OSError) or name.removeprefix("SQLITE_").startswith(_HINDRANCES):
+        raise StorageError(f"{path} cannot be read ({reason})") from error
+    raise DamageError(f"{path} is damaged or not a journal ({error})") from error
+
+
+def require_journal(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse an SQLite file that is no journal, or one of another format."""
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (written,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise DamageError(f"{path} is an SQLite file, but not a journal of ctid")
+    require_format(path, written, FORMAT)
+
+
+def require_format(path: Path, written: int, known: int) -> None:
+    """Refuse a file of another format than the one that this program reads."""
+    if written != known:
+        raise RefusedError(
+            f"{path} has format {written}; this ctid reads format {known}. Use the ctid that wrote it, another results "
+            "folder (--out), or --fresh to move the old results aside"
+        )
+
+
+class Places:
+    """An open journal's folder and files as they were when it was opened."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder: int | None = os.open(path.parent, os.O_RDONLY)
+        places = (path.parent, path, path.with_name(f"{path.name}-wal"))
+        self._found = {place: _identity_of(place) for place in places if place.exists()}
+
+    def require(self) -> None:
+        """Refuse to go on in a file that its path does not lead to any more."""
+        for place, found in self._found.items():
+            if _identity_of(place) != found:
+                advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"
+                raise StorageError(f"{self._what_became_of(place)}. {advice}")
+
+    def _what_became_of(self, place: Path) -> str:
+        now = None
+        with suppress(OSError):
+            # Linux knows the present name of an open folder.
+            now = os.readlink(f"/proc/self/fd/{self._folder}")
+        moved = now is not None and now != str(place.resolve()) and not now.endswith(" (deleted)")
+        if moved and place == next(iter(self._found)):
+            return f"{place} was renamed while a run wrote to it; it is {now} now"
+        return f"{place} was deleted or replaced while a run wrote to it"
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        if self._folder is not None:
+            with suppress(OSError):
+                os.close(self._folder)
+            self._folder = None
+
+
+def _identity_of(path: Path) -> tuple[int, int] | None:
+    with suppress(OSError):
+        found = os.stat(path)
+        return found.st_dev, found.st_ino
+    return None

@@ -1,0 +1,172 @@
+"""What windows say of the tones at many instants, and which of that is refuted by what is left of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.tones import constants as c
+from ctid_cli.tones.fit import WindowTones
+from ctid_cli.tones.kernels import refute
+
+#: Standard error of the growth over half a window, in relative errors of the amplitude: the mean square of u is 1/3.
+GROWTH_ERROR = 3.0**0.5
+
+
+class Readings(NamedTuple):
+    """One entry for each instant and tone that some window shows there."""
+
+    #: Which of the instants.
+    row: IndexArray
+    #: Frequency and its standard error [rad/sample].
+    omega: Array
+    error: Array
+    amplitude: Array
+    amplitude_error: Array
+    #: Phase at the instant [rad].
+    phase: Array
+    #: Logarithmic growth of the amplitude [1/sample] and rate of change of the frequency [rad/sample^2].
+    growth: Array
+    rate: Array
+    #: Length of the window, and where its middle is [samples].
+    window: IndexArray
+    middle: Array
+    #: Whether the window tells the tone from its neighbours, and whether the tone is there beyond doubt.
+    resolved: BoolArray
+    significant: BoolArray
+    #: Distance of the lines of a comb that the tone belongs to, 0 if to none, and the band of that [rad/sample].
+    gap: Array
+    low: Array
+    high: Array
+    #: Which tone of its window it is.
+    tone: IndexArray
+
+    def at(self, which: IndexArray) -> "Readings":
+        """Return some of the readings."""
+        return Readings(**{name: getattr(self, name)[which] for name in self._fields})
+
+
+def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
+    """Read windows of one length at all places [samples] that lie in them, the windows nearest to a place first."""
+    half = 0.5 * length
+    low = np.searchsorted(tones.middle, places - half, side="right")
+    count = np.searchsorted(tones.middle, places + half, side="right") - low
+    row = np.repeat(np.arange(places.size), count)
+    window = np.repeat(low, count) + np.arange(row.size) - np.repeat(np.cumsum(count) - count, count)
+    near = np.argsort(np.abs(places[row] - tones.middle[window]), kind="stable")
+    row, window = row[near], window[near]
+    pair, tone = np.nonzero(_sound(tones, length)[window])
+    row, window = row[pair], window[pair]
+
+    def of(values: Array) -> Array:
+        return np.asarray(values[window, tone])
+
+    x = places[row] - tones.middle[window]
+    u = x / half
+    growth, rate = of(tones.growth), of(tones.rate)
+    omega, error = _frequency(tones, length, window, tone, x)
+    # The amplitude at the end of a window depends on its growth; where it has vanished, an exponential that is none
+    # would seem surer than the noise allows.
+    grown = np.exp(np.clip(growth * x, -20.0, 20.0))
+    amplitude = of(tones.amplitude) * grown
+    amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u) * np.maximum(1.0, grown)
+    significant = (amplitude > c.SIGNIFICANT * amplitude_error) & (of(tones.omega) * length > c.PERIODS * 2.0 * np.pi)
+    phase = of(tones.phase) + of(tones.omega) * x + 0.5 * rate * x**2
+    resolved = of(_distance(tones) * length / (2.0 * np.pi)) >= c.RESOLVED
+    lengths, middle = np.full(row.size, length), tones.middle[window]
+    combs = [of(each) for each in _combs(tones)]
+    return Readings(
+        *(row, omega, error, amplitude, amplitude_error, phase, growth, rate),
+        *(lengths, middle, resolved, significant, *combs, tone),
+    )
+
+
+def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexArray, x: Array) -> tuple[Array, Array]:
+    """Return frequencies at a distance from the middles, and standard errors with what no test would have found."""
+
+    def of(values: Array) -> Array:
+        return np.asarray(values[window, tone])
+
+    half = 0.5 * length
+    omega_error, rate, growth, bend = of(tones.omega_error), of(tones.rate), of(tones.growth), of(tones.bend)
+    omega = of(tones.omega) + rate * x
+    error = np.hypot(omega_error, of(tones.rate_error) * x)
+    # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is that at the middle.
+    share, curved = 1.0 - 5.0 * (x / half) ** 2, np.abs(bend) / of(tones.bend_error)
+    error = np.where(curved > c.QUIET, np.hypot(error, 0.5 * share * bend), error)
+    bent = curved > c.BENT
+    omega = np.where(bent, omega - share * bend, omega)
+    error = np.where(bent, np.hypot(error, share * of(tones.bend_error)), error)
+    hidden = np.minimum(c.KINK * np.abs(rate) * length, c.HIDDEN_KINK * omega_error) / c.COVERED
+    error = np.where(np.abs(rate) > c.MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
+    error = np.where(of(tones.change_chance) < c.DOUBTFUL, c.DOUBT * error, error)
+    growing, relative = np.abs(growth) * half, of(tones.amplitude_error) / of(tones.amplitude)
+    blended = (growing > c.GROWS * GROWTH_ERROR * relative) & (growing < c.BLENDED_GROWTH)
+    return omega, np.where(blended, np.hypot(error, np.abs(growth) / c.COVERED), error)
+
+
+def _sound(tones: WindowTones, length: int) -> BoolArray:
+    """Return which tones nothing that is left of their window disturbs, shape (R, n)."""
+    bins = length / (2.0 * np.pi)
+    changed = tones.change_chance < c.LEVEL
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~changed
+    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
+    sound &= line <= c.NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
+    full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
+    sound &= ~(full & (line > c.COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2))
+    for j in range(changed.shape[1]):
+        energy = np.where(changed[:, j], tones.change_energy[:, j], 0.0)[:, None]
+        disturbed = energy > c.NEAR * ((tones.omega - tones.omega[:, j, None]) * bins) ** 2
+        disturbed[:, j] = False
+        sound &= ~disturbed
+    return np.asarray(sound)
+
+
+def _distance(tones: WindowTones) -> Array:
+    """Return the distance of each tone from the nearest other one of its window [rad/sample], shape (R, n)."""
+    apart = np.abs(tones.omega[:, :, None] - tones.omega[:, None, :])
+    n = np.arange(apart.shape[1])
+    apart[:, n, n] = np.inf
+    return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2))
+
+
+def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
+    """Return distances and bands of the combs that tones belong to, each of shape (R, n), zero where there is none.
+
+    Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
+    Distances that are a large share of the frequencies are those of harmonics.
+    """
+    gap, low, high = np.zeros((3, *tones.omega.shape))
+    if tones.omega.shape[1] < c.COMB:
+        return gap, low, high
+    order = np.argsort(tones.omega, axis=1)
+    omega, error = (np.take_along_axis(each, order, axis=1) for each in (tones.omega, tones.omega_error))
+    steps, sure = np.diff(omega, axis=1), np.hypot(error[:, 1:], error[:, :-1])
+    allowed = np.maximum(c.EQUAL_ERRORS * np.maximum(sure[:, 1:], sure[:, :-1]), c.UNEQUAL * steps[:, :-1])
+    equal = (np.abs(np.diff(steps, axis=1)) <= allowed) & (steps[:, :-1] < c.HARMONIC * omega[:, :-2])
+    for row, k in np.argwhere(equal):
+        if gap[row, order[row, k + 1]] > 0.0:
+            continue
+        # All lines at multiples of the distance belong to the comb, unless too many are missing between them.
+        base = steps[row, k]
+        away = (omega[row] - omega[row, k + 1]) / base
+        lines = np.sort(np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))]))
+        breaks = np.flatnonzero(np.diff(lines) > c.MOST_APART)
+        begin = np.searchsorted(breaks, np.searchsorted(lines, 0.0))
+        first = lines[breaks[begin - 1] + 1] if begin > 0 else lines[0]
+        last = lines[breaks[begin]] if begin < breaks.size else lines[-1]
+        inside = order[row, (away > first - c.BESIDE) & (away < last + c.BESIDE)]
+        gap[row, inside] = base
+        low[row, inside] = omega[row, k + 1] + (first - c.BESIDE) * base
+        high[row, inside] = omega[row, k + 1] + (last + c.BESIDE) * base
+    return gap, low, high
+
+
+def moving(r: Readings, bounds: IndexArray) -> BoolArray:
+    """Return which readings are lines that one moving tone makes, as shorter windows show."""
+    refuted = refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, c.COVERED)
+    if not (r.gap > 0.0).any():
+        return np.asarray(refuted)
+    line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
+    share: Array = np.bincount(line, refuted) / np.bincount(line)
+    return np.asarray(refuted | (share[line] > c.REFUTED))

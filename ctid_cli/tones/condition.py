@@ -1,0 +1,135 @@
+"""A recorded signal made ready: checks, spikes, and fewer samples where its tones are low."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import next_fast_len, rfft
+from scipy.signal import firwin, freqz, kaiserord, upfirdn
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import DataError
+from ctid_cli.tones import constants as c
+
+
+class Conditioned(NamedTuple):
+    """Samples that the tones are looked for in, and what was done to the record."""
+
+    #: Samples divided by ``scale``, NaN where missing, shape (M,).
+    samples: Array
+    #: Sampling interval [s], and the instant of the first of these samples [s since the first of the record].
+    interval: float
+    begins: float
+    scale: float
+    #: Impulse response of the low-pass, and one of how many samples is kept.
+    weights: Array
+    factor: int
+    #: Sentences for the user.
+    reasons: tuple[str, ...]
+
+    def gain(self, turn: Array) -> Array:
+        """Return the factor by which the filter changes amplitudes at some phases from sample to sample [rad]."""
+        if self.weights.size == 1:
+            return np.ones_like(turn)
+        return np.asarray(np.abs(freqz(self.weights, worN=turn.ravel() / self.factor)[1]).reshape(turn.shape))
+
+
+def condition(samples: Array, interval: float) -> Conditioned:
+    """Check a record, take its spikes as missing, and thin it as far as its highest line allows."""
+    refuse_unusable(samples)
+    spikes = find_spikes(samples)
+    reasons = []
+    if spikes.any():
+        samples = np.where(spikes, np.nan, samples)
+        told = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
+        reasons.append(f"{told}: {spikes.sum()}.")
+    scale = float(np.nanmax(np.abs(samples)))
+    # Rounding leaves no noise by which errors could be told.
+    samples = samples / scale + c.DITHER * np.random.default_rng(0).standard_normal(samples.size)
+    most = samples.size // c.FEWEST_KEPT
+    top = highest_line(samples) if most > 1 else np.pi
+    factor = min(most, int(np.pi * c.TONE_BAND / top))
+    if factor <= 1:
+        return Conditioned(samples, interval, 0.0, scale, np.ones(1), 1, tuple(reasons))
+    # Edges as shares of the Nyquist frequency; what would fold into the kept band is stopped.
+    taps, beta = kaiserord(c.STOP_BAND, 2.0 * (1.0 - c.KEPT_BAND) / factor)
+    weights = firwin(taps | 1, 1.0 / factor, window=("kaiser", beta))
+    bridged = bridge_gaps(samples, int(c.BRIDGED * 2.0 * np.pi / top))
+    inner = slice(-(-(weights.size - 1) // factor), (samples.size - 1) // factor + 1)
+    thinned = upfirdn(weights, bridged, 1, factor)[inner]
+    thin = factor * interval
+    kept = f"One of {factor} samples is kept, every {thin:.4g} s"
+    edge = 0.5 * c.KEPT_BAND / thin
+    reasons.append(f"{kept}, after a low-pass that keeps what is below {edge:.4g} Hz.")
+    begins = (inner.start * factor - 0.5 * (weights.size - 1)) * interval
+    return Conditioned(np.asarray(thinned), thin, begins, scale, weights, factor, tuple(reasons))
+
+
+def refuse_unusable(samples: Array) -> None:
+    """Raise DataError for a signal that is too short, constant, or out of range."""
+    present = samples[np.isfinite(samples)]
+    if present.size < c.FEWEST:
+        raise DataError(f"{present.size} samples are too few: there must be {c.FEWEST}")
+    low, high = float(present.min()), float(present.max())
+    largest = max(abs(low), abs(high))
+    if high - low <= c.CONSTANT * largest:
+        raise DataError(f"the signal is constant ({low:.6g}): it has no tones")
+    if not c.SMALLEST_SAMPLE <= largest <= c.LARGEST_SAMPLE:
+        raise DataError(f"the square of the largest sample, {largest:.3g}, is no normal number; use another unit")
+
+
+def find_spikes(samples: Array) -> BoolArray:
+    """Return where a record, which may have missing samples, has values no sum of a few tones can have."""
+    from scipy.ndimage import maximum_filter1d
+
+    there = np.isfinite(samples)
+    if not there.any():
+        return there
+    size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
+    # The largest of the samples on each side, those next to the spike left out.
+    begin = c.SPIKE_AROUND // 2
+    largest = maximum_filter1d(np.pad(size, c.SPIKE_WIDTH + c.SPIKE_AROUND), c.SPIKE_AROUND)
+    largest = largest[begin : begin + size.size + 2 * c.SPIKE_WIDTH + c.SPIKE_AROUND + 1]
+    around = np.maximum(largest[: size.size], largest[-size.size :])
+    spikes: BoolArray = (around > 0.0) & (size > c.SPIKE_TIMES * around)
+    return spikes if spikes.mean() <= c.MOST_SPIKES else np.zeros_like(spikes)
+
+
+def bridge_gaps(samples: Array, longest: int) -> Array:
+    """Fill gaps of at most so many samples by straight lines."""
+    missing = ~np.isfinite(samples)
+    if longest < 1 or not missing.any():
+        return samples
+    steps = np.diff(missing.astype(np.int8), prepend=0, append=0)
+    first, after = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    short = (after - first <= longest) & (first > 0) & (after < samples.size)
+    places = np.arange(samples.size)
+    bridged = np.interp(places, places[~missing], samples[~missing])
+    bridged[missing] = np.where(np.repeat(short, after - first), bridged[missing], np.nan)
+    return np.asarray(bridged)
+
+
+def highest_line(samples: Array) -> float:
+    """Return the phase per sample [rad] of the highest line of a record, in segments of several lengths.
+
+    A line is an ordinate of a tapered periodogram that white noise exceeds in one of a thousand records, so far is it
+    above the median around it. Long segments show the weakest lines, short ones those that move or do not last.
+    """
+    values = np.nan_to_num(samples - np.nanmean(samples))
+    top, length = 0.0, values.size
+    while length >= c.SHORTEST_SEGMENT:
+        segments = values[: values.size // length * length].reshape(-1, length)
+        size = next_fast_len(length, real=True)
+        taper = np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2
+        together = max(1, c.BLOCK_SAMPLES // length)
+        for first in range(0, len(segments), together):
+            power = np.abs(rfft(segments[first : first + together] * taper, size)) ** 2
+            whole = power.shape[1] // c.FLOOR_BINS * c.FLOOR_BINS
+            blocks = power[:, :whole].reshape(len(power), -1, c.FLOOR_BINS)
+            floor = np.median(blocks, axis=2) / np.log(2.0)
+            known = c.MEDIAN_EFFICIENCY * c.FLOOR_BINS
+            height = known * ((c.FALSE_LINES / values.size) ** (-1.0 / known) - 1.0)
+            lines = (blocks > height * np.maximum(floor, c.SMALLEST_FLOOR)[:, :, None]).any(axis=0)
+            if lines.any():
+                top = max(top, 2.0 * np.pi * (int(np.flatnonzero(lines)[-1]) + 1) / size)
+        length = min(length // 8, 2 ** int(np.log2(length // 8))) if length >= 8 else 0
+    return min(top, np.pi) or np.pi

@@ -1,0 +1,155 @@
+"""Lines in what tones leave of their windows: the colour of the noise, its level, and the strongest ordinates."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import next_fast_len, rfft
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.tones import constants as c
+
+
+class Left(NamedTuple):
+    """What is left of windows of one length, whitened."""
+
+    #: Whitened residuals of mean square 1 where they are noise; zero where a sample is missing, shape (R, L).
+    white: Array
+    #: Prediction-error filter of each window, shape (R, p + 1).
+    filters: Array
+    #: Mean square of the innovations, shape (R,).
+    innovations: Array
+    #: Phase per sample of the largest ordinate before any whitening [rad], and its ratio to the floor, shape (R,).
+    peak: Array
+    peak_height: Array
+
+    def noise(self, turn: Array) -> Array:
+        """Return the mean square of white noise as strong as that at some phases per sample [rad], shape (R, n)."""
+        lags = np.arange(self.filters.shape[1])
+        response = (self.filters[:, None, :] * np.exp(-1j * turn[:, :, None] * lags)).sum(axis=2)
+        return np.asarray(self.innovations[:, None] / np.abs(response) ** 2)
+
+
+class Lines(NamedTuple):
+    """The strongest line that is left of each window, and further ones."""
+
+    #: Chance of noise to show one as strong, shape (R,).
+    chance: Array
+    #: Its phase per sample [rad], its ratio to the floor, and the energy that the largest ordinate would take away, in
+    #: units of the noise, shape (R,).
+    omega: Array
+    height: Array
+    energy: Array
+    #: Further lines, no side lobes of stronger ones [rad], NaN where none is, and their energies, shape (R, K).
+    further: Array
+    further_energy: Array
+
+
+def whiten(residuals: Array, fitted: IndexArray) -> Left:
+    """Whiten rows of residuals, of which ``fitted`` parameters each were estimated, by autoregressive models.
+
+    The models are those of the noise: ordinates far above the floor are cut from the spectrum before they are made.
+    """
+    rows, length = residuals.shape
+    there = np.isfinite(residuals)
+    values = np.where(there, residuals, 0.0)
+    power = periodogram(values * np.sin(np.pi * (np.arange(length) + 0.5) / length) ** 2)
+    floor = running_floor(power, length)
+    peak = power.argmax(axis=1)
+    each = np.arange(rows)
+    height = power[each, peak] / np.maximum(floor[each, peak], c.SMALLEST_FLOOR)
+    order = min(c.WHITENING_ORDER, max(1, length // c.SAMPLES_PER_ORDER))
+    cosines = np.cos(np.outer(np.arange(order + 1), np.linspace(0.0, np.pi, power.shape[1])))
+    # The first and the last ordinate are there once, all others twice.
+    weighted = cosines.copy()
+    weighted[:, 1:-1] *= 2.0
+    filters = prediction_errors(np.minimum(power, c.CUT * floor) @ weighted.T)
+    for _ in range(c.WHITENING_ROUNDS - 1):
+        own = np.array([(filters[:, : order + 1 - k] * filters[:, k:]).sum(axis=1) for k in range(order + 1)])
+        own[1:] *= 2.0
+        gain = np.maximum(own.T @ cosines, c.SMALLEST_GAIN)
+        floor = running_floor(power * gain, length) / gain
+        filters = prediction_errors(np.minimum(power, c.CUT * floor) @ weighted.T)
+    white = values.copy()
+    for lag in range(1, order + 1):
+        white[:, lag:] += filters[:, lag, None] * values[:, :-lag]
+    white *= there
+    squares = (white**2).sum(axis=1) / np.maximum(there.sum(axis=1) - fitted - order, 1)
+    white /= np.sqrt(np.where(squares > 0.0, squares, 1.0))[:, None]
+    return Left(white, filters, squares, np.pi * peak / (power.shape[1] - 1), height)
+
+
+def periodogram(values: Array) -> Array:
+    """Return the squares of the padded transform of rows, whose length is even."""
+    size = next_fast_len(c.PADDING * values.shape[1], real=True)
+    transform = rfft(values, size + size % 2, axis=1)
+    return np.asarray(transform.real**2 + transform.imag**2)
+
+
+def floor_bins(length: int) -> int:
+    """Return the number of bins in one running median of the ordinates of a window."""
+    return min(c.FLOOR_BINS, length // 4) // 2 * 2 + 1
+
+
+def running_floor(power: Array, length: int) -> Array:
+    """Return running medians of rows of ordinates, as means of exponential variables; straight lines between some."""
+    half = floor_bins(length) // 2
+    hop = max(1, half // 2)
+    bins = power[:, :: c.PADDING]
+    # The spectrum is mirrored at its ends.
+    bins = np.pad(bins, ((0, 0), (half, half + hop)), mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(bins, 2 * half + 1, axis=1)[:, ::hop]
+    medians = np.partition(around, half, axis=2)[:, :, half] / np.log(2.0)
+    ramp = np.arange(hop * c.PADDING) / (hop * c.PADDING)
+    lines = medians[:, :-1, None] * (1.0 - ramp) + medians[:, 1:, None] * ramp
+    return np.asarray(lines.reshape(power.shape[0], -1)[:, : power.shape[1]])
+
+
+def prediction_errors(covariances: Array) -> Array:
+    """Return the prediction-error filters of rows of autocovariances, by the Yule-Walker equations, (R, p + 1)."""
+    order = covariances.shape[1] - 1
+    r = covariances / np.where(covariances[:, :1] > 0.0, covariances[:, :1], 1.0)
+    r[:, 0] = 1.0 + c.LEAST_NOISE
+    lags = np.abs(np.subtract.outer(np.arange(order), np.arange(order)))
+    solved = np.linalg.solve(r[:, lags], -r[:, 1:, None])[:, :, 0]
+    return np.concatenate((np.ones((r.shape[0], 1)), solved), axis=1)
+
+
+def strongest_lines(left: Left) -> Lines:
+    """Find the strongest lines of each row, in the ratio of the periodogram to its running median."""
+    rows, length = left.white.shape
+    ordinates = periodogram(left.white)
+    turn = np.pi / (ordinates.shape[1] - 1)
+    ratio = ordinates / np.maximum(running_floor(ordinates, length), c.SMALLEST_FLOOR)
+    ratio[:, : c.PADDING] = 0.0
+    # The floor is uncertain: the ratio is one of exponential variables.
+    known = c.MEDIAN_EFFICIENCY * floor_bins(length)
+    least = c.SURELY * known * (c.LEAST_CHANCE ** (-1.0 / known) - 1.0)
+    each, top = np.arange(rows), ordinates.max(axis=1)
+    place = ratio.argmax(axis=1)
+    height = ratio[each, place]
+    further = np.full((rows, c.FURTHER), np.nan)
+    energies = np.zeros((rows, c.FURTHER))
+    more, last = np.flatnonzero(height > least), place
+    lobe = np.arange(-c.LOBES * c.PADDING + 1, c.LOBES * c.PADDING)
+    for k in range(c.FURTHER):
+        around = last[more, None] + lobe
+        ratio[more[:, None], np.clip(around, 0, ratio.shape[1] - 1)] = 0.0
+        last = last.copy()
+        last[more] = ratio[more].argmax(axis=1)
+        found = (ratio[more, last[more]] > least) & (ordinates[more, last[more]] > c.SIDE_LOBE * top[more])
+        more = more[found]
+        if not more.size:
+            break
+        further[more, k], energies[more, k] = last[more] * turn, ordinates[more, last[more]] / length
+    one = (1.0 + height / known) ** -known
+    chance = -np.expm1(c.INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
+    # The models of the noise have taken the skirts of a very strong line for its colour.
+    plain = left.peak_height > c.LINE_HEIGHT
+    return Lines(
+        np.where(plain, 0.0, chance),
+        np.where(plain, left.peak, place * turn),
+        np.where(plain, left.peak_height, height),
+        np.where(plain, left.peak_height, top / length),
+        further,
+        energies,
+    )

@@ -1,0 +1,185 @@
+"""Decaying chirps fitted to windows: one line after the other joins until the residual is noise."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.processors import in_threads
+from ctid_cli.tones import constants as c
+from ctid_cli.tones.find import Left, Lines, strongest_lines, whiten
+from ctid_cli.tones.kernels import PARAMETERS, find_changes, fit_windows
+
+
+class WindowTones(NamedTuple):
+    """The tones of windows of one length."""
+
+    #: Middle of each window [samples], shape (R,).
+    middle: Array
+    #: At the middle: frequency [rad/sample], its standard error, amplitude, its standard error, phase [rad],
+    #: growth [1/sample], rate of change of frequency [rad/sample^2] and its error; NaN where there is no tone, (R, n).
+    omega: Array
+    omega_error: Array
+    amplitude: Array
+    amplitude_error: Array
+    phase: Array
+    growth: Array
+    rate: Array
+    rate_error: Array
+    #: Error of omega that a curved frequency makes, estimated from what is left, and its standard error [rad/sample].
+    bend: Array
+    bend_error: Array
+    #: Chance of noise to change as much within the window, and the energy of the change in units of the noise, (R, n).
+    change_chance: Array
+    change_energy: Array
+    #: Chance of noise to show as strong a line as is left, where that stands [rad/sample], its energy, shape (R,).
+    line_chance: Array
+    line: Array
+    line_energy: Array
+    #: Whether the iterations reached a minimum, shape (R,).
+    converged: BoolArray
+
+
+class _Fits(NamedTuple):
+    """Windows and the parameters of their tones, which the compiled fit changes."""
+
+    first: IndexArray
+    used: IndexArray
+    parameters: Array
+    variances: Array
+    converged: BoolArray
+
+
+class _Tests(NamedTuple):
+    """What is left of windows, and what it shows."""
+
+    left: Left
+    lines: Lines
+    #: Energy that a change would explain, and P3 in the phase that is left, shape (R, n).
+    change: Array
+    cube: Array
+
+
+def fit_tones(
+    samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None = None
+) -> WindowTones:
+    """Fit the tones of windows of one length, starting with what was found in shorter windows."""
+    most = max(1, min(most, (length // c.SAMPLES_PER_PARAMETER - 1) // PARAMETERS))
+    size = max(1, c.BLOCK_SAMPLES // length)
+    parts = [first[k : k + size] for k in range(0, first.size, size)]
+    blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
+    return WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+
+
+def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
+    rows, shape = first.size, (first.size, most, PARAMETERS)
+    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros(shape), np.zeros(rows, np.bool_))
+    if shorter is not None:
+        _start(fits, length, shorter)
+    residuals = np.empty((rows, length))
+    tests: _Tests | None = None
+    todo = np.arange(rows)
+    for round_ in range(most + 1):
+        fit_windows(samples, length, first, todo, *fits[1:], residuals)
+        new = _tested(residuals[todo], fits, todo)
+        tests = new if tests is None else _replaced(tests, todo, new)
+        if round_ == most:
+            break
+        # What a change explains better is no line.
+        changed = np.nan_to_num(new.change).max(axis=1)
+        further = np.where(new.lines.further_energy >= changed[:, None], new.lines.further, np.nan)
+        turns = np.column_stack((new.lines.omega, further)) * 0.5 * (length - 1)
+        lined = (new.lines.chance < c.LEVEL) & (changed <= new.lines.energy)
+        todo, turns = todo[lined], turns[lined]
+        joined = _join(fits, todo, turns[:, 0])
+        todo, turns = todo[joined], turns[joined]
+        if not todo.size:
+            break
+        for each in turns.T[1:]:
+            _join(fits, todo, each)
+    assert tests is not None
+    return _tones(fits, tests, length)
+
+
+def nearest(middles: Array, places: Array) -> IndexArray:
+    """Return which of some middles, ascending, is the nearest to each place."""
+    return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
+
+
+def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
+    """Take over the tones of the shorter windows nearest to the middles, where nothing is wrong with them."""
+    half = 0.5 * (length - 1)
+    middle: Array = np.asarray(fits.first + half, dtype=np.float64)
+    beginning = nearest(shorter.middle, middle)
+    clean = shorter.converged & (shorter.line_chance >= c.LEVEL) & ~(shorter.change_chance < c.LEVEL).any(axis=1)
+    sure = clean[:, None] & (shorter.amplitude > c.SURE * shorter.amplitude_error)
+    for j in range(min(shorter.omega.shape[1], fits.parameters.shape[1])):
+        rows = np.flatnonzero(sure[beginning, j])
+        of, place = beginning[rows], fits.used[rows]
+        omega = shorter.omega[of, j] + shorter.rate[of, j] * (middle[rows] - shorter.middle[of])
+        fits.parameters[rows, place, 3] = omega * half
+        fits.parameters[rows, place, 4] = 0.5 * shorter.rate[of, j] * half**2
+        fits.used[rows] += 1
+
+
+def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
+    """Add a line to some windows, and return where: where it is one, there is room, and no tone is near."""
+    most = fits.parameters.shape[1]
+    apart = np.abs(fits.parameters[rows, :, 3] - turns[:, None])
+    apart[np.arange(most) >= fits.used[rows, None]] = np.inf
+    fits_in: BoolArray = (apart.min(axis=1) > c.APART * np.pi) & (fits.used[rows] < most)
+    rows, turns = rows[fits_in], turns[fits_in]
+    fits.parameters[rows, fits.used[rows]] = 0.0
+    fits.parameters[rows, fits.used[rows], 3] = turns
+    fits.used[rows] += 1
+    return fits_in
+
+
+def _tested(residuals: Array, fits: _Fits, rows: IndexArray) -> _Tests:
+    left = whiten(residuals, PARAMETERS * fits.used[rows] + 1)
+    change, cube = np.full((2, rows.size, fits.parameters.shape[1]), np.nan)
+    find_changes(left.white, left.filters, fits.parameters[rows], fits.used[rows], change, cube)
+    return _Tests(left._replace(white=np.empty((rows.size, 0))), strongest_lines(left), change, cube)
+
+
+def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
+    """Return tests with those of some windows replaced."""
+    for fields, values in zip((old.left, old.lines, (old.change, old.cube)), (*new[:2], new[2:]), strict=True):
+        for field, value in zip(fields, values, strict=True):
+            field[rows] = value
+    return old
+
+
+def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
+    """Turn parameters over the window into numbers per sample, with standard errors by the noise near each tone."""
+    half = 0.5 * (length - 1)
+    empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
+    cosine, sine, growth, turn, bend = np.where(empty, np.nan, fits.parameters.transpose(2, 0, 1))
+    noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
+    amplitude = np.hypot(cosine, sine)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        errors = np.sqrt(noise[:, :, None] * fits.variances)
+        # A phase c P3(u), P3 = (5 u^3 - 3 u)/2, takes 3/2 c from the slope of the phase at u = 0; its mean square is
+        # c^2/7, and the residual is turned back by a tone of unit amplitude, whose mean square is 1/2.
+        per_unit = 1.5 * np.sqrt(noise) / amplitude / half
+        bent, uncertain = 2.0 * tests.cube / (length / 7.0) * per_unit, np.sqrt(14.0 / length) * per_unit
+    chances = np.minimum(1.0, c.CHANGE_TAIL * 2.0 * tests.change * np.exp(-tests.change))
+    return WindowTones(
+        middle=np.asarray(fits.first + half, dtype=np.float64),
+        omega=turn / half,
+        omega_error=errors[:, :, 3] / half,
+        amplitude=amplitude,
+        amplitude_error=np.sqrt(0.5 * (errors[:, :, 0] ** 2 + errors[:, :, 1] ** 2)),
+        phase=np.arctan2(-sine, cosine),
+        growth=growth / half,
+        rate=2.0 * bend / half**2,
+        rate_error=2.0 * errors[:, :, 4] / half**2,
+        bend=bent,
+        bend_error=uncertain,
+        change_chance=chances,
+        change_energy=tests.change,
+        line_chance=tests.lines.chance,
+        line=tests.lines.omega,
+        line_energy=tests.lines.height,
+        converged=fits.converged,
+    )

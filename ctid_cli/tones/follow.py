@@ -1,0 +1,163 @@
+"""Tones over time: of each instant the longest sound windows, followed from each instant to the next."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.tones import constants as c
+from ctid_cli.tones.check import Readings, moving, readings_of
+from ctid_cli.tones.find import floor_bins
+from ctid_cli.tones.fit import WindowTones, fit_tones, nearest
+from ctid_cli.tones.kernels import PARAMETERS, keep_readings
+
+
+def readings_at(
+    samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
+) -> Readings:
+    """Return the tones of a signal at some places [samples], ascending: of each that of its longest sound window."""
+    parts: list[Readings] = []
+    tones: WindowTones | None = None
+    lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]
+    for done, (length, first) in enumerate(zip(lengths, _windows(lengths, samples.size, places), strict=True)):
+        if tell is not None:
+            tell(done, len(lengths))
+        tones = fit_tones(samples, length, first, c.MOST_LINES, tones)
+        parts.append(readings_of(tones, length, places))
+    # The longest windows first, and of those of one length the one whose middle is nearest.
+    found = Readings(*(np.concatenate(each) for each in zip(*parts[::-1], strict=True)))
+    found = found.at(np.argsort(found.row, kind="stable"))
+    bounds = np.searchsorted(found.row, np.arange(places.size + 1))
+    kept = keep_readings(
+        found.omega, found.error, found.window, bounds, c.SAME_BINS, c.SAME_ERRORS, moving(found, bounds)
+    )
+    found = found.at(np.flatnonzero(kept))
+    return found.at(np.lexsort((found.omega, found.row)))
+
+
+def _windows(lengths: list[int], count: int, places: Array) -> list[IndexArray]:
+    """Return the first samples of the windows of each length that are read at any place, or where others start.
+
+    Where places are far apart, most of the short windows lie between them.
+    """
+    chosen: list[IndexArray] = []
+    longer: Array = np.empty(0)
+    for length in reversed(lengths):
+        first = np.unique(np.append(np.arange(0, count - length + 1, length // c.HOPS), count - length))
+        wanted = np.searchsorted(places, first + length - 0.5) > np.searchsorted(places, first - 0.5)
+        wanted[nearest(first + 0.5 * (length - 1), longer)] = True
+        chosen.append(first[wanted])
+        longer = np.asarray(chosen[-1] + 0.5 * (length - 1), dtype=np.float64)
+    return chosen[::-1]
+
+
+@dataclass
+class _Path:
+    """Readings of one tone, ascending in time, and the row of the last one."""
+
+    readings: list[int] = field(default_factory=list)
+    last: int = 0
+
+
+def paths_of(found: Readings, places: Array) -> list[IndexArray]:
+    """Return the readings of each tone, the strongest tone first."""
+    step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
+    paths = _joined(_followed(found, places, step), found, places.size)
+    paths = [path for path in paths if _described(found, path, places, step)]
+    # What lasts counts more than what is loud for a moment.
+    return _merged(sorted(paths, key=lambda path: -path.size * float(np.median(found.amplitude[path]))), found)
+
+
+def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
+    """Join paths whose median frequencies are within one bin of their windows: the rows of the stronger one count."""
+    merged: list[IndexArray] = []
+    for path in paths:
+        for k, other in enumerate(merged):
+            apart = abs(float(np.median(found.omega[path]) - np.median(found.omega[other])))
+            window = min(float(np.median(found.window[path])), float(np.median(found.window[other])))
+            if apart * window < 2.0 * np.pi:
+                new = path[~np.isin(found.row[path], found.row[other])]
+                both = np.concatenate((other, new))
+                merged[k] = both[np.argsort(found.row[both], kind="stable")]
+                break
+        else:
+            merged.append(path)
+    return merged
+
+
+def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
+    """Pair readings of adjacent rows so that the sum of their misfits is least."""
+    ended: list[_Path] = []
+    open_: list[_Path] = []
+    bounds = np.searchsorted(found.row, np.arange(places.size + 1))
+    for row in range(places.size):
+        still = [p for p in open_ if row - p.last <= max(c.PATIENCE, found.window[p.readings[-1]] / step)]
+        ended += [p for p in open_ if p not in still]
+        open_ = still
+        here = np.arange(bounds[row], bounds[row + 1])
+        free = np.ones(here.size, np.bool_)
+        if open_ and here.size:
+            before = np.array([p.readings[-1] for p in open_])
+            misfit = np.minimum(_misfit(found, before, here, places), 1.0)
+            for old, new in zip(*linear_sum_assignment(misfit), strict=True):
+                if misfit[old, new] < 1.0:
+                    open_[old].readings.append(int(here[new]))
+                    open_[old].last = row
+                    free[new] = False
+        open_ += [_Path([int(k)], row) for k in here[free]]
+    return [np.array(p.readings) for p in ended + open_]
+
+
+def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array) -> Array:
+    """Return how far readings are off what tones would be by now, as a share of what is allowed, (tones, readings)."""
+    passed = places[found.row[here]][None, :] - places[found.row[before]][:, None]
+    moved = 0.5 * (found.rate[before][:, None] + found.rate[here][None, :]) * passed
+    off = np.abs(found.omega[here][None, :] - found.omega[before][:, None] - moved)
+    bin_ = 2.0 * np.pi / np.minimum(found.window[before][:, None], found.window[here][None, :])
+    errors = np.hypot(found.error[before][:, None], found.error[here][None, :])
+    return np.asarray(off / np.maximum(c.GATE_BINS * bin_, c.GATE_ERRORS * errors))
+
+
+def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexArray]:
+    """Put the pieces of one tone together, the nearest pieces first."""
+    ends = np.array([(found.row[p[0]], found.row[p[-1]]) for p in paths]).reshape(-1, 2)
+    omega = np.array([(found.omega[p[0]], found.omega[p[-1]]) for p in paths]).reshape(-1, 2)
+    pause = ends[None, :, 0] - ends[:, None, 1]
+    jump = np.abs(omega[None, :, 0] / omega[:, None, 1] - 1.0)
+    cost = np.where(pause > 0, jump + c.PAUSE * pause / rows, np.inf)
+    after: dict[int, int] = {}
+    taken: set[int] = set()
+    for pair in np.argsort(cost, axis=None):
+        a, b = divmod(int(pair), len(paths))
+        if not cost[a, b] < c.LARGEST_JUMP:
+            break
+        if a not in after and b not in taken:
+            after[a] = b
+            taken.add(b)
+    joined = []
+    for k in range(len(paths)):
+        if k in taken:
+            continue
+        pieces = [k]
+        while pieces[-1] in after:
+            pieces.append(after[pieces[-1]])
+        joined.append(np.concatenate([paths[piece] for piece in pieces]))
+    return joined
+
+
+def _described(found: Readings, path: IndexArray, places: Array, step: float) -> bool:
+    """Return whether a tone lasts for one of its windows, and is worth its parameters and the place of its window.
+
+    That is the minimum description length of a tone of a signal.
+    """
+    sure = found.resolved[path] & found.significant[path] & (found.error[path] < c.COARSE * found.omega[path])
+    window = found.window[path]
+    # The noise beneath a line is uncertain too, as it is for the test that finds lines.
+    known = c.MEDIAN_EFFICIENCY * np.minimum(float(floor_bins(4 * c.FLOOR_BINS)), 0.5 * window)
+    gain = known * np.log1p(0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2 / known)
+    worth = gain > 0.5 * PARAMETERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))
+    long_enough = np.minimum(window, places[-1] - places[0])
+    lasting = places[found.row[path[-1]]] - places[found.row[path[0]]] + 2.0 * step >= long_enough
+    return bool((sure & worth & lasting).any())

@@ -1,0 +1,389 @@
+"""Compiled loops over the samples of windows: the fit of decaying chirps, and changes within a window."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+
+#: Parameters of a tone over u in [-1, 1], the window: amplitudes a and b of ``exp(g u) (a cos + b sin)(w u + c u^2)``,
+#: then g, w and c.
+PARAMETERS = 5
+#: Products of tones this many bins apart sum up to nearly nothing and are left out of the normal equations.
+SEPARATE_BINS = 8.0
+#: Samples that are taken together, few enough for the nearest cache: the loops over them have no dependence.
+CHUNK = 128
+#: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
+STAGES = ((2, 1), (4, 4), (PARAMETERS, 30))
+#: Largest logarithmic growth over half a window, and phase that is bent over half a window [rad].
+MOST_GROWTH = 4.0
+MOST_BEND = 1e4
+#: A stage ends when a step would lower the sum of squares by less than this share of one sample's, or changes no
+#: phase by more than this [rad] and no amplitude by more than this share.
+SMALL_GAIN = 1e-3
+SMALL_STEP = 1e-9
+#: Longest step of a phase over half a window [rad]; longer ones may end in any of the minima.
+LONGEST_STEP = 2.0
+#: Marquardt's damping in units of the diagonal: first value, factors, and where it gives up.
+DAMPING = 1e-4
+RAISED = 10.0
+LOWERED = 0.1
+LEAST_DAMPING = 1e-12
+MOST_DAMPING = 1e6
+#: Added to the diagonal before a covariance is computed, as a share of it.
+RIDGE = 1e-13
+#: A change is looked for in the middle of the window, without this share at each end.
+ENDS = 0.05
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _product(one: Array, other: Array, count: int) -> float:
+    total = 0.0
+    for j in range(count):
+        total += one[j] * other[j]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _first_phasors(tone: Array, du: float, phasors: Array) -> complex:
+    """Fill in the phasors of the first chunk and their factors to the next one, and return the factor of those."""
+    growth, turn, bend = tone[2], tone[3], tone[4]
+    chunk = phasors.shape[1]
+    ahead = chunk * du
+    # phi(u + d) - phi(u) = w d + c (2 u d + d^2), at u = -1 to the next sample, and to the next chunk
+    z = np.exp(complex(-growth, bend - turn))
+    q = np.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
+    p = np.exp(complex(0.0, 2.0 * bend * du * du))
+    leap = np.exp(complex(growth * ahead, turn * ahead + bend * (ahead * ahead - 2.0 * ahead)))
+    longer = np.exp(complex(0.0, 2.0 * bend * ahead * du))
+    for j in range(chunk):
+        phasors[0, j], phasors[1, j] = z.real, z.imag
+        phasors[2, j], phasors[3, j] = leap.real, leap.imag
+        z *= q
+        q *= p
+        leap *= longer
+    return complex(np.exp(complex(0.0, 2.0 * bend * ahead * ahead)))
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _take_tone(tone: Array, phasors: Array, there: Array, u: Array, rows: Array, left: Array) -> None:
+    """Take a tone from what is left of a chunk; ``rows`` are its derivatives by its parameters.
+
+    Short loops over few arrays each, which the compiler turns into vector instructions.
+    """
+    real, imag = phasors[0], phasors[1]
+    of_cosine, of_sine, of_growth, of_turn, of_bend = rows[0], rows[1], rows[2], rows[3], rows[4]
+    cosine, sine = tone[0], tone[1]
+    for j in range(left.size):
+        of_cosine[j] = there[j] * real[j]
+        of_sine[j] = there[j] * imag[j]
+    for j in range(left.size):
+        left[j] -= cosine * of_cosine[j] + sine * of_sine[j]
+    for j in range(left.size):
+        of_growth[j] = u[j] * (cosine * of_cosine[j] + sine * of_sine[j])
+    for j in range(left.size):
+        of_turn[j] = u[j] * (sine * of_cosine[j] - cosine * of_sine[j])
+    for j in range(left.size):
+        of_bend[j] = u[j] * of_turn[j]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _turn(phasors: Array, further: complex, scratch: Array) -> None:
+    """Turn the phasors of a chunk into those of the next one."""
+    for k in (0, 2):
+        real, imag = phasors[k], phasors[k + 1]
+        by_real, by_imag = phasors[2], phasors[3]
+        if k == 2:
+            for j in range(scratch.size):
+                scratch[j] = real[j] * further.real - imag[j] * further.imag
+            for j in range(scratch.size):
+                imag[j] = real[j] * further.imag + imag[j] * further.real
+        else:
+            for j in range(scratch.size):
+                scratch[j] = real[j] * by_real[j] - imag[j] * by_imag[j]
+            for j in range(scratch.size):
+                imag[j] = real[j] * by_imag[j] + imag[j] * by_real[j]
+        for j in range(scratch.size):
+            real[j] = scratch[j]
+
+
+@njit(cache=True, nogil=True)
+def _equations(
+    y: Array, there: Array, tones: Array, constant: float, gram: Array, right: Array, left: Array, work: Array
+) -> float:
+    """Normal equations ``gram step = right`` of all parameters, the constant last; what is left, and its squares."""
+    length, n = y.size, tones.shape[0]
+    last = PARAMETERS * n
+    chunk = work.shape[1]
+    rows, phasors, u, scratch = work[: last + 1], work[last + 1 : last + 1 + 4 * n], work[-2], work[-1]
+    du = 2.0 / (length - 1)
+    further = np.empty(n, np.complex128)
+    for k in range(n):
+        further[k] = _first_phasors(tones[k], du, phasors[4 * k : 4 * k + 4])
+    gram[: last + 1, : last + 1] = 0.0
+    right[: last + 1] = 0.0
+    total = 0.0
+    for first in range(0, length, chunk):
+        here = min(chunk, length - first)
+        known, rest = there[first : first + here], left[first : first + here]
+        for j in range(here):
+            u[j] = (first + j) * du - 1.0
+            rest[j] = y[first + j] - constant * known[j]
+        for k in range(n):
+            of_tone = rows[PARAMETERS * k : PARAMETERS * (k + 1)]
+            _take_tone(tones[k], phasors[4 * k : 4 * k + 4], known, u, of_tone, rest)
+            if first + chunk < length:
+                _turn(phasors[4 * k : 4 * k + 4], further[k], scratch)
+        rows[last, :here] = known
+        total += _product(rest, rest, here)
+        for a in range(last + 1):
+            right[a] += _product(rows[a], rest, here)
+        gram[last, last] += _product(known, known, here)
+        for k in range(n):
+            wide = SEPARATE_BINS * math.pi + 2.0 * abs(tones[k, 4])
+            if abs(tones[k, 3]) < wide:
+                for a in range(PARAMETERS * k, PARAMETERS * (k + 1)):
+                    gram[last, a] += _product(rows[a], known, here)
+            for m in range(k + 1):
+                if abs(tones[k, 3] - tones[m, 3]) >= wide + 2.0 * abs(tones[m, 4]):
+                    continue
+                for a in range(PARAMETERS * k, PARAMETERS * (k + 1)):
+                    for b in range(PARAMETERS * m, min(PARAMETERS * (m + 1), a + 1)):
+                        gram[a, b] += _product(rows[a], rows[b], here)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _factorise(gram: Array, free: int, ridge: float, factor: Array, scales: Array) -> bool:
+    """Compute the Cholesky factor of the equations of the free parameters, scaled to a unit diagonal."""
+    n = scales.size
+    for i in range(n):
+        scales[i] = 1.0
+        if i == n - 1 or i % PARAMETERS < free:
+            scales[i] = math.sqrt(gram[i, i])
+            if not (math.isfinite(scales[i]) and scales[i] > 0.0):
+                return False
+    for i in range(n):
+        fixed = i < n - 1 and i % PARAMETERS >= free
+        for j in range(i + 1):
+            if fixed or (j < n - 1 and j % PARAMETERS >= free):
+                factor[i, j] = 1.0 if i == j else 0.0
+                continue
+            total = gram[i, j] / (scales[i] * scales[j]) + (ridge if i == j else 0.0)
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > 4e-16 * n:
+                factor[i, i] = math.sqrt(total)
+            else:
+                # What is left of a column that the others explain is rounding: not positive definite.
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _solve(factor: Array, scales: Array, right: Array, free: int, step: Array) -> None:
+    """Solve the scaled equations; the step of a parameter that is not free is zero."""
+    n = scales.size
+    for i in range(n):
+        total = right[i] / scales[i] if i == n - 1 or i % PARAMETERS < free else 0.0
+        for k in range(i):
+            total -= factor[i, k] * step[k]
+        step[i] = total / factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            step[i] -= factor[k, i] * step[k]
+        step[i] /= factor[i, i]
+    for i in range(n):
+        step[i] /= scales[i]
+
+
+@njit(cache=True, nogil=True)
+def _variances(gram: Array, factor: Array, scales: Array, variances: Array) -> None:
+    """Compute the diagonal of the inverse of the equations, from the columns of the inverse of their factor."""
+    size = scales.size
+    known = _factorise(gram, PARAMETERS, RIDGE, factor, scales)
+    column = np.zeros(size)
+    for a in range(size - 1):
+        total = 0.0
+        for i in range(a, size if known else a):
+            value = 1.0 if i == a else 0.0
+            for k in range(a, i):
+                value -= factor[i, k] * column[k]
+            column[i] = value / factor[i, i]
+            total += column[i] * column[i]
+        variances[a // PARAMETERS, a % PARAMETERS] = total / scales[a] ** 2 if known else np.nan
+
+
+@njit(cache=True, nogil=True)
+def fit_windows(
+    samples: Array,
+    length: int,
+    first: IndexArray,
+    chosen: IndexArray,
+    used: IndexArray,
+    parameters: Array,
+    variances: Array,
+    converged: BoolArray,
+    residuals: Array,
+) -> None:
+    """Fit the tones of some windows by Levenberg-Marquardt steps, starting from the parameters that they have.
+
+    ``parameters`` and ``variances``, these in units of the noise variance, are of shape (R, n, 5); what is left goes to
+    ``residuals``, shape (R, L).
+    """
+    most = PARAMETERS * parameters.shape[1] + 1
+    gram, trial_gram = np.zeros((2, most, most))
+    right, trial_right, step = np.zeros((3, most))
+    left, trial_left, y, there = np.empty((4, length))
+    factor, scales = np.zeros((most, most)), np.ones(most)
+    work = np.zeros((most + 4 * parameters.shape[1] + 2, min(CHUNK, length)))
+    for row in chosen:
+        n = used[row]
+        tones = parameters[row, :n]
+        size = PARAMETERS * n + 1
+        constant, count = 0.0, 0.0
+        for j in range(length):
+            value = samples[first[row] + j]
+            there[j] = 0.0 if math.isnan(value) else 1.0
+            y[j] = 0.0 if math.isnan(value) else value
+            constant += y[j]
+            count += there[j]
+        converged[row] = False
+        if count <= size:
+            residuals[row] = np.nan
+            continue
+        constant /= count
+        cost = _equations(y, there, tones, constant, gram, right, left, work)
+        trial = np.empty_like(tones)
+        for free, steps in STAGES:
+            damping, taken, done = DAMPING, 0, False
+            while taken < steps and not done:
+                if damping > MOST_DAMPING:
+                    done = True
+                elif _factorise(gram, free, damping, factor, scales[:size]):
+                    _solve(factor, scales[:size], right, free, step)
+                    gain, largest, turned = step[size - 1] * right[size - 1], 0.0, 0.0
+                    for k in range(n):
+                        height = math.hypot(tones[k, 0], tones[k, 1]) + 1e-300
+                        for j in range(PARAMETERS):
+                            gain += step[PARAMETERS * k + j] * right[PARAMETERS * k + j]
+                            trial[k, j] = tones[k, j] + step[PARAMETERS * k + j]
+                        trial[k, 2] = min(max(trial[k, 2], -MOST_GROWTH), MOST_GROWTH)
+                        trial[k, 4] = min(max(trial[k, 4], -MOST_BEND), MOST_BEND)
+                        for j in range(PARAMETERS):
+                            moved = abs(trial[k, j] - tones[k, j])
+                            largest = max(largest, moved / height if j < 2 else moved)
+                            turned = max(turned, 0.0 if j < 2 else moved)
+                    level = constant + step[size - 1]
+                    if gain <= SMALL_GAIN * cost / count or largest <= SMALL_STEP:
+                        done = True
+                    elif turned < LONGEST_STEP:
+                        lower = _equations(y, there, trial, level, trial_gram, trial_right, trial_left, work)
+                        if lower <= cost:
+                            # Nearly every step is taken: its equations are those of the next one.
+                            tones[:] = trial
+                            constant, cost, taken = level, lower, taken + 1
+                            gram, trial_gram = trial_gram, gram
+                            right, trial_right = trial_right, right
+                            left, trial_left = trial_left, left
+                            damping = max(damping * LOWERED, LEAST_DAMPING)
+                            continue
+                    damping *= RAISED
+                else:
+                    damping *= RAISED
+            converged[row] = done
+        for j in range(length):
+            residuals[row, j] = left[j] if there[j] else np.nan
+        _variances(gram, factor, scales[:size], variances[row])
+
+
+@njit(cache=True, nogil=True)
+def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArray, energy: Array, cube: Array) -> None:
+    """Measure how much the tones of each window seem to change within it.
+
+    ``energy``, shape (R, n), is the largest sum of squares that a change of phase and amplitude at one instant would
+    take from a whitened residual, in units of the noise. Of noise, the sum of the demodulated residual up to an instant
+    has what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n), is the sum of
+    the demodulated residual's quadrature times ``P3(u)``.
+    """
+    length = white.shape[1]
+    begin = max(1, int(ENDS * length))
+    # Integrals of the orthonormal Legendre polynomials from -1 to v, squared.
+    of_amplitude, of_phase = np.empty(length), np.empty(length)
+    for i in range(length):
+        x = (i + 1) / length
+        v = 2.0 * x - 1.0
+        of_amplitude[i] = 1.0 / (length * (x - x * x - 3.0 * (0.25 * (v * v - 1.0)) ** 2) + 1e-300)
+        of_phase[i] = 1.0 / (1.0 / of_amplitude[i] - length * 5.0 * (0.25 * (v**3 - v)) ** 2 + 1e-300)
+    du = 2.0 / (length - 1)
+    for row in range(white.shape[0]):
+        for k in range(used[row]):
+            cosine, sine = parameters[row, k, 0], parameters[row, k, 1]
+            turn, bend = parameters[row, k, 3], parameters[row, k, 4]
+            response = 0.0j
+            for lag in range(filters.shape[1]):
+                response += filters[row, lag] * np.exp(complex(0.0, -turn * du * lag))
+            phase = math.atan2(-sine, cosine) + math.atan2(response.imag, response.real)
+            z = np.exp(complex(0.0, turn - bend - phase))
+            q = np.exp(complex(0.0, -turn * du - bend * (du * du - 2.0 * du)))
+            p = np.exp(complex(0.0, -2.0 * bend * du * du))
+            real, imag, largest, third = 0.0, 0.0, 0.0, 0.0
+            for i in range(length):
+                u = du * i - 1.0
+                value = white[row, i]
+                real += value * z.real
+                imag += value * z.imag
+                third += value * z.imag * 0.5 * (5.0 * u * u - 3.0) * u
+                if begin <= i < length - begin:
+                    largest = max(largest, real * real * of_amplitude[i] + imag * imag * of_phase[i])
+                z *= q
+                q *= p
+            energy[row, k] = largest
+            cube[row, k] = third
+
+
+@njit(cache=True, nogil=True)
+def keep_readings(
+    omega: Array, error: Array, window: IndexArray, bounds: IndexArray, reach: float, errors: float, closed: BoolArray
+) -> NDArray[np.bool_]:
+    """Return which readings of each instant are kept: none that is near to one of a longer, or nearer, window."""
+    kept = np.zeros(omega.size, np.bool_)
+    for row in range(bounds.size - 1):
+        for best in range(bounds[row], bounds[row + 1]):
+            if closed[best]:
+                continue
+            kept[best] = True
+            for k in range(best, bounds[row + 1]):
+                sure = errors * math.hypot(error[k], error[best])
+                near = abs(omega[k] - omega[best]) < max(reach * 2.0 * math.pi / window[k], sure)
+                closed[k] |= near and not math.isnan(sure)
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def refute(
+    omega: Array,
+    error: Array,
+    window: IndexArray,
+    gap: Array,
+    low: Array,
+    high: Array,
+    bounds: IndexArray,
+    covered: float,
+) -> NDArray[np.bool_]:
+    """Return which readings are lines of a comb where a shorter window shows one tone that is elsewhere."""
+    refuted = np.zeros(omega.size, np.bool_)
+    for row in range(bounds.size - 1):
+        for k in range(bounds[row], bounds[row + 1]):
+            best = -1
+            if gap[k] > 0.0:
+                for j in range(bounds[row], bounds[row + 1]):
+                    shorter = window[j] < window[k] and window[j] * gap[k] < 2.0 * math.pi
+                    if shorter and low[k] < omega[j] < high[k] and (best < 0 or error[j] < error[best]):
+                        best = j
+            refuted[k] = best >= 0 and abs(omega[k] - omega[best]) > covered * error[best]
+    return refuted

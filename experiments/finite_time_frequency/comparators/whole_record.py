@@ -1,0 +1,269 @@
+"""Frequencies of a whole record by ESPRIT and by nonlinear least squares: references for the other estimators."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
+
+from .common import complete_samples, is_certain, require_ordered_bounds, require_positive
+
+#: Rows of ESPRIT's Hankel matrix as a fraction of the samples, and the largest number of them.
+ROWS_FRACTION = 0.4
+MOST_ROWS = 400
+#: More samples than this make a matrix too large to decompose; averages show as much.
+MOST_AVERAGES = 100_000
+#: Singular values below this fraction of the largest are rounding.
+RANK_TOLERANCE = 1e-11
+#: Below this ratio of the singular values the sinusoids cannot be told apart.
+SINGULAR = 1e-10
+#: A residual below this fraction of the signal (root mean squares) is rounding, and may as well be this large.
+ROUNDING = 1e-13
+#: Probability with which white noise alone has a tone that is called one.
+FALSE_TONE = 1e-6
+#: Halvings of a step that raises the cost by more than these fractions of itself and of the signal's square.
+HALVINGS = 20
+COST_ROUNDING = 1e-12
+SIGNAL_ROUNDING = 1e-26
+
+
+@dataclass(frozen=True, kw_only=True)
+class Esprit(FrequencyEstimator):
+    r"""Frequencies of a whole record by ESPRIT.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    averaging : float, default 0.0
+        Blocks of this length are averaged first [s], so that some hundred samples are left; 0 for none. Frequencies
+        must lie below pi over this time.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi over the interval of the averages.
+
+    Notes
+    -----
+    The Hankel matrix of a sum of n sinusoids has rank 2 n, and its column space U satisfies ``U_down = U_up F``, where
+    F has the eigenvalues ``exp(+-j w_i T)``. F is found by least squares from the leading left singular vectors.
+
+    References
+    ----------
+    R. Roy and T. Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques", *IEEE Trans.
+    Acoustics, Speech, and Signal Processing* 37 (1989) 984-995. doi:10.1109/29.32276
+    """
+
+    whole_record: ClassVar[bool] = True
+
+    averaging: float = 0.0
+    lowest_frequency: float = 0.0
+    highest_frequency: float | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.averaging < 0.0:
+            raise DataError(f"averaging must not be negative, not {self.averaging!r}", "averaging")
+        require_ordered_bounds(self)
+
+    def check(self, count, interval):
+        """Refuse averages that hide the frequencies, and records that leave too few of them or too many."""
+        self._blocks(count, interval)
+
+    def _blocks(self, count, interval):
+        """Return samples in an average, rows of the Hankel matrix, and the upper bound of the frequencies [rad/s]."""
+        block = max(1, round(min(self.averaging / interval, float(count))))
+        highest = np.pi / (block * interval)
+        if self.highest_frequency is not None:
+            if self.highest_frequency > highest * (1.0 + 1e-12):
+                shown = f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s"
+                asked = f"highest_frequency is {self.highest_frequency:g} rad/s"
+                remedy = f"use an averaging below {np.pi / self.highest_frequency:g} s"
+                raise DataError(f"{shown}, but {asked}; {remedy}", "averaging")
+            highest = self.highest_frequency
+        averages = count // block
+        rows = min(int(ROWS_FRACTION * averages), MOST_ROWS)
+        if rows < 2 * self.tones + 1:
+            few = f"{averages} samples, after the averaging, are too few for {self.tones} tones"
+            raise DataError(f"{few}; use a longer record or a shorter averaging", "averaging")
+        if averages > MOST_AVERAGES:
+            many = f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes"
+            least = f"{count / MOST_AVERAGES * interval:.2g} s"
+            raise DataError(f"{many}; use an averaging of at least {least}, or a part of the record", "averaging")
+        return block, rows, highest
+
+    def track(self, samples, interval):
+        """Return the rotation of the signal space of the averaged record."""
+        y = complete_samples(samples)
+        n = self.tones
+        block, rows, highest = self._blocks(y.size, interval)
+        averages = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
+        hankel = np.lib.stride_tricks.sliding_window_view(averages, averages.size - rows + 1)
+        vectors, singular_values, _ = np.linalg.svd(hankel, full_matrices=False)
+        flags = Flag(0)
+        if not singular_values[2 * n - 1] > RANK_TOLERANCE * singular_values[0]:
+            flags |= Flag.UNDETERMINED
+        basis = vectors[:, : 2 * n]
+        rotations = np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:], rcond=None)[0])
+        angles = np.sort(np.angle(rotations[np.imag(rotations) > 0]))
+        if angles.size < n:
+            # Real eigenvalues: a constant, an alternating or a vanishing part instead of a sinusoid.
+            flags |= Flag.COMPLEX_ROOTS
+            angles = np.sort(np.abs(np.angle(rotations)))[::2]
+        omega = angles / (block * interval)
+        bounded = np.clip(omega, self.lowest_frequency, highest)
+        if (bounded != omega).any():
+            flags |= Flag.OUT_OF_BOUNDS
+        return whole_track(y, interval, bounded, flags)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NonlinearLeastSquares(FrequencyEstimator):
+    r"""Frequencies of a whole record by nonlinear least squares: maximum likelihood in white Gaussian noise.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    initial_frequencies : tuple of float, optional
+        Start [rad/s]; by default that of :class:`Esprit`.
+    averaging : float, default 0.0
+        Blocks that ESPRIT averages for the start [s]; 0 for none.
+    max_iterations : int, default 50
+        Largest number of iterations.
+    tolerance : float, default 1e-8
+        Stop when a step turns no phase by more than this over the record [rad].
+
+    Notes
+    -----
+    Minimises the sum of squares over frequencies and amplitudes. The amplitudes are eliminated in every step (variable
+    projection), and the Gauss-Newton step of the frequencies is halved until it lowers the cost. In white Gaussian
+    noise the estimate reaches the Cramer-Rao bound. The cost has many minima about 2 pi/T apart, T the length of the
+    record, so the start must be close.
+
+    References
+    ----------
+    D. C. Rife and R. R. Boorstyn, "Multiple tone parameter estimation from discrete-time observations", *Bell System
+    Technical Journal* 55 (1976) 1389-1410. doi:10.1002/j.1538-7305.1976.tb02941.x
+    """
+
+    whole_record: ClassVar[bool] = True
+
+    initial_frequencies: tuple[float, ...] | None = None
+    averaging: float = 0.0
+    max_iterations: int = 50
+    tolerance: float = 1e-8
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_positive(self, "max_iterations", "tolerance")
+        self.keep_one_for_each("initial_frequencies", "rad/s")
+        initial = self.initial_frequencies or ()
+        if len(set(initial)) < len(initial):
+            raise DataError(f"initial_frequencies must differ, not {initial!r}", "initial_frequencies")
+
+    @property
+    def start(self):
+        """Estimator of the start."""
+        return Esprit(tones=self.tones, averaging=self.averaging)
+
+    def check(self, count, interval):
+        """Refuse a start that the clock cannot show, and records that are too short."""
+        if self.initial_frequencies is None:
+            self.start.check(count, interval)
+            return
+        highest = np.pi / interval
+        if max(self.initial_frequencies) >= highest:
+            beyond = f"must be below {highest:.4g} rad/s, pi over the sampling interval"
+            raise DataError(f"initial_frequencies {beyond}", "initial_frequencies")
+        if count < 3 * self.tones:
+            raise DataError(f"{count} samples are too few for {self.tones} tones; use a longer record", "tones")
+
+    def track(self, samples, interval):
+        """Return the end of Gauss-Newton steps from the given frequencies, or from those of ESPRIT."""
+        y = complete_samples(samples)
+        self.check(y.size, interval)
+        flags = Flag(0)
+        omega = np.sort(self.initial_frequencies or self.start.track(y, interval).frequencies[0])
+        t = centred_times(y.size, interval)
+        negligible = SIGNAL_ROUNDING * float(y @ y)
+        try:
+            step, _, cost = frequency_step(y, t, omega)
+            for _ in range(self.max_iterations):
+                if np.abs(step).max() * (t[-1] - t[0]) <= self.tolerance:
+                    break
+                for _ in range(HALVINGS):
+                    trial = omega + step
+                    if (trial > 0).all() and (trial < np.pi / interval).all():
+                        outcome = frequency_step(y, t, trial)
+                        if outcome[2] <= cost * (1.0 + COST_ROUNDING) + negligible:
+                            break
+                    step = 0.5 * step
+                else:
+                    break
+                omega, (step, _, cost) = trial, outcome
+            else:
+                flags |= Flag.NOT_CONVERGED
+        except np.linalg.LinAlgError:
+            flags |= Flag.UNDETERMINED
+        return whole_track(y, interval, np.sort(omega), flags)
+
+
+def centred_times(count, interval):
+    """Return the instants with the middle of the record as origin: sines and cosines are most different there."""
+    return interval * (np.arange(count) - 0.5 * (count - 1))
+
+
+def fit_amplitudes(y, t, omega):
+    """Return sines and cosines, their coefficients by least squares, and the residual."""
+    angles = t[:, None] * omega
+    design = np.hstack([np.sin(angles), np.cos(angles)])
+    coefficients, _, _, singular_values = np.linalg.lstsq(design, y, rcond=None)
+    if singular_values[-1] < SINGULAR * singular_values[0]:
+        raise np.linalg.LinAlgError("the samples cannot tell the sinusoids apart")
+    return design, coefficients, y - design @ coefficients
+
+
+def frequency_step(y, t, omega):
+    """Return the Gauss-Newton step of the frequencies, the error that the residual can make, and its square."""
+    n = omega.size
+    design, coefficients, residual = fit_amplitudes(y, t, omega)
+    slopes = t[:, None] * (design[:, n:] * coefficients[:n] - design[:, :n] * coefficients[n:])
+    # What of the slopes the amplitudes cannot follow.
+    orthogonal, _ = np.linalg.qr(design)
+    slopes -= orthogonal @ (orthogonal.T @ slopes)
+    cost, scales = float(residual @ residual), np.linalg.norm(slopes, axis=0)
+    if not (scales > 0).all():
+        return np.zeros(n), np.full(n, np.inf), cost
+    q, r = np.linalg.qr(slopes / scales)
+    if np.abs(np.diag(r)).min() < SINGULAR:
+        return np.zeros(n), np.full(n, np.inf), cost
+    inverse = np.linalg.inv(r)
+    error = np.linalg.norm(inverse, axis=1) / scales * np.sqrt(cost + ROUNDING**2 * float(y @ y))
+    return inverse @ (q.T @ residual) / scales, error, cost
+
+
+def whole_track(y, interval, omega, flags):
+    """Return the track of one row, with the flags that possible errors and amplitudes call for.
+
+    The weakest tone is compared with the strongest that white noise of the residual's size would seem to have: each of
+    the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the probability
+    ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic analysis", *Proc.
+    Royal Society A* 125 (1929) 54-59, for many samples).
+    """
+    n, t = omega.size, centred_times(y.size, interval)
+    try:
+        _, error, _ = frequency_step(y, t, omega)
+        _, coefficients, residual = fit_amplitudes(y, t, omega)
+    except np.linalg.LinAlgError:
+        flags |= Flag.UNDETERMINED | Flag.UNCERTAIN
+    else:
+        length = t[-1] - t[0]
+        if not is_certain(omega[None, :], error[None, :], length, length)[0]:
+            flags |= Flag.UNCERTAIN
+        variance = float(residual @ residual) / max(y.size - 3 * n, 1)
+        weakest = float((coefficients[:n] ** 2 + coefficients[n:] ** 2).min())
+        if not weakest > 4.0 * variance / y.size * np.log(0.5 * y.size / FALSE_TONE):
+            flags |= Flag.UNDETERMINED
+    return FrequencyTrack(np.array([(y.size - 1) * interval]), omega[None, :], np.array([int(flags)], np.uint16))

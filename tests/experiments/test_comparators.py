@@ -1,0 +1,211 @@
+"""The comparators of the frequency study: against SciPy and plain formulas, their convergence, and what they refuse."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from ctid_cli import DataError, Flag
+from ctid_cli.custom_code import STUDIES, find_class
+from ctid_cli.specification.load import spec_from_canonical
+from ctid_cli.studies.catalogue import find_study
+from tests.frequency.signals import INTERVAL, OMEGA, tones
+
+STUDY = find_study("finite-time-frequency")
+COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
+#: Loaded as specifications load them: Numba's caches know the modules by the names that they have then.
+Observer, Filter, Esprit, Nonlinear = (
+    find_class(f"./{kind}", COMPARATORS)
+    for kind in (
+        *("adaptive_observer.py:AdaptiveObserver", "filter_regression.py:FilterRegression"),
+        *("whole_record.py:Esprit", "whole_record.py:NonlinearLeastSquares"),
+    )
+)
+observer, regression, whole = (sys.modules[each.__module__] for each in (Observer, Filter, Esprit))
+T = INTERVAL * np.arange(4000)
+NOISE = np.random.default_rng(0).standard_normal(T.size)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_rows_are_derivatives_of_the_filtered_signal(n):
+    # At s = j w: w_j = (l/(s + l))^j y, and row k is (-1)^(k + 1) s^(2 (n - k)) w_2n, the last s^(2 n) w_2n.
+    pole, s = 3.0, 1.7j
+    chain = (pole / (s + pole)) ** np.arange(2 * n + 1)
+    rows = regression.derivative_rows(n, pole) @ chain
+    powers = [(-1) ** (k + 1) * s ** (2 * (n - k)) for k in range(1, n + 1)] + [s ** (2 * n)]
+    np.testing.assert_allclose(rows, np.array(powers) * chain[-1], rtol=1e-12)
+
+
+def test_chain_is_that_of_scipy_for_a_linearly_held_signal():
+    y = tones(2, 600).sum(axis=1)
+    chain = regression.filter_chain(y, 3.0, 4, INTERVAL)
+    for order in range(1, 5):
+        system = signal.lti([3.0**order], np.poly(np.full(order, -3.0)))
+        _, expected, _ = signal.lsim(system, y, INTERVAL * np.arange(y.size))
+        np.testing.assert_allclose(chain[:, order], expected, atol=1e-9)
+
+
+def test_the_gradient_is_implicit_and_normalised():
+    rows = np.random.default_rng(1).standard_normal((50, 3))
+    gains, found = np.array([2.0, 0.5]), np.array([1.0, -1.0])
+    for row in rows:
+        phi, error = row[:2], row[2] - row[:2] @ found
+        found = found + gains * phi * error / (1.0 + phi @ (gains * phi))
+    last = regression.descend(rows, gains, np.array([1.0, -1.0]))[-1]
+    np.testing.assert_allclose(last, found, rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_the_filter_converges_with_the_square_of_the_interval(n):
+    errors = []
+    for finer in (1, 2):
+        y = tones(n, 12_000 * finer, INTERVAL / finer).sum(axis=1)
+        track = Filter(tones=n, pole=3.0).track(y, INTERVAL / finer)
+        errors.append(np.abs(track.frequencies[-1] - OMEGA[n]).max())
+        assert track.valid[-3000 * finer :].all()
+    # Lines between the samples are all that is wrong with it.
+    assert errors[0] < 1e-3
+    assert 3.0 < errors[0] / errors[1] < 9.0
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_the_observer_has_the_poles_that_were_asked_for(n):
+    squares, poles, gains = OMEGA[n] ** 2, 2.0 * 1.2 ** np.arange(2 * n), np.empty(2 * n)
+    observer.place_poles(squares, poles, gains)
+    # The derivative of a unit state is a column of the closed-loop matrix.
+    matrix, slope = np.empty((2 * n, 2 * n)), np.empty((n + 1, 2 * n))
+    for k in range(2 * n):
+        states = np.zeros((n + 1, 2 * n))
+        states[0, k] = 1.0
+        observer.observer_slope(states, 0.0, squares, gains, slope)
+        matrix[:, k] = slope[0]
+    assert np.poly(matrix) == pytest.approx(np.poly(-poles), rel=1e-8)
+
+
+def test_sensitivities_are_derivatives_of_the_observer():
+    rng = np.random.default_rng(0)
+    squares, gains = OMEGA[2] ** 2, rng.standard_normal(4)
+    states = rng.standard_normal((3, 4))
+    slope, plus, minus = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    observer.observer_slope(states, 0.7, squares, gains, slope)
+    for p in range(2):
+        # d/dt of the sensitivity is the change of the slope along (sensitivity, unit change of the square).
+        for sign, out in ((1, plus), (-1, minus)):
+            moved = states.copy()
+            moved[0] += sign * 1e-6 * states[p + 1]
+            observer.observer_slope(moved, 0.7, squares + sign * 1e-6 * np.eye(2)[p], gains, out)
+        np.testing.assert_allclose(slope[p + 1], (plus[0] - minus[0]) / 2e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_observer_converges_from_nearby(n):
+    track = Observer(tones=n, initial_frequencies=tuple(OMEGA[n] + 0.3)).track(tones(n, 9000).sum(axis=1), INTERVAL)
+    assert np.abs(track.frequencies[-1] - OMEGA[n]).max() < 2e-3
+    assert track.valid[-500:].all()
+
+
+def test_the_observer_keeps_its_bounds_and_says_so():
+    options = Observer(tones=2, initial_frequencies=(2.0, 5.0), highest_frequency=6.0)
+    track = options.track(np.sin(9.5 * T), INTERVAL)
+    assert ((track.frequencies >= 0.2) & (track.frequencies <= 6.0)).all()
+    assert (np.diff(track.frequencies, axis=1) >= 0.3 - 1e-12).all()
+    assert (track.flags & Flag.OUT_OF_BOUNDS).any()
+    assert not track.valid.any()
+
+
+@pytest.mark.parametrize("n", range(1, 6))
+def test_whole_records_are_exact_without_noise(n):
+    y = tones(n, 1500).sum(axis=1)
+    for options in (Esprit(tones=n, averaging=0.05), Nonlinear(tones=n, averaging=0.05)):
+        track = options.track(y, INTERVAL)
+        np.testing.assert_allclose(track.frequencies, OMEGA[n][None, :], atol=1e-8)
+        assert track.valid.all()
+
+
+def test_step_and_error_are_those_of_the_whole_jacobian():
+    # Against all unknowns at once: amplitudes and frequencies in one matrix.
+    t, omega = whole.centred_times(400, INTERVAL), OMEGA[2] * 1.01
+    y = tones(2, 400).sum(axis=1) + 0.1 * NOISE[:400]
+    step, error, cost = whole.frequency_step(y, t, omega)
+    angles = np.outer(t, omega)
+    linear = np.column_stack([np.sin(angles), np.cos(angles)])
+    a = np.linalg.lstsq(linear, y, rcond=None)[0]
+    J = np.column_stack([t[:, None] * (np.cos(angles) * a[:2] - np.sin(angles) * a[2:]), linear])
+    residual = y - linear @ a
+    np.testing.assert_allclose(step, np.linalg.lstsq(J, residual, rcond=None)[0][:2], rtol=1e-8)
+    np.testing.assert_allclose(error, np.sqrt(np.diag(np.linalg.inv(J.T @ J))[:2] * cost), rtol=1e-8)
+
+
+NO_TWO_TONES = {
+    "zero": 0 * T,
+    "constant": 0 * T + 2.5,
+    "one tone": np.sin(2 * T),
+    "one tone and noise": np.sin(2 * T) + 0.05 * NOISE,
+    "noise": NOISE,
+    "three tones": np.sin(2 * T) + np.cos(3 * T) + np.sin(4 * T),
+}
+
+
+@pytest.mark.parametrize("name", NO_TWO_TONES)
+@pytest.mark.parametrize(
+    "options", [Filter(tones=2, pole=4.0), Esprit(tones=2, averaging=0.05)], ids=["filter", "whole"]
+)
+def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
+    assert not options.track(NO_TWO_TONES[name], INTERVAL).valid.any()
+
+
+def test_too_few_iterations_are_reported():
+    options = Nonlinear(tones=2, initial_frequencies=(1.1, 1.9), max_iterations=1)
+    track = options.track(tones(2, 1500).sum(axis=1), INTERVAL)
+    assert track.flags[0] & Flag.NOT_CONVERGED
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "field"),
+    [
+        (Observer, {"initial_frequencies": (2.0,)}, "initial_frequencies"),
+        (Observer, {"initial_frequencies": (2.0, 2.1)}, "initial_frequencies"),
+        (Observer, {"initial_frequencies": (2.0, 5.0), "ratio": 0.9}, "ratio"),
+        (Observer, {"initial_frequencies": (2.0, 5.0), "highest_frequency": 0.4}, "highest_frequency"),
+        (Filter, {"pole": 0.0}, "pole"),
+        (Filter, {"pole": 3.0, "gains": (1.0,)}, "gains"),
+        (Filter, {"pole": 3.0, "lowest_frequency": 3.0, "highest_frequency": 2.0}, "lowest_frequency"),
+        (Esprit, {"averaging": -1.0}, "averaging"),
+        (Nonlinear, {"initial_frequencies": (2.0, 2.0)}, "initial_frequencies"),
+    ],
+)
+def test_impossible_options_are_refused(kind, options, field):
+    with pytest.raises((DataError, ValueError)) as error:
+        kind(tones=2, **options)
+    assert error.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("options", "count", "interval", "message"),
+    [
+        (Observer(tones=2, initial_frequencies=(2.0, 5.0)), 1000, 0.5, "fastest pole of the observer, 3.456 rad/s"),
+        (Filter(tones=2, pole=4.0, hold=1e307), 1000, 0.01, "hold = 1e\\+307 s is longer than the record, 10 s"),
+        (Filter(tones=2, pole=320.0), 1000, 0.01, "one below 314.159 rad/s"),
+        (Esprit(tones=2, averaging=29.0), 3000, 0.01, "1 samples, after the averaging, are too few for 2 tones"),
+        (Esprit(tones=1, averaging=1.0, highest_frequency=10.0), 3000, 0.01, "show frequencies up to 3.14159 rad/s"),
+        (Esprit(tones=1), 200_000, 0.01, "200,000 samples are more than the 100,000 .* at least 0.02 s"),
+        (Nonlinear(tones=2, initial_frequencies=(2.0, 5000.0)), 3000, 0.01, "must be below 314.2 rad/s"),
+    ],
+)
+def test_records_that_do_not_fit_are_refused_before_there_are_any(options, count, interval, message):
+    with pytest.raises(DataError, match=message):
+        options.check(count, interval)
+
+
+def test_a_missing_sample_is_refused():
+    with pytest.raises(DataError, match="takes no missing ones"):
+        Esprit(tones=2).track(np.append(np.ones(500), np.nan), INTERVAL)
+
+
+def test_a_step_within_a_whole_record_is_unwise():
+    spec = STUDY.plan(
+        "two-tones", ["signal.tones=[{frequency: [{until: 30, value: 2}, {value: 2.1}]}, {frequency: 3}]"]
+    ).spec
+    assert sum("gives one estimate of the whole record" in warning for warning in spec.warnings) == 2
+    assert spec_from_canonical(spec.canonical(), spec.folder).canonical() == spec.canonical()

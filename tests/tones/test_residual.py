@@ -1,0 +1,92 @@
+"""Lines that the tones of a track leave over."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ctid_cli.tones.condition import find_spikes
+from ctid_cli.tones.constants import SPIKE_AROUND, SPIKE_TIMES, SPIKE_WIDTH
+from ctid_cli.tones.residual import left_over, with_lines_left, without_spikes
+from ctid_cli.tones.track import MissingLine, Track
+from ctid_cli.tones.track import track as follow
+
+INTERVAL = 0.002
+T = INTERVAL * np.arange(10_000)
+NOISE = 0.01 * np.random.default_rng(0).standard_normal(T.size)
+
+
+def tracked(y, tones):
+    return with_lines_left(
+        replace(follow(SimpleNamespace(samples=y, interval=INTERVAL), tones), missing=()), y, INTERVAL
+    )
+
+
+def test_a_second_tone_that_nobody_asked_for_is_named():
+    y = np.sin(2 * np.pi * 60.0 * T) + 0.1 * np.sin(2 * np.pi * 85.0 * T) + NOISE
+    (line,) = tracked(y, 1).missing
+    assert line.omega / (2 * np.pi) == pytest.approx(85.0, abs=0.05)
+    assert line.amplitude == pytest.approx(0.1, rel=0.05)
+    assert tracked(y, 2).missing == ()
+
+
+def test_a_tone_that_moves_leaves_no_line_beside_itself():
+    y = np.sin(2 * np.pi * (60.0 * T + 0.2 * T**2)) + NOISE
+    assert tracked(y, 1).missing == ()
+
+
+def test_a_method_that_names_lines_itself_is_believed():
+    lines = (MissingLine(300.0, 1.0, 0.1),)
+    track = Track.of(T[:3], np.full((3, 1), 100.0), np.zeros(3, np.uint16), INTERVAL, missing=lines)
+    assert with_lines_left(track, NOISE, INTERVAL) is track
+
+
+def test_where_nothing_is_known_nothing_is_named():
+    track = Track.of(T[:3], np.full((3, 1), 100.0), np.zeros(3, np.uint16), INTERVAL)
+    assert with_lines_left(track, NOISE, INTERVAL).missing == ()
+
+
+def test_a_spike_is_not_what_the_tones_leave():
+    y = np.sin(2 * np.pi * 60.0 * T) + NOISE
+    track = follow(SimpleNamespace(samples=y, interval=INTERVAL), 1)
+    y[4000] = 1e6
+    left = left_over(y, INTERVAL, track)
+    assert left.unknown[4000]
+    assert np.abs(left.residual[~left.unknown]).max() < 0.1
+
+
+def found_one_by_one(samples):
+    size = np.abs(samples - np.median(samples))
+    spikes = np.zeros(size.size, bool)
+    for k in range(size.size):
+        before = size[max(0, k - SPIKE_WIDTH - SPIKE_AROUND) : max(0, k - SPIKE_WIDTH)]
+        after = size[k + SPIKE_WIDTH + 1 :][:SPIKE_AROUND]
+        around = max(before.max(initial=0.0), after.max(initial=0.0))
+        spikes[k] = 0.0 < SPIKE_TIMES * around < size[k]
+    return spikes
+
+
+@pytest.mark.parametrize("turn", [0.003, 0.1, 1.0, 3.0])
+@pytest.mark.parametrize("place", [0, 1, 5, 700, 1495, 1499])
+def test_spikes_are_found_at_every_place(turn, place):
+    y = np.sin(turn * np.arange(1500))
+    assert not find_spikes(y).any()
+    y[place] += 20.0
+    found = find_spikes(y)
+    assert found.tolist() == found_one_by_one(y).tolist()
+    assert found[place]
+    assert np.isnan(without_spikes(y)).tolist() == found.tolist()
+
+
+def test_noise_steps_and_pulses_are_no_spikes():
+    rng = np.random.default_rng(0)
+    assert not find_spikes(rng.standard_normal(20_000)).any()
+    y = np.sin(0.3 * np.arange(2000))
+    y[1000:] *= 50.0
+    assert not find_spikes(y).any()
+    y = 0.01 * rng.standard_normal(4000)
+    y[::70] += 1.0  # pulses are what such a signal is made of
+    assert not find_spikes(y).any()
+    assert not find_spikes(np.full(100, np.nan)).any()
+    assert not find_spikes(np.full(100, 3.0)).any()
