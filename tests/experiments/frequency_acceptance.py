@@ -238,7 +238,9 @@ def efficient(seeds: int = 100, first: int = 2000, interval: float = 0.001, dura
         y = clean + np.random.default_rng(seed).uniform(-0.2, 0.2, t.size)
         estimates = {
             "least squares with prefilter": tracker().track(y, interval).frequencies[-1],
-            "total least squares without": tracker(0.0, solution="total_least_squares").track(y, interval).frequencies[-1],
+            "total least squares without": tracker(0.0, solution="total_least_squares")
+            .track(y, interval)
+            .frequencies[-1],
         }
         for name, omega in estimates.items():
             errors.setdefault(name, []).append(omega - TRUTH)
