@@ -88,6 +88,15 @@ def squared_residual(gram: Array, theta: Array) -> float:
 
 
 @njit(cache=True, nogil=True)
+def size_of(gram: Array, theta: Array) -> float:
+    """Size of the terms that cancel in the residuals, ``|psi| + sum |theta_k| |phi_k|``."""
+    size = np.sqrt(gram[theta.size, theta.size])
+    for k in range(theta.size):
+        size += abs(theta[k]) * np.sqrt(gram[k, k])
+    return float(size)
+
+
+@njit(cache=True, nogil=True)
 def factorise(gram: Array, ridge: float, factor: Array, scales: Array) -> bool:
     """Cholesky factor of the regressors' second moments, scaled to a unit diagonal."""
     n = scales.size
@@ -292,10 +301,7 @@ def flag_uncertain(
     factor, scales, slopes, direction = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
     if not factorise(gram, 0.0, factor, scales):
         return UNDETERMINED
-    # Size of the terms that cancel in a residual: |psi| + sum |theta_k| |phi_k|.
-    size = np.sqrt(gram[n, n])
-    for k in range(n):
-        size += abs(theta[k]) * scales[k]
+    size = size_of(gram, theta)
     misfit, rounded = squared_residual(gram, theta), ROUNDING * size * size
     if misfit < DETERMINED * rounded:
         misfit = min(left, max(misfit, rounded))
@@ -361,7 +367,7 @@ MIXED_NEGLIGIBLE = 1e-4
 #: An estimate is judged by the residuals of so many times n h.
 JUDGED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
-SINCE_VERDICT, VERDICT, SINCE_DOUBT = range(3)
+SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
 
 
 @njit(cache=True, nogil=True)
@@ -420,6 +426,7 @@ def judge_rows(
     spans: Array,
     elapsed: Array,
     clock: Clock,
+    flush: int,
     before: Array,
     levels: Array,
     doubts: IntArray,
@@ -458,14 +465,17 @@ def judge_rows(
                 levels[NEWEST] = 0.0
                 if started:
                     doubts[SINCE_DOUBT] = 0
-            elif not lasts_a_period(omega[k], doubts[SINCE_DOUBT] * clock.interval):
+                if contradicted:
+                    doubts[SINCE_CHANGE] = 0
+            # Rows from before a change must first have left the window.
+            elif doubts[SINCE_CHANGE] < flush or not lasts_a_period(omega[k], doubts[SINCE_DOUBT] * clock.interval):
                 verdict = UNCERTAIN
             verdict |= flag_inconsistent(grams[k, 1], omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
             doubts[VERDICT] = verdict
-            usual = ALARM_RATIO * squared_residual(gram, theta[k]) + ROUNDING_FLOOR * gram[n, n]
-            levels[USUAL] = usual / counts[k]
+            rounded = ROUNDING * size_of(gram, theta[k]) ** 2
+            levels[USUAL] = ALARM_RATIO * max(squared_residual(gram, theta[k]), rounded) / counts[k]
         doubts[SINCE_VERDICT] = (doubts[SINCE_VERDICT] + 1) % clock.every if started else 0
-        doubts[SINCE_DOUBT] += 1
+        doubts[SINCE_DOUBT:] += 1
         flags[k] |= doubts[VERDICT]
 
 

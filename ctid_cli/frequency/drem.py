@@ -257,12 +257,13 @@ class OnlineMixing(Online):
         n = options.tones
         self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
         self._reach = 2 * n * self.clock.lag + int(self._ages[-1]) + 1
+        self._flush = 2 * n * self.clock.lag + window
         self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
         self._enough = min(options.rows_before_valid(self.clock), window)
         self._used = 0
         width = n + 3 + 2 * (n + 1) ** 2
         self._sliding = np.zeros((window, width)), np.zeros(width), np.zeros(1, np.int64)
-        self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50])
+        self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50])
 
     @abstractmethod
     def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
@@ -300,7 +301,7 @@ class OnlineMixing(Online):
         spans, elapsed = (self._reach + support) * interval, (self._reach + used) * interval
         grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
         judged_by = rows, grams, judged, spans, elapsed
-        judge_rows(theta, *judged_by, self.clock, *self._judged, omega, flags)
+        judge_rows(theta, *judged_by, self.clock, self._flush, *self._judged, omega, flags)
 
 
 class OnlineGradient(OnlineMixing):
