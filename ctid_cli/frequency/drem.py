@@ -260,7 +260,7 @@ class OnlineMixing(Online):
         self._flush = 2 * n * self.clock.lag + window
         self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
         self._enough = min(options.rows_before_valid(self.clock), window)
-        self._used = 0
+        self._used = 0.0
         width = n + 3 + 2 * (n + 1) ** 2
         self._sliding = np.zeros((window, width)), np.zeros(width), np.zeros(1, np.int64)
         self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50])
@@ -290,8 +290,8 @@ class OnlineMixing(Online):
         # [Delta Psi, Delta^2, mixed rows, rows, second moments of the rows at h and at the second delay]
         sums = np.empty(entries.shape)
         slide(entries, *self._sliding, sums)
-        used = self._used + np.cumsum(found)
-        self._used = int(used[-1])
+        used = self._used + np.cumsum(found, dtype=float)
+        self._used = used[-1]
         theta, support = self.estimates(mixed, sums, used)
         unexcited = ~(sums[:, n] > 0.0)
         flags[~found & (used > 0)] |= int(Flag.GAP)
@@ -300,8 +300,8 @@ class OnlineMixing(Online):
         interval, judged = self.clock.interval, np.where(unexcited, 0.0, sums[:, n + 2])
         spans, elapsed = (self._reach + support) * interval, (self._reach + used) * interval
         grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
-        judged_by = rows, grams, judged, spans, elapsed
-        judge_rows(theta, *judged_by, self.clock, self._flush, *self._judged, omega, flags)
+        judging = self.clock, self._flush, *self._judged
+        judge_rows(theta, rows, grams, judged, spans, elapsed, *judging, omega, flags)
 
 
 class OnlineGradient(OnlineMixing):

@@ -118,8 +118,8 @@ class OnlineRestarting(Online):
             memory=memory / interval,
             whitener=whitener,
         )
-        moments = np.zeros((3, n + 1, n + 1))
-        self._fit = Fit(*moments, np.full(n, np.nan), np.full(n, np.nan), np.zeros(4), np.zeros(5, np.int64))
+        older, newer, check = np.zeros((3, n + 1, n + 1))
+        self._fit = Fit(older, newer, check, np.full(n, np.nan), np.full(n, np.nan), np.zeros(4), np.zeros(5, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
