@@ -77,7 +77,6 @@ from .estimation.redundancy import RedundantMinimum as RedundantMinimum, minimis
 # Frequencies of signals
 from .frequency.flags import Flag as Flag
 from .frequency.base import FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
-from .frequency.delay_regression import Online as Online
 from .frequency.drem import DremGradient as DremGradient, DremFiniteTime as DremFiniteTime, DremWindow as DremWindow
 from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
 from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
