@@ -8,7 +8,7 @@ import numpy as np
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.frequency.tracking import FrequencyTrack
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting import identification_plot, track_plot
@@ -157,15 +157,15 @@ def _report(result: Any) -> Report:
 def _with_columns(track: FrequencyTrack) -> Track:
     """A track as those of records are."""
     every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
-    return Track.of(track.t, track.omega, track.flags, every)
+    return Track.of(track.t, track.frequencies, track.flags, every)
 
 
 def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:
     import pandas as pd
 
-    tones = range(track.omega.shape[1])
-    columns: dict[str, Any] = {"t": track.t, **{f"omega_{k + 1}": track.omega[:, k] for k in tones}}
-    columns |= {f"frequency_{k + 1}_hz": track.omega[:, k] / (2.0 * np.pi) for k in tones}
+    tones = range(track.frequencies.shape[1])
+    columns: dict[str, Any] = {"t": track.t, **{f"omega_{k + 1}": track.frequencies[:, k] for k in tones}}
+    columns |= {f"frequency_{k + 1}_hz": track.frequencies[:, k] / (2.0 * np.pi) for k in tones}
     columns |= {"valid": track.valid, "flags": [flag_words(int(flags)) for flags in track.flags]}
     return pd.DataFrame(columns).set_index("t")
 

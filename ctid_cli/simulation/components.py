@@ -199,7 +199,7 @@ class Measure(ABC):
         fit : Fit
             The estimate as the estimator returned it. What is returned as a mapping has ``parameters`` and
             ``standard_errors`` by name, and a ``model`` where these make one. An estimate of the frequencies of a
-            signal has ``found``, a `FrequencyTrack` or a `FrequencyEstimate`.
+            signal has ``track``, a `FrequencyTrack`.
         data : DataSet
             What `simulate_dataset` returns: ``record`` and, of one of ctid's systems, ``true_model``.
 
