@@ -3,8 +3,8 @@
     PYTHONPATH=. python benchmarks/bench_engine.py [DATA_SETS [JOBS...]]
 
 Every data set takes 50 ms. The ideal is their sum divided by the number of jobs. The measured time is that of the whole
-command with the workers that are there: looking at the folder, journal with full synchronisation, sealing and reading
-back. The start of the workers, paid once however long the run, is shown apart.
+command with the workers that are there: looking at the folder, journal with full synchronisation, writing runs.h5 and
+reading back. The start of the workers, paid once however long the run, is shown apart.
 
 Two ways to spend 50 ms are measured. Asleep, a worker leaves the processor free, so that only waiting for the engine
 shows. Busy, the engine and whatever else runs on the machine compete with the workers for processors.

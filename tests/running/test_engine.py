@@ -40,7 +40,7 @@ def run(plan: Any, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
     return run_experiment(plan, place, jobs=jobs, warm=lambda plan: None, **options)
 
 
-def sealed(place: Path) -> bytes:
+def exported(place: Path) -> bytes:
     return (place / "runs.h5").read_bytes()
 
 
@@ -101,10 +101,10 @@ def group_is_gone(process: subprocess.Popen[str], within: float) -> bool:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     place = tmp_path_factory.mktemp("undisturbed") / "toys"
     run(run_toys.plan(seconds=0.02), place)
-    return sealed(place)
+    return exported(place)
 
 
-def test_sealed_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exported_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(FakePlan(), tmp_path / "one", jobs=1)
     run(FakePlan(), tmp_path / "two", jobs=2)
     in_order = States.jobs
@@ -116,7 +116,7 @@ def test_sealed_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(States, "jobs", shuffled)
     run(FakePlan(), tmp_path / "shuffled", jobs=2)
-    assert sealed(tmp_path / "one") == sealed(tmp_path / "two") == sealed(tmp_path / "shuffled")
+    assert exported(tmp_path / "one") == exported(tmp_path / "two") == exported(tmp_path / "shuffled")
 
 
 def test_the_longest_of_a_replicate_comes_first() -> None:
@@ -165,10 +165,10 @@ def test_an_estimate_is_reported_only_after_it_is_stored(tmp_path: Path) -> None
 
 def test_a_finished_experiment_is_left_as_it_is(tmp_path: Path) -> None:
     run(FakePlan(), tmp_path)
-    before = sealed(tmp_path)
+    before = exported(tmp_path)
     summary = run_experiment(FakePlan(), tmp_path, warm=lambda plan: pytest.fail("nothing is to be compiled"))  # type: ignore[arg-type]
     assert (summary.computed, summary.reused, summary.missing) == (0, 36, 0)
-    assert sealed(tmp_path) == before
+    assert exported(tmp_path) == before
 
 
 def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
     status = experiment_status(tmp_path)
     assert (status.planned, status.done, status.left_aside) == (8, 8, 10)
     run(FakePlan(Toy(), runs=2), tmp_path / "alone")
-    assert sealed(tmp_path) == sealed(tmp_path / "alone")
+    assert exported(tmp_path) == exported(tmp_path / "alone")
 
 
 def test_two_names_of_one_estimator_share_its_estimates(tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_killed_three_times_and_resumed_gives_the_same_bytes(tmp_path: Path, und
     last = start(place, 1)
     finish(last)
     assert last.returncode == 0
-    assert sealed(place) == undisturbed
+    assert exported(place) == undisturbed
 
 
 def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path) -> None:
@@ -284,7 +284,7 @@ def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_seals_what_is_finished(tmp_path: Path, undisturbed: bytes, number: int, code: int) -> None:
+def test_a_signal_exports_what_is_finished(tmp_path: Path, undisturbed: bytes, number: int, code: int) -> None:
     place = tmp_path / "toys"
     process = start(place, 2)
     reported = read_ids(process, 4)
@@ -298,7 +298,7 @@ def test_a_signal_seals_what_is_finished(tmp_path: Path, undisturbed: bytes, num
     assert 0 < len(frame) < 120
     assert set(frame["status"]) <= {"CONVERGED", "FAILED"}
     run(run_toys.plan(), place)
-    assert sealed(place) == undisturbed
+    assert exported(place) == undisturbed
 
 
 def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path) -> None:
@@ -349,7 +349,7 @@ def newer_format(place: Path) -> None:
     connection.close()
 
 
-@pytest.mark.parametrize("unsealed", [False, True], ids=["sealed", "killed"])
+@pytest.mark.parametrize("killed", [False, True], ids=["complete", "killed"])
 @pytest.mark.parametrize(
     ("plan", "prepare", "message"),
     [
@@ -366,10 +366,10 @@ def test_refused_folders_stay_as_they_are(
     plan: FakePlan,
     prepare: dict[str, str] | Callable[[Path], None] | None,
     message: str,
-    unsealed: bool,
+    killed: bool,
 ) -> None:
     place = tmp_path / "toys"
-    if unsealed:
+    if killed:
         process = start(place, 2)
         read_ids(process, 3)
         os.killpg(process.pid, signal.SIGKILL)
@@ -410,7 +410,7 @@ def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path) -> None:
     finish(process)
 
 
-def test_sealed_results_without_their_journal_are_not_overwritten(tmp_path: Path) -> None:
+def test_exported_results_without_their_journal_are_not_overwritten(tmp_path: Path) -> None:
     run(FakePlan(), tmp_path)
     (tmp_path / "journal.sqlite").unlink()
     before = snapshot(tmp_path)
@@ -423,11 +423,11 @@ def test_sealed_results_without_their_journal_are_not_overwritten(tmp_path: Path
 def test_fresh_moves_the_old_folder_aside(tmp_path: Path) -> None:
     place = tmp_path / "toys"
     run(FakePlan(experiment="other"), place)
-    before = sealed(place)
+    before = exported(place)
     summary = run(FakePlan(), place, fresh=True)
     assert summary.reused == 0
     assert summary.moved_aside is not None
-    assert sealed(summary.moved_aside) == before
+    assert exported(summary.moved_aside) == before
     assert folder.experiment_folders(tmp_path) == [place]
 
 
@@ -466,12 +466,12 @@ def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed
     assert reported <= stored_ids(place)
     assert group_is_gone(process, within=5)
     run(run_toys.plan(), place)
-    assert sealed(place) == undisturbed
+    assert exported(place) == undisturbed
 
 
-def test_a_full_disk_while_sealing_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_while_exporting_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(FakePlan(runs=2), tmp_path)
-    before = sealed(tmp_path)
+    before = exported(tmp_path)
 
     def full(descriptor: int) -> None:
         if "runs.h5" in os.readlink(f"/proc/self/fd/{descriptor}"):
@@ -481,7 +481,7 @@ def test_a_full_disk_while_sealing_keeps_the_old_file(tmp_path: Path, monkeypatc
         patch.setattr(os, "fsync", full)
         with pytest.raises(StorageError, match="all 18 estimates are safe"):
             run(FakePlan(runs=3), tmp_path)
-    assert sealed(tmp_path) == before
+    assert exported(tmp_path) == before
     assert not list(tmp_path.glob("*.tmp"))
     assert len(read_estimates(tmp_path)) == 18
 
@@ -533,7 +533,7 @@ def test_the_shipped_quickstart_gives_the_same_bytes_from_any_number_of_jobs(tmp
     for jobs in (1, 2):
         summary = run_experiment(plan, tmp_path / str(jobs), jobs=jobs)
         assert (summary.missing, summary.failed) == (0, 0)
-    assert sealed(tmp_path / "1") == sealed(tmp_path / "2")
+    assert exported(tmp_path / "1") == exported(tmp_path / "2")
     keys = [key for cell in range(2) for replicate in range(2) for key in plan.job(cell, replicate).keys]
     assert {key.id for key in keys} == set(read_estimates(tmp_path / "1")["id"])
     assert (tmp_path / "1" / "spec.yaml").read_text() == (ROOT / "configs" / "quickstart.yaml").read_text()

@@ -142,7 +142,7 @@ def run(asked: FakePlan, place: Path, jobs: int = 2, **options: Any) -> RunSumma
     return run_experiment(asked, place, jobs=jobs, warm=lambda plan: None, **options)  # type: ignore[arg-type]
 
 
-def sealed(place: Path) -> bytes:
+def exported(place: Path) -> bytes:
     return (place / "runs.h5").read_bytes()
 
 
@@ -197,17 +197,17 @@ def test_neither_workers_nor_interruptions_change_a_byte(
     assert interruptions > 0
     summary = run(plan(), place)
     assert (summary.exit_code, summary.missing) == (0, 0)
-    assert sealed(place) == sealed(undisturbed)
+    assert exported(place) == exported(undisturbed)
     # Once more there is nothing to do.
     assert preview(plan(), place).estimates == 0  # type: ignore[arg-type]
     assert run(plan(), place).computed == 0
-    assert sealed(place) == sealed(undisturbed)
+    assert exported(place) == exported(undisturbed)
 
 
 def test_estimates_of_other_plans_are_used_and_neither_more_nor_fewer(tmp_path: Path, undisturbed: Path) -> None:
     run(plan(runs=30, precision=None), tmp_path)
     summary = run(plan(), tmp_path)
-    assert sealed(tmp_path) == sealed(undisturbed)
+    assert exported(tmp_path) == exported(undisturbed)
     most, fewer = sizes(undisturbed)
     assert summary.reused == 3 * (30 + fewer)
     assert summary.computed == 3 * (most - 30)
