@@ -22,7 +22,6 @@ from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, preview
 from ctid_cli.running.plan import Plan, current_origin
 from ctid_cli.running.states import States
-from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage import folder
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.identity import Origin
@@ -297,23 +296,6 @@ def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path) -> None:
     assert time.monotonic() - began < 10
     assert process.returncode == -signal.SIGINT
     assert group_is_gone(process, within=15)
-
-
-def test_the_callers_event_stops_a_run(tmp_path: Path) -> None:
-    stop = threading.Event()
-    seen: list[Progress] = []
-
-    def stop_soon(progress: Progress) -> None:
-        seen.append(progress)
-        if progress.stored:
-            stop.set()
-
-    summary = run(toy_plan(Toy(seconds=0.05), runs=40), tmp_path, progress=stop_soon, stop=StopRequest(stop))
-    assert summary.stopped_by == "stop"
-    assert summary.exit_code == 5
-    assert 0 < summary.computed < summary.planned
-    assert len(read_estimates(tmp_path)) == summary.computed
-    assert sum(each.message.startswith("stopping (stop)") for each in seen) == 1
 
 
 # Refusals
