@@ -312,6 +312,10 @@ def no_journal(place: Path) -> None:
     (place / "journal.sqlite").unlink()
 
 
+def damaged_journal(place: Path) -> None:
+    os.truncate(place / "journal.sqlite", 4096)
+
+
 def newer_format(place: Path) -> None:
     with sqlite3.connect(place / "journal.sqlite") as connection:
         connection.execute("PRAGMA user_version=99")
@@ -327,6 +331,7 @@ def newer_format(place: Path) -> None:
         (toy_plan(), {"platform": "abacus"}, "--allow-mixed"),
         (toy_plan(runs=9), newer_format, "format 99"),
         (toy_plan(), no_journal, "without the journal"),
+        (toy_plan(), damaged_journal, "is damaged.*--fresh --keep-readable"),
     ],
 )
 def test_refused_folders_stay_as_they_are(
@@ -343,9 +348,9 @@ def test_refused_folders_stay_as_they_are(
     elif prepare:
         prepare(place)
     before = snapshot(tmp_path)
-    with pytest.raises(RefusedError, match=message):
+    with pytest.raises((RefusedError, StorageError), match=message):
         run(plan, place)
-    with pytest.raises(RefusedError, match=message):
+    with pytest.raises((RefusedError, StorageError), match=message):
         preview(plan, place)
     assert snapshot(tmp_path) == before
 
