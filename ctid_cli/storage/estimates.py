@@ -124,8 +124,10 @@ class Estimates:
 
     def chosen(self, which: BoolArray | IndexArray) -> Estimates:
         """Return some of them, whose columns are taken out of those of all."""
-        some = self._some(np.asarray(self.places)[which])
-        some._all = self._all or self
+        places, numbers = self.places, np.flatnonzero(which) if which.dtype == bool else which
+        # An array of a range would be as long as the export, for each of perhaps a thousand groups.
+        some = self._some(places.start + numbers if isinstance(places, range) else places[numbers])
+        some._all = self if self._places is None else self._all
         return some
 
     def _some(self, places: range | IndexArray) -> Estimates:
