@@ -10,12 +10,13 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage.columns import failed, parameter_names
-from ctid_cli.storage.estimates import export_rows, is_converged, read_estimates, read_stored
+from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import slots, true_values
 from ctid_cli.storage.status import experiment_status, find_estimate
+from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
 from tests.storage.made_results import ORIGIN, MadeResults, outcomes_of, plan_of
 
 MANIFEST = plan_of(5).manifest()
@@ -145,6 +146,12 @@ def test_rows_are_read_some_at_a_time(place: Path, monkeypatch: pytest.MonkeyPat
 
 def row(status: str = "CONVERGED", delay: float | None = 8.0, fit: float | None = 95.0) -> dict[str, Any]:
     return {"status": status, "delay": delay, "fit_percent": fit}
+
+
+def is_converged(estimate: dict[str, Any], success: dict[str, Any] | None, truth: dict[str, float]) -> bool | None:
+    arrays = arrays_of_rows([estimate])
+    hits = judged(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
+    return None if hits is None else bool(hits[0])
 
 
 @pytest.mark.parametrize(
