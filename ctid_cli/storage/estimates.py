@@ -21,6 +21,7 @@ from ctid_cli.storage import folder as place
 from ctid_cli.storage.column_arrays import ROWS, AnyArray, names_of
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
@@ -52,16 +53,21 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
 def read_stored(folder: Path) -> Estimates:
     """Return the estimates of the latest plan of an experiment."""
     with place.reading_journal(folder) as log:
-        if log is None:
-            # There is a journal without a plan where the run was killed before it had planned anything.
-            if not (folder / EXPORT).exists():
-                raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
-            return Estimates(open_export(folder / EXPORT))
-        exported, times = log.exported(), partial(_times_in, folder)
-        if exported is not None and sha256_of(folder / EXPORT) == exported:
-            return Estimates(open_export(folder / EXPORT), times)
-        log.check()
-        return Estimates(export_in_memory(log), times)
+        return stored_in(folder, log)
+
+
+def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
+    """Return the estimates of the latest plan, from ``runs.h5`` where it holds what the journal does."""
+    if log is None:
+        # There is a journal without a plan where the run was killed before it had planned anything.
+        if not (folder / EXPORT).exists():
+            raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
+        return Estimates(open_export(folder / EXPORT))
+    exported, times = log.exported(), partial(_times_in, folder)
+    if exported is not None and sha256_of(folder / EXPORT) == exported:
+        return Estimates(open_export(folder / EXPORT), times)
+    log.check()
+    return Estimates(export_in_memory(log), times)
 
 
 def _times_in(folder: Path, data_hash: str, estimator_hash: str) -> Any:
