@@ -26,12 +26,8 @@ from ctid_cli.storage import columns
 from ctid_cli.storage.column_arrays import AnyArray, ColumnWriter, names_of
 
 #: Columns with what estimates are compared by.
-_COLUMNS = {
-    column.name: column
-    for column in columns.COLUMNS
-    if column.name
-    in ("status", "delay", "numerator", "denominator", "parameters", "standard_errors", "quantiles", "fit_percent")
-}
+_NAMES = ["status", "fit_percent", "delay", "numerator", "denominator", "parameters", "standard_errors", "quantiles"]
+_COLUMNS = [column for column in columns.COLUMNS if column.name in _NAMES]
 #: Arrays that the values under true names are found in, and those of their standard errors and quantiles.
 VALUES = ("delay", "numerator", "numerator_length", "denominator", "denominator_length", "parameters")
 ERRORS = ("standard_errors", "standard_errors_present", "quantiles")
@@ -49,7 +45,7 @@ class Found(NamedTuple):
 def arrays_of_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
     """Return what rows are compared by, as arrays."""
     arrays: dict[str, AnyArray] = {}
-    for column in _COLUMNS.values():
+    for column in _COLUMNS:
         writer = ColumnWriter(column)
         writer.include(rows)
         arrays |= writer.arrays(rows)
