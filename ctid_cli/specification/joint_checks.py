@@ -2,21 +2,19 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, UsageError
+from ctid_cli.estimation.common import Start, StartFrom
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS, resolve
-from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.components import is_custom
@@ -255,23 +253,15 @@ def _world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """How long a record is, and how many of its samples are left after a delay."""
+    """How long a record is."""
 
     interval: float
     samples: int
-    #: Instants of the samples from the first one on, where they are known [s].
-    times: Array | None = None
 
     @property
     def duration(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.interval * (self.samples - 1)
-
-    def samples_after(self, delay: float) -> int:
-        """Return how many samples a delay [s] leaves."""
-        if self.times is not None:
-            return int(np.count_nonzero(self.times >= delay))
-        return max(self.samples - math.ceil(delay / self.interval), 0)
 
 
 def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
@@ -279,7 +269,7 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
-        return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
+        return [Variant({}, {}, Extent(interval, record.n_samples))]
     return [Variant({}, case.swept, _extent_of(case.options)) for case in samplings]
 
 
@@ -288,7 +278,7 @@ def _extent_of(sampling: Any) -> Extent:
     if not isinstance(sampling, GivenInstants):
         return Extent(sampling.mean_interval, sampling.length)
     times = sampling.times(np.random.default_rng(0))
-    return Extent(float(np.ptp(times)) / (times.size - 1), times.size, times - times[0])
+    return Extent(float(np.ptp(times)) / (times.size - 1), times.size)
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -296,33 +286,23 @@ def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
-def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]:
-    """Say that an estimator has too few samples of a record."""
+def _of_greatest_delay(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]:
+    """Say that the delay of an estimator may be as long as the record."""
     bounds = getattr(options, "delay_bounds", None)
-    key = "delay" if bounds is None else "delay_bounds"
-    latest = float(getattr(options, "delay", 0.0) if bounds is None else bounds[1])
-    terms = getattr(options, "terms", None)
-    coefficients = options.poles + options.zeros + 1 if terms is None else sum(term.size for term in terms)
-    parameters = int(coefficients + (bounds is not None))
-    left = extent.samples_after(latest)
+    key, latest = ("delay", getattr(options, "delay", 0.0)) if bounds is None else ("delay_bounds", bounds[1])
     if latest >= extent.duration and latest > 0:
         yield (*at, key), f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s); lower it"
-    elif left <= parameters:
-        masked = f" after the first {latest:g} s" if left < extent.samples_after(0.0) else ""
-        yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or fewer poles or zeros"
 
 
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
-    """Say what each estimator of a system has against the record, the loop and the initial delays."""
+    """Say what each estimator of a system has against the length of the record and the loop."""
     for name, section in spec.estimators.items():
         if section.custom or issubclass(section.target, FrequencyEstimator):
             continue
         at, cases = ("estimators", name), variants(section)
-        yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
+        yield from over({(): cases, ("sampling",): records}, partial(_of_greatest_delay, at))
         if open_loop:
             yield from over({(): cases}, partial(_of_instruments, at))
-        if spec.starts is not None:
-            yield from over({(): cases}, partial(_of_delays, name, spec.starts.initial_delay or []))
 
 
 def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
@@ -331,28 +311,20 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
         yield (*at, "instruments"), f"closed-loop instruments need the reference and the controller; {give}"
 
 
-def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
-    if getattr(options, "start_from", None) != "delay" or not hasattr(options, "delay_bounds"):
-        return
-    low, high = options.delay_bounds
-    for k, point in enumerate(delays):
-        ends = point.uniform if isinstance(point, UniformStart) else [point]
-        outside = [end for end in ends if not low <= end <= high]
-        if outside:
-            message = f"{outside[0]:g} s is outside the delay bounds [{low:g}, {high:g}] s of estimator {name!r}"
-            yield ("starts", "initial_delay", k), message
-
-
 def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str]) -> Iterator[Complaint]:
     points, given = starts.initial_delay or [], starts.parameters or []
     random = [k for k, point in enumerate(points) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
+    for k, point in enumerate(points):
+        ends = point.uniform if isinstance(point, UniformStart) else [point]
+        refused = (_refused_starts(spec, ("starts", "initial_delay", k), Start(delay=end), "delay") for end in ends)
+        yield from next(filter(None, map(list, refused)), [])
     drawn = [k for k, parameters in enumerate(given) if isinstance(parameters, RelativeStart)]
     for k, parameters in enumerate(given):
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
-            yield from _structure_complaints(spec, path, parameters.options())
+            yield from _refused_starts(spec, path, Start(model=parameters.options()), "parameters")
         elif k == drawn[0]:
             # All of them have the structure of the system.
             yield from _of_relative_start(spec, path)
@@ -370,34 +342,21 @@ def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
         except DataError as error:
             yield path, f"the system cannot be written as a sum of submodels: {error}; give values: {{additive: …}}"
         else:
-            yield from _structure_complaints(spec, path, model)
+            yield from _refused_starts(spec, path, Start(model=model), "parameters")
 
 
-def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
-    """Say which estimators cannot start from a model."""
+def _refused_starts(spec: Spec, path: KeyPath, start: Start, start_from: StartFrom) -> Iterator[Complaint]:
+    """Say which estimators cannot start from a delay or a model."""
     for name, section in spec.estimators.items():
-        if not section.custom:
-            yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
+        if not section.custom and getattr(section.target, "start_from", None) == start_from:
+            yield from over({(): variants(section)}, partial(_refused_start, name, path, start))
 
 
-def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
-    if getattr(options, "start_from", None) != "parameters":
-        return
-    if hasattr(options, "terms"):
-        if model.terms != tuple(options.terms):
-            wanted = f"{_terms_text(options.terms)} of estimator {name!r}"
-            yield path, f"the start has the submodels {_terms_text(model.terms)}, not, in this order, {wanted}"
-        return
-    fraction = unfactored(model)
-    zeros = fraction.numerator.size - 1
-    if fraction.order != options.poles or zeros > options.zeros:
-        wanted = f"{options.poles} poles and {options.zeros} zeros of estimator {name!r}"
-        yield path, f"the start has {fraction.order} poles and {zeros} zeros as one fraction, not the {wanted}"
-
-
-def _terms_text(terms: Sequence[Term]) -> str:
-    parts = [{name: value for name, value in asdict(term).items() if value or name != "integrators"} for term in terms]
-    return ", ".join(str(part).replace("'", "") for part in parts)
+def _refused_start(name: str, path: KeyPath, start: Start, estimator: Any) -> Iterator[Complaint]:
+    try:
+        estimator.check_start(start)
+    except DataError as error:
+        yield path, f"{error} (estimator {name!r})"
 
 
 def _success_complaints(spec: Spec) -> Iterator[Complaint]:
