@@ -20,20 +20,19 @@ from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.simulation.start_points import additive_form
+from ctid_cli.specification.custom_sections import CustomMeasureSection
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import (
+from ctid_cli.specification.sections import Section, place_of
+from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.sweeps import (
     MAX_COMBINATIONS,
-    CustomMeasureSection,
-    Section,
     Variant,
     case_count,
     known_variants,
     over,
-    place_of,
     replaced,
     variants,
 )
-from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.system_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
 

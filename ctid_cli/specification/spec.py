@@ -18,28 +18,12 @@ from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
 from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
+from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
-from ctid_cli.specification.sections import (
-    MAX_WHOLE,
-    ByShape,
-    CustomMeasureSection,
-    Kinds,
-    Name,
-    NotNegative,
-    Number,
-    Options,
-    Positive,
-    Section,
-    Swept,
-    Text,
-    Variant,
-    WithKey,
-    known_variants,
-    matching,
-    section_for,
-    variants,
-)
+from ctid_cli.specification.sections import Options, Section, WithKey, section_for
+from ctid_cli.specification.sweeps import Variant, known_variants, variants
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
+from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 

@@ -404,7 +404,11 @@ NOT_PERIODIC = r"beam.csv: one period .* regular clock .* use initial_state 'est
     ("record", "options", "message"),
     [
         (open_record(TWO_MODES, 6, 0.1, 1), {}, "beam.csv: 6 usable samples are too few for 6 parameters"),
-        (open_record(TWO_MODES, 10, 0.1, 1), {"initial_state": "estimated"}, "10 usable samples are too few for 10 parameters"),
+        (
+            open_record(TWO_MODES, 10, 0.1, 1),
+            {"initial_state": "estimated"},
+            "10 usable samples are too few for 10",
+        ),
         (RECORD, {"instruments": "closed_loop"}, "beam.csv: .*instruments 'open_loop'"),
         (
             replace(RECORD, y=np.where(RECORD.t == RECORD.t[5], np.nan, RECORD.y)),

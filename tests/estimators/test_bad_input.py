@@ -81,7 +81,7 @@ U, Y = np.sin(3 * T), np.cos(T)
         (record_of(T, U, np.full(100, 7.0)), r"motor.csv: the output is constant \(7\) over the usable samples"),
         (
             record_of(T, U, np.where(T < 9.8, np.nan, Y)),
-            r"motor.csv: \d usable samples are too few for \d parameters.*longer record, a smaller model, or a smaller largest",
+            r"motor.csv: \d usable samples are too few for \d parameters.*longer record, a smaller model, or",
         ),
     ],
     ids=["constant input", "constant output", "too few samples"],
