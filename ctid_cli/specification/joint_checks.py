@@ -14,7 +14,7 @@ from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.common import Start, StartFrom
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
-from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.components import is_custom
@@ -22,7 +22,7 @@ from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.simulation.start_points import additive_form
 from ctid_cli.specification.custom_sections import CustomMeasureSection
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Section, place_of
+from ctid_cli.specification.sections import place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.sweeps import (
     MAX_COMBINATIONS,
@@ -42,100 +42,13 @@ MAX_SAMPLES = 10_000_000
 MAX_SETTINGS = 1_000_000
 #: Settings whose first data sets are tried.
 MAX_TRIALS = 64
-
-_SIMULATED = ("system", "excitation", "sampling")
-#: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Which sections there are
-
-
-def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-    """Say which sections are missing or too many, whatever they hold."""
-    present = {name for name in Spec.model_fields if raw.get(name) is not None}
-    of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
-    for name in of_other:
-        if name in present:
-            other = "; what is added to a signal is its disturbance" if name == "noise" else ""
-            yield (name,), f"belongs to a {about}, and there is none here; leave it out{other}"
-    if "signal" not in present:
-        yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
-    elif "sampling" not in present:
-        yield ("sampling",), "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
-    random = _random_section(spec, raw, present)
-    if random and "monte_carlo" not in present:
-        yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
-
-
-def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise"):
-        if name in present:
-            yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
-    if _reference(raw, "loop") is not None:
-        yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
-    column = _reference(raw, "data") is not None
-    if column and "loop" not in present:
-        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
-    elif not column and "loop" in present and isinstance(raw["data"], Mapping):
-        yield ("data", "reference"), "is missing; a loop has a reference: name its column"
-
-
-def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    if {"loop", "excitation"} <= present:
-        yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
-    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None and not _has_relay(raw["loop"]):
-        yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
-    missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
-    if len(missing) == len(_SIMULATED):
-        yield (), "there are no data: give system, excitation and sampling; or data; or signal and sampling"
-        return
-    for name in missing:
-        yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
-
-
-def _has_relay(loop: Mapping[str, Any]) -> bool:
-    controller = loop.get("controller")
-    return isinstance(controller, Mapping) and "relay" in controller
-
-
-def _reference(raw: Mapping[str, Any], section: str) -> Any:
-    """Return the reference in a section, whatever the section is."""
-    content = raw.get(section)
-    return content.get("reference") if isinstance(content, Mapping) else None
-
-
-def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> str:
-    """Return a section of simulated data that draws random numbers; empty if none does."""
-    if "data" in present:
-        return ""
-    parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
-    parts["excitation of the loop"] = _reference(raw, "loop"), getattr(spec.loop, "reference", None)
-    for name, (content, section) in parts.items():
-        if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
-            return name
-    return ""
-
-
-def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
-    """Return whether the class that a section, which may be broken, names draws no random number with its options."""
-    target = None if section is None else section.target
-    options = content if isinstance(content, Mapping) else {}
-    kind = options.get("kind")
-    if target is None and isinstance(kind, str) and kind in KINDS[part]:
-        target = resolve(part, kind)
-    without = getattr(target, "deterministic_with", {})
-    if getattr(target, "deterministic", False) is True:
-        return True
-    return any(options.get(name) in without[name] for name in without)
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Everything else
+# All sections together
 
 
 def too_many_cases(spec: Spec) -> str:

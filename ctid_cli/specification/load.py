@@ -15,9 +15,10 @@ from ctid_cli.signals.files import is_inside
 from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
 from ctid_cli.specification.custom_sections import names_code
-from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
+from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
+from ctid_cli.specification.presence import presence_complaints
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import case_count, replaced, variants
 from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, YamlSource, parse_yaml, read_yaml, written
