@@ -17,6 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origi
 import numpy as np
 import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from ctid_cli.arrays import Array
 from ctid_cli.custom_code import reason
@@ -64,7 +65,7 @@ class Section(BaseModel):
         try:
             section = handler(value)
         except ValidationError as error:
-            problems += [explained(detail, cls.descriptions()) for detail in error.errors(include_url=False)]
+            problems += [explained(detail, cls.descriptions()) for detail in cls.details(error, value)]
         else:
             if not problems:
                 found = option_complaints(section) or section.complaints()
@@ -74,6 +75,11 @@ class Section(BaseModel):
         other = cls.elsewhere
         said = [(at, other.get(str(at[0]), text) if at else text, key) for at, text, key in problems]
         raise several_wrong(cls.__name__, said)
+
+    @classmethod
+    def details(cls, error: ValidationError, raw: Any) -> list[ErrorDetails]:
+        """Return what pydantic has against the values of a section."""
+        return error.errors(include_url=False)
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
