@@ -395,7 +395,15 @@ class Spec(Section):
 
 
 class SpecPart(Spec):
-    """What is right of a specification that has mistakes; nothing is required of it."""
+    """What is right of a specification that has mistakes; nothing is required of it.
+
+    Parameters
+    ----------
+    experiment : str
+        Name of the experiment; empty if it is wrong
+    estimators : mapping of mappings
+        Estimators that are right, by their names
+    """
 
     experiment: str = ""
     estimators: dict[str, EstimatorSection] = {}  # noqa: RUF012
