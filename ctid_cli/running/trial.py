@@ -35,8 +35,8 @@ from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.sweeps import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import FAILURES
