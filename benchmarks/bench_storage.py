@@ -1,11 +1,11 @@
-"""What reading and sealing many stored estimates costs: processor time and memory of every command.
+"""What reading many stored estimates and writing runs.h5 cost: processor time and memory of every command.
 
-    python benchmarks/bench_storage.py [ESTIMATES] [--only seal,table,...] [--keep FOLDER]
+    python benchmarks/bench_storage.py [ESTIMATES] [--only write,table,...] [--keep FOLDER]
 
 Makes the results of an experiment with so many estimates (100,000 if nothing is said; two estimators from two starts at
 ten noise levels, rows as quickstart has them, one in a thousand a failure), through the same journal as a run, and
-then gives each command in a process of its own. Nothing is estimated. `seal` is a run that finds everything done but
-not sealed, `run` one that finds it sealed too.
+then gives each command in a process of its own. Nothing is estimated. `write` is a run that finds everything done but
+not exported, so that it writes runs.h5; `run` is one that finds it exported too.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 import yaml
 
-from ctid_cli.running.job import Job, run_job
+from ctid_cli.running.job import run_job
 from ctid_cli.running.plan import build_plan, current_origin
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage import journal, sqlite_file
@@ -42,7 +42,7 @@ LEVELS = 10
 EACH = 4
 FAILURES = 0.001
 BATCH = 1000
-COMMANDS = ("status", "seal", "run", "status", "table", "show", "figure", "export", "verify", "report")
+COMMANDS = ("status", "write", "run", "status", "table", "show", "figure", "export", "verify", "report")
 
 
 def specification(estimates: int) -> dict[str, Any]:
@@ -57,9 +57,7 @@ def specification(estimates: int) -> dict[str, Any]:
 def outcomes(plan: Any, manifest: dict[str, Any]) -> Iterator[Outcome]:
     """An outcome for every place: the real ones of the first data set with other last digits."""
     rng = np.random.default_rng(1)
-    first = plan.tasks()[0]
-    job = Job(plan.data_cells[first.cell], first.replicate, 1, tuple(plan.keys(first)))
-    real = {o.key[2:]: o for o in run_job(job) if isinstance(o, Outcome)}
+    real = {o.key[2:]: o for o in run_job(plan.job(0, 0)) if isinstance(o, Outcome)}
     for key in _in_order(manifest):
         of = real[key[2:]]
         factors = iter((1.0 + 1e-3 * rng.standard_normal(32)).tolist())
@@ -87,7 +85,7 @@ def _other(value: Any, factors: Iterator[float]) -> Any:
 
 
 def fill(folder: Path, spec: Path) -> None:
-    """A journal as a run that was killed before it could seal leaves it."""
+    """A journal as a run that was killed before it wrote runs.h5 leaves it."""
     plan = build_plan(load_spec(spec))
     manifest = plan.manifest()
     (folder / NAME).mkdir(parents=True)
@@ -112,7 +110,7 @@ def measure(name: str, folder: Path, spec: Path) -> None:
         with h5py.File(folder / NAME / "runs.h5") as file:
             some = file["estimates/id"][-1].decode()
     arguments = {
-        "seal": ["run", str(spec), "--jobs", "1", *results],
+        "write": ["run", str(spec), "--jobs", "1", *results],
         "run": ["run", str(spec), "--jobs", "1", *results],
         "show": ["show", some, *results],
         "export": ["export", NAME, *results, "--file", str(folder / "all.csv")],

@@ -116,6 +116,12 @@ class Estimator(Generic[LaidOut, AnyFit]):
     def _estimate(self, laid_out: LaidOut, start: Start | None) -> AnyFit:
         raise NotImplementedError
 
+    def check_start(self, start: Start) -> None:
+        """Refuse, with a DataError, a start that the options exclude; no record is needed to tell.
+
+        Most estimators choose their starts themselves and refuse none.
+        """
+
     def prepare(self, record: Any) -> Prepared[LaidOut, AnyFit]:
         """Check a record, or several where they may be, and lay it out once for any number of starts.
 
@@ -225,7 +231,7 @@ def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> 
 def check_record(record: Record, data: FilterData, parameters: int, free_response: bool = False) -> None:
     """Refuse records from which nothing can be estimated; a free response needs no input that varies."""
     if data.count <= parameters:
-        what = f"{named(record)}{data.count} usable samples for {parameters} parameters"
+        what = f"{named(record)}{data.count} usable samples are too few for {parameters} parameters"
         raise DataError(f"{what}; take a longer record, a smaller model, or a smaller largest delay")
     if np.ptp(record.input.values) == 0.0:
         if free_response:
@@ -248,7 +254,7 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
     low, high = bounds
     delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
     if not low <= delay <= high:
-        raise DataError(f"the initial delay, {delay:g} s, lies outside the bounds {low:g} to {high:g} s")
+        raise DataError(f"the initial delay, {delay:g} s, lies outside the delay bounds, {low:g} to {high:g} s")
     return delay
 
 

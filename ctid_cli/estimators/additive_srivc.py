@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from itertools import islice, permutations
 from typing import ClassVar
@@ -190,6 +190,11 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
             if self.instruments == "closed_loop" or any(term.integrators for term in self.terms):
                 raise OptionError("initial_state", f"{text}; use rest or estimated")
 
+    def check_start(self, start: Start) -> None:
+        """Refuse a model with other submodels."""
+        if start.model is not None:
+            check_submodels(start.model, self.terms)
+
     def _lay_out(self, record: Record) -> Submodels:
         loop = loop_data(record, self.instruments)
         # A record of one period has an input before its first sample: the same one.
@@ -249,8 +254,7 @@ class Submodels:
         given. Where parameters are known by name, submodels stay.
         """
         found = self.start if given is None or given.model is None else ModalStart(given.model, "The start was given.")
-        if found.model.terms != self.problem.terms:
-            raise DataError(f"the start has the submodels {found.model.terms} and the estimator {self.problem.terms}")
+        check_submodels(found.model, self.problem.terms)
         return found if self.problem.fixed else found._replace(model=found.model.sorted())
 
 
@@ -263,6 +267,19 @@ def check_terms(terms: tuple[Term, ...]) -> None:
     order = sum(term.order for term in terms)
     if order > 40:
         raise OptionError("terms", f"terms have {order} poles together; at most 40 are supported")
+
+
+def check_submodels(start: AdditiveModel, terms: tuple[Term, ...]) -> None:
+    """Check that a start has the submodels of an estimator."""
+    if start.terms != terms:
+        wanted = f"not, in this order, {_terms_text(terms)}"
+        raise DataError(f"the start has the submodels {_terms_text(start.terms)}, {wanted}")
+
+
+def _terms_text(terms: Sequence[Term]) -> str:
+    """Write the degrees of submodels as in a specification."""
+    parts = [{name: value for name, value in asdict(term).items() if value or name != "integrators"} for term in terms]
+    return ", ".join(str(part).replace("'", "") for part in parts)
 
 
 def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) -> Array:

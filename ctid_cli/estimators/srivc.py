@@ -128,6 +128,11 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
+    def check_start(self, start: Start) -> None:
+        """Refuse a model of another structure."""
+        if start.model is not None:
+            given_coefficients(start.model, Structure(self.poles, self.zeros), self.delay)
+
     def _lay_out(self, record: Record) -> tuple[SampledProblem | AdditiveProblem, Record]:
         loop = loop_data(record, self.instruments)
         data = filter_data(record, self.delay, self.hold_output)
@@ -178,7 +183,8 @@ def given_coefficients(model: AdditiveModel, structure: Structure, delay: float)
     whole = unfactored(model)
     if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
         given = f"{whole.order} poles and {whole.numerator.size - 1} zeros"
-        raise DataError(f"the start has {given}, and the estimator {structure.poles} and {structure.zeros}")
+        wanted = f"{structure.poles} poles and {structure.zeros} zeros"
+        raise DataError(f"the start has {given} as one fraction, not {wanted}")
     padded = np.concatenate((np.zeros(structure.zeros + 1 - whole.numerator.size), whole.numerator))
     stable: Array = with_stable_denominator(np.concatenate((whole.denominator[1:], padded, [delay])), structure.poles)
     return stable

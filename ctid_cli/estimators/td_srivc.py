@@ -123,6 +123,10 @@ class TdSrivc(Estimator["Searches", Fit]):
         check_proper(self.poles, self.zeros)
         object.__setattr__(self, "delay_bounds", checked_bounds(self.delay_bounds))
 
+    def check_start(self, start: Start) -> None:
+        """Refuse an initial delay outside the bounds."""
+        initial_delay(start, self.delay_bounds)
+
     def _lay_out(self, record: Record) -> Searches:
         check_greatest_delay(record, self.delay_bounds[1])
         problem = self._problem(record)

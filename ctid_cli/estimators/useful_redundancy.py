@@ -196,6 +196,10 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
             bootstrap_draws=self.bootstrap_draws,
         )
 
+    def check_start(self, start: Start) -> None:
+        """Refuse an initial delay outside the bounds."""
+        initial_delay(start, self.delay_bounds)
+
     def _lay_out(self, record: Record) -> RedundantSearch | PrintedSearch:
         unfiltered = self.refinement._lay_out(record).last
         bandwidth = self.bandwidth or output_bandwidth(record)

@@ -25,8 +25,8 @@ from ctid_cli.simulation.dataset import DataSet, SimulatedSource, Source, joined
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
 from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
-from ctid_cli.specification.sections import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
+from ctid_cli.specification.sweeps import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names

@@ -13,9 +13,9 @@ import numpy as np
 
 from ctid_cli.inference.monte_carlo import CellPrecision, Replications, Until, decide
 from ctid_cli.running.plan import Plan
-from ctid_cli.storage.estimates import is_converged
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import Key, Manifest, found_values, true_values
+from ctid_cli.storage.manifest import Key, Manifest, true_values
+from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
 
 #: Stored results by estimate.
 Found = Mapping[Key, Mapping[str, Any]]
@@ -67,9 +67,9 @@ def _replications(
     """Return what an estimator gave, from the first data set to the last before one that is missing."""
     keys = (Key(data, replicate, part["hash"], start) for replicate in count())
     results = [found[key] for key in takewhile(found.__contains__, keys)]
-    hits = [is_converged(row, success, truth) for row in results]
-    values = [[found_values(row, truth)[0][name] for name in truth] for row in results]
-    errors = np.array(values, dtype=float).reshape(len(results), len(truth)) - np.array([*truth.values()], dtype=float)
+    arrays = arrays_of_rows(results)
+    values = found_under(tuple(truth), arrays, len(results)).values
     # Without a rule, or without true values to compare with, an estimate neither converges nor fails to.
-    counted = None if None in hits else np.array(hits, dtype=bool)
-    return Replications(counted, errors, tuple(truth), part["name"], part["swept"], start)
+    hits = judged(success, truth, arrays, values, [row.get("measures") for row in results])
+    errors = values - np.array([*truth.values()], dtype=float)
+    return Replications(hits, errors, tuple(truth), part["name"], part["swept"], start)

@@ -1,4 +1,4 @@
-"""Requests to stop: an interrupt (Ctrl-C), a termination signal, an event set by the caller, a budget of time."""
+"""Requests to stop: an interrupt (Ctrl-C), a termination signal, a number of failures, a budget of time."""
 
 import signal
 import threading
@@ -8,7 +8,7 @@ from typing import Any, Self
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-#: Reasons that are neither signals nor the caller's event.
+#: Reasons that are no signals.
 TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 
 
@@ -19,11 +19,9 @@ class StopRequest:
     once, as if nobody had listened; the workers end with it, and the journal is made for that.
     """
 
-    def __init__(
-        self, event: threading.Event | None = None, *, failures: int | None = None, seconds: float | None = None
-    ) -> None:
-        """Stop when the caller sets an event, after failed estimates of this run, or after some time [s]."""
-        self._event, self.failures = event, failures
+    def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
+        """Stop after failed estimates of this run, or after some time [s]."""
+        self.failures = failures
         self._deadline = None if seconds is None else time.monotonic() + seconds
         self._reason: str | None = None
         self._before: dict[signal.Signals, Any] = {}
@@ -56,9 +54,7 @@ class StopRequest:
 
     @property
     def reason(self) -> str | None:
-        """Name of the signal, ``"stop"`` for the caller's event, another reason, or None."""
-        if self._event is not None and self._event.is_set():
-            self.ask("stop")
-        elif self._deadline is not None and time.monotonic() > self._deadline:
+        """Name of the signal, another reason, or None."""
+        if self._deadline is not None and time.monotonic() > self._deadline:
             self.ask(TIME_BUDGET)
         return self._reason

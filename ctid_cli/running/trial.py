@@ -35,12 +35,13 @@ from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.sweeps import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import FAILURES
-from ctid_cli.storage.manifest import found_values, true_values
+from ctid_cli.storage.manifest import true_values
+from ctid_cli.storage.truth import found_of_rows
 from ctid_cli.temporary import TemporaryFolder
 
 #: Samples of the data sets that are made, and time after which no other is begun [s].
@@ -306,13 +307,13 @@ def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:
     """Say that an estimate has nothing that a true value, or the rule of success, can be compared with."""
-    values = found_values(row, truth)[0]
-    if truth and all(value is None for value in values.values()):
+    lacks = dict(zip(truth, np.isnan(found_of_rows([row], truth).values[0]).tolist(), strict=True))
+    if truth and all(lacks.values()):
         names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
         yield f"returns {names}; true values are known of {', '.join(truth)} only"
     others = [name for name in truth if name != "delay"]
     asked = {"delay_relative_error": ["delay"] if "delay" in truth else [], "parameter_relative_error": others}
     for rule, wanted in asked.items():
-        lacking = [each for each in wanted if values[each] is None]
+        lacking = [each for each in wanted if lacks[each]]
         if lacking and success.get(rule) is not None:
             yield f"returns no {', '.join(lacking)}, so that it never meets success.{rule}"

@@ -2,40 +2,37 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
 from ctid_cli.canonical import canonical_json
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, UsageError
+from ctid_cli.estimation.common import Start, StartFrom
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
-from ctid_cli.kinds import KINDS, resolve
-from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.factoring import unfactored
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import GivenInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance, SumOfSinusoids
 from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.frequency_measures import true_frequencies
 from ctid_cli.simulation.start_points import additive_form
+from ctid_cli.specification.custom_sections import CustomMeasureSection
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import (
+from ctid_cli.specification.sections import place_of
+from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.sweeps import (
     MAX_COMBINATIONS,
-    CustomMeasureSection,
-    Section,
     Variant,
     case_count,
     known_variants,
     over,
-    place_of,
     replaced,
     variants,
 )
-from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.system_sections import RelativeStart, StartsSection, UniformStart
 from ctid_cli.specification.yaml_source import KeyPath
 
@@ -45,100 +42,13 @@ MAX_SAMPLES = 10_000_000
 MAX_SETTINGS = 1_000_000
 #: Settings whose first data sets are tried.
 MAX_TRIALS = 64
-
-_SIMULATED = ("system", "excitation", "sampling")
-#: Sections that belong to the identification of systems.
-_OF_SYSTEMS = ("system", "excitation", "loop", "noise", "data", "starts")
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
 _RULES_OF_SIGNALS = ("band", "by", "window")
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Which sections there are
-
-
-def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-    """Say which sections are missing or too many, whatever they hold."""
-    present = {name for name in Spec.model_fields if raw.get(name) is not None}
-    of_other, about = (_OF_SYSTEMS, "system") if "signal" in present else (("disturbance",), "signal")
-    for name in of_other:
-        if name in present:
-            other = "; what is added to a signal is its disturbance" if name == "noise" else ""
-            yield (name,), f"belongs to a {about}, and there is none here; leave it out{other}"
-    if "signal" not in present:
-        yield from _of_a_record(raw, present) if "data" in present else _of_a_simulation(raw, present)
-    elif "sampling" not in present:
-        yield ("sampling",), "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
-    random = _random_section(spec, raw, present)
-    if random and "monte_carlo" not in present:
-        yield ("monte_carlo",), f"is missing, and the {random} is random; for example {{runs: 100, seed: 1}}"
-
-
-def _of_a_record(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    for name in (*_SIMULATED, "noise"):
-        if name in present:
-            yield (name,), "belongs to simulated data, and 'data' names a measured record; keep one of the two"
-    if _reference(raw, "loop") is not None:
-        yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
-    column = _reference(raw, "data") is not None
-    if column and "loop" not in present:
-        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
-    elif not column and "loop" in present and isinstance(raw["data"], Mapping):
-        yield ("data", "reference"), "is missing; a loop has a reference: name its column"
-
-
-def _of_a_simulation(raw: Mapping[str, Any], present: set[str]) -> Iterator[Complaint]:
-    if {"loop", "excitation"} <= present:
-        yield ("excitation",), "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
-    elif isinstance(raw.get("loop"), Mapping) and raw["loop"].get("reference") is None and not _has_relay(raw["loop"]):
-        yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
-    missing = [name for name in _SIMULATED if name not in present | ({"excitation"} if "loop" in present else set())]
-    if len(missing) == len(_SIMULATED):
-        yield (), "there are no data: give system, excitation and sampling; or data; or signal and sampling"
-        return
-    for name in missing:
-        yield (name,), "is missing; data are simulated with system, excitation (or loop) and sampling"
-
-
-def _has_relay(loop: Mapping[str, Any]) -> bool:
-    controller = loop.get("controller")
-    return isinstance(controller, Mapping) and "relay" in controller
-
-
-def _reference(raw: Mapping[str, Any], section: str) -> Any:
-    """Return the reference in a section, whatever the section is."""
-    content = raw.get(section)
-    return content.get("reference") if isinstance(content, Mapping) else None
-
-
-def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> str:
-    """Return a section of simulated data that draws random numbers; empty if none does."""
-    if "data" in present:
-        return ""
-    parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
-    parts["excitation of the loop"] = _reference(raw, "loop"), getattr(spec.loop, "reference", None)
-    for name, (content, section) in parts.items():
-        if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):
-            return name
-    return ""
-
-
-def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
-    """Return whether the class that a section, which may be broken, names draws no random number with its options."""
-    target = None if section is None else section.target
-    options = content if isinstance(content, Mapping) else {}
-    kind = options.get("kind")
-    if target is None and isinstance(kind, str) and kind in KINDS[part]:
-        target = resolve(part, kind)
-    without = getattr(target, "deterministic_with", {})
-    if getattr(target, "deterministic", False) is True:
-        return True
-    return any(options.get(name) in without[name] for name in without)
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Everything else
+# All sections together
 
 
 def too_many_cases(spec: Spec) -> str:
@@ -255,23 +165,15 @@ def _world_complaints(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]
 
 @dataclass(frozen=True, eq=False)
 class Extent:
-    """How long a record is, and how many of its samples are left after a delay."""
+    """How long a record is."""
 
     interval: float
     samples: int
-    #: Instants of the samples from the first one on, where they are known [s].
-    times: Array | None = None
 
     @property
     def duration(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.interval * (self.samples - 1)
-
-    def samples_after(self, delay: float) -> int:
-        """Return how many samples a delay [s] leaves."""
-        if self.times is not None:
-            return int(np.count_nonzero(self.times >= delay))
-        return max(self.samples - math.ceil(delay / self.interval), 0)
 
 
 def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
@@ -279,7 +181,7 @@ def extents(spec: Spec, samplings: Sequence[Variant]) -> list[Variant]:
     if spec.measured is not None:
         record = spec.measured.dataset(0).record
         interval = record.duration / max(record.n_samples - 1, 1)
-        return [Variant({}, {}, Extent(interval, record.n_samples, (record.t - record.t[0])[record.valid]))]
+        return [Variant({}, {}, Extent(interval, record.n_samples))]
     return [Variant({}, case.swept, _extent_of(case.options)) for case in samplings]
 
 
@@ -288,7 +190,7 @@ def _extent_of(sampling: Any) -> Extent:
     if not isinstance(sampling, GivenInstants):
         return Extent(sampling.mean_interval, sampling.length)
     times = sampling.times(np.random.default_rng(0))
-    return Extent(float(np.ptp(times)) / (times.size - 1), times.size, times - times[0])
+    return Extent(float(np.ptp(times)) / (times.size - 1), times.size)
 
 
 def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
@@ -296,33 +198,23 @@ def _too_long(at: KeyPath, sampling: Any) -> Iterator[Complaint]:
         yield at, f"more than {MAX_SAMPLES} samples in a record are not supported"
 
 
-def _of_record(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]:
-    """Say that an estimator has too few samples of a record."""
+def _of_greatest_delay(at: KeyPath, options: Any, extent: Extent) -> Iterator[Complaint]:
+    """Say that the delay of an estimator may be as long as the record."""
     bounds = getattr(options, "delay_bounds", None)
-    key = "delay" if bounds is None else "delay_bounds"
-    latest = float(getattr(options, "delay", 0.0) if bounds is None else bounds[1])
-    terms = getattr(options, "terms", None)
-    coefficients = options.poles + options.zeros + 1 if terms is None else sum(term.size for term in terms)
-    parameters = int(coefficients + (bounds is not None))
-    left = extent.samples_after(latest)
+    key, latest = ("delay", getattr(options, "delay", 0.0)) if bounds is None else ("delay_bounds", bounds[1])
     if latest >= extent.duration and latest > 0:
         yield (*at, key), f"a delay of {latest:g} s is not shorter than the record ({extent.duration:g} s); lower it"
-    elif left <= parameters:
-        masked = f" after the first {latest:g} s" if left < extent.samples_after(0.0) else ""
-        yield at, f"{left} samples{masked} are too few for {parameters} parameters; take more, or fewer poles or zeros"
 
 
 def _estimator_complaints(spec: Spec, records: Sequence[Variant], *, open_loop: bool) -> Iterator[Complaint]:
-    """Say what each estimator of a system has against the record, the loop and the initial delays."""
+    """Say what each estimator of a system has against the length of the record and the loop."""
     for name, section in spec.estimators.items():
         if section.custom or issubclass(section.target, FrequencyEstimator):
             continue
         at, cases = ("estimators", name), variants(section)
-        yield from over({(): cases, ("sampling",): records}, partial(_of_record, at))
+        yield from over({(): cases, ("sampling",): records}, partial(_of_greatest_delay, at))
         if open_loop:
             yield from over({(): cases}, partial(_of_instruments, at))
-        if spec.starts is not None:
-            yield from over({(): cases}, partial(_of_delays, name, spec.starts.initial_delay or []))
 
 
 def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
@@ -331,28 +223,20 @@ def _of_instruments(at: KeyPath, options: Any) -> Iterator[Complaint]:
         yield (*at, "instruments"), f"closed-loop instruments need the reference and the controller; {give}"
 
 
-def _of_delays(name: str, delays: Sequence[float | UniformStart], options: Any) -> Iterator[Complaint]:
-    if getattr(options, "start_from", None) != "delay" or not hasattr(options, "delay_bounds"):
-        return
-    low, high = options.delay_bounds
-    for k, point in enumerate(delays):
-        ends = point.uniform if isinstance(point, UniformStart) else [point]
-        outside = [end for end in ends if not low <= end <= high]
-        if outside:
-            message = f"{outside[0]:g} s is outside the delay bounds [{low:g}, {high:g}] s of estimator {name!r}"
-            yield ("starts", "initial_delay", k), message
-
-
 def _start_complaints(spec: Spec, starts: StartsSection, broken: frozenset[str]) -> Iterator[Complaint]:
     points, given = starts.initial_delay or [], starts.parameters or []
     random = [k for k, point in enumerate(points) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
+    for k, point in enumerate(points):
+        ends = point.uniform if isinstance(point, UniformStart) else [point]
+        refused = (_refused_starts(spec, ("starts", "initial_delay", k), Start(delay=end), "delay") for end in ends)
+        yield from next(filter(None, map(list, refused)), [])
     drawn = [k for k, parameters in enumerate(given) if isinstance(parameters, RelativeStart)]
     for k, parameters in enumerate(given):
         path = ("starts", "parameters", k)
         if not isinstance(parameters, RelativeStart):
-            yield from _structure_complaints(spec, path, parameters.options())
+            yield from _refused_starts(spec, path, Start(model=parameters.options()), "parameters")
         elif k == drawn[0]:
             # All of them have the structure of the system.
             yield from _of_relative_start(spec, path)
@@ -370,34 +254,21 @@ def _of_relative_start(spec: Spec, path: KeyPath) -> Iterator[Complaint]:
         except DataError as error:
             yield path, f"the system cannot be written as a sum of submodels: {error}; give values: {{additive: …}}"
         else:
-            yield from _structure_complaints(spec, path, model)
+            yield from _refused_starts(spec, path, Start(model=model), "parameters")
 
 
-def _structure_complaints(spec: Spec, path: KeyPath, model: AdditiveModel) -> Iterator[Complaint]:
-    """Say which estimators cannot start from a model."""
+def _refused_starts(spec: Spec, path: KeyPath, start: Start, start_from: StartFrom) -> Iterator[Complaint]:
+    """Say which estimators cannot start from a delay or a model."""
     for name, section in spec.estimators.items():
-        if not section.custom:
-            yield from over({(): variants(section)}, partial(_of_structure, name, model, path))
+        if not section.custom and getattr(section.target, "start_from", None) == start_from:
+            yield from over({(): variants(section)}, partial(_refused_start, name, path, start))
 
 
-def _of_structure(name: str, model: AdditiveModel, path: KeyPath, options: Any) -> Iterator[Complaint]:
-    if getattr(options, "start_from", None) != "parameters":
-        return
-    if hasattr(options, "terms"):
-        if model.terms != tuple(options.terms):
-            wanted = f"{_terms_text(options.terms)} of estimator {name!r}"
-            yield path, f"the start has the submodels {_terms_text(model.terms)}, not, in this order, {wanted}"
-        return
-    fraction = unfactored(model)
-    zeros = fraction.numerator.size - 1
-    if fraction.order != options.poles or zeros > options.zeros:
-        wanted = f"{options.poles} poles and {options.zeros} zeros of estimator {name!r}"
-        yield path, f"the start has {fraction.order} poles and {zeros} zeros as one fraction, not the {wanted}"
-
-
-def _terms_text(terms: Sequence[Term]) -> str:
-    parts = [{name: value for name, value in asdict(term).items() if value or name != "integrators"} for term in terms]
-    return ", ".join(str(part).replace("'", "") for part in parts)
+def _refused_start(name: str, path: KeyPath, start: Start, estimator: Any) -> Iterator[Complaint]:
+    try:
+        estimator.check_start(start)
+    except DataError as error:
+        yield path, f"{error} (estimator {name!r})"
 
 
 def _success_complaints(spec: Spec) -> Iterator[Complaint]:

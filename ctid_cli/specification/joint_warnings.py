@@ -14,8 +14,8 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.dataset import located
 from ctid_cli.specification.joint_checks import MAX_TRIALS, Extent, extents, has_relay
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import Variant, known_variants, over, variants
 from ctid_cli.specification.spec import Spec
+from ctid_cli.specification.sweeps import Variant, known_variants, over, variants
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: A record shows the slowest pole if it lasts so many of its time constants beyond the delay: below that its standard

@@ -1,32 +1,24 @@
 """From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import ValidationError
 
 from ctid_cli.custom_code import is_shipped
 from ctid_cli.errors import DataError, RefusedError, SpecError
-from ctid_cli.kinds import KINDS
 from ctid_cli.signals.files import is_inside
 from ctid_cli.signals.measurement import read_held_signal
 from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, located
-from ctid_cli.specification.joint_checks import joint_complaints, presence_complaints, too_many_cases
+from ctid_cli.specification.custom_sections import names_code
+from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.specification.messages import Complaint, Located, explained, shown
-from ctid_cli.specification.sections import case_count, names_code, replaced, variants
-from ctid_cli.specification.spec import Spec
-from ctid_cli.specification.yaml_source import (
-    OVERRIDE_FILE,
-    KeyPath,
-    YamlSource,
-    parse_yaml,
-    read_yaml,
-    written,
-)
+from ctid_cli.specification.presence import presence_complaints
+from ctid_cli.specification.spec import Spec, SpecPart
+from ctid_cli.specification.sweeps import case_count, replaced, variants
+from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, YamlSource, parse_yaml, read_yaml, written
 
 
 def load_spec(
@@ -86,13 +78,15 @@ def load_loop(path: Path) -> LoopOptions:
     tree = source.tree.get("loop") if isinstance(source.tree, dict) else None
     if tree is None:
         raise SpecError([source.problem((), "there is no section loop; write loop: {controller: {...}}")])
-    section, problems = _piece("loop", tree, path.parent)
+    part, problems = _right_part({"loop": tree}, path.parent)
+    section, problems = part.loop, [problem for problem in problems if problem[0][0] == "loop"]
     if section is not None and section.reference is not None:
         message = "belongs to simulated data; that of a record is a column, --reference"
         problems = [(("loop", "reference"), message, True)]
     elif case_count(section) > 1:
         problems = [(("loop",), "has lists of values; a record was taken in one loop: keep one of each", False)]
     _require_none(source, problems)
+    assert section is not None
     options: LoopOptions = section.options()
     return options
 
@@ -133,62 +127,29 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     code = [source.problem(path, ask) for path in _code_in(tree, folder)]
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
-    found: dict[str, Any] = {"experiment": "", "estimators": {}}
-    complaints: list[Located] = []
-    given = {name for name, value in tree.items() if value is not None}
-    for name, value in _pieces(tree):
-        right, wrong = _piece(name, value, folder, given)
-        complaints += wrong
-        if not wrong:
-            found[name] = found[name] | right if name == "estimators" else right
-    for key in tree.keys() - Spec.model_fields.keys():
-        complaints.append(explained(_about(key, "extra_forbidden", tree[key]), Spec.descriptions()))
-    for key in ("experiment", "estimators"):
-        if key not in tree:
-            complaints.append(explained(_about(key, "missing", None), Spec.descriptions()))
-    complaints += [
-        (where, message, True) for where, message in presence_complaints(Spec.model_construct(**found), tree)
-    ]
+    spec, complaints = _right_part(tree, folder)
+    complaints += [(where, message, True) for where, message in presence_complaints(spec, tree)]
     # What is wrong is left out of what is looked at next.
-    found |= {str(where[0]): None for where, _, _ in complaints if where and where[0] != "estimators"}
-    spec = Spec.model_construct(**{name: value for name, value in found.items() if name in Spec.model_fields})
+    wrong = {str(where[0]) for where, _, _ in complaints if where and where[0] != "estimators"}
+    spec = spec.model_copy(update=dict.fromkeys(wrong & Spec.model_fields.keys()))
     spec._folder, spec._source = folder, source
     return spec, complaints
 
 
-def _pieces(tree: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Return what is looked at by itself: every section, and every estimator."""
-    for name in tree.keys() & Spec.model_fields.keys():
-        value = tree[name]
-        if name == "estimators" and isinstance(value, dict) and value:
-            yield from ((name, {key: part}) for key, part in value.items())
-        else:
-            yield name, value
-
-
-def _piece(name: str, value: Any, folder: Path, given: Set[str] = frozenset()) -> tuple[Any, list[Located]]:
-    """Return a section, or some estimators, of a specification that has some sections, and what is wrong with it."""
+def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Located]]:
+    """Return the sections, and estimators, that are right by themselves, and what is wrong with the others."""
+    context = {"folder": folder, "of_signal": tree.get("signal") is not None}
     try:
-        context = {"folder": folder, "of_signal": "signal" in given}
-        return _adapter(name).validate_python(value, strict=True, context=context), []
+        return Spec.model_validate(tree, context=context), []
     except ValidationError as error:
-        details = error.errors(include_url=False)
-    for detail in details:
-        if name == "estimators" and detail["type"] == "no_kind" and {"signal", "system", "data"} & given:
-            kinds = KINDS["frequency_estimator" if "signal" in given else "estimator"]
-            detail["ctx"] = {"allowed": ", ".join(kinds)}
-    return None, [explained({**detail, "loc": (name, *detail["loc"])}, Spec.descriptions()) for detail in details]
-
-
-@cache
-def _adapter(name: str) -> TypeAdapter[Any]:
-    info = Spec.model_fields[name]
-    form: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
-    return TypeAdapter(form)
-
-
-def _about(key: str, error: str, value: Any) -> ErrorDetails:
-    return {"type": error, "loc": (key,), "msg": "", "input": value}
+        complaints = [explained(detail, {}) for detail in error.errors(include_url=False)]
+    places = [where for where, _, _ in complaints]
+    right = {name: value for name, value in tree.items() if not any(where[:1] == (name,) for where in places)}
+    named = tree.get("estimators")
+    if isinstance(named, Mapping):
+        faulty = {where[1] for where in places if where[:1] == ("estimators",) and len(where) > 1}
+        right["estimators"] = {name: value for name, value in named.items() if name not in faulty}
+    return SpecPart.model_validate(right, context=context), complaints
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:

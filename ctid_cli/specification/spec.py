@@ -10,36 +10,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
+from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import OptionError, Problem
 from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
+from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
 from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
+from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
-from ctid_cli.specification.sections import (
-    MAX_WHOLE,
-    ByShape,
-    CustomMeasureSection,
-    Kinds,
-    Name,
-    NotNegative,
-    Number,
-    Options,
-    Positive,
-    Section,
-    Swept,
-    Text,
-    Variant,
-    WithKey,
-    known_variants,
-    matching,
-    section_for,
-    variants,
-)
+from ctid_cli.specification.sections import Options, Section, WithKey, section_for
+from ctid_cli.specification.sweeps import Variant, known_variants, variants
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
+from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 
@@ -331,6 +317,17 @@ class Spec(Section):
     _folder: Path = PrivateAttr(default=Path())
     _source: YamlSource = PrivateAttr(default_factory=lambda: YamlSource("(stored specification)"))
 
+    @classmethod
+    def details(cls, error: ValidationError, raw: Any) -> list[ErrorDetails]:
+        """Return what pydantic has against the values, naming only the estimators for this kind of experiment."""
+        found = super().details(error, raw)
+        given = {name for name in ("signal", "system", "data") if raw.get(name) is not None}
+        kinds = KINDS["frequency_estimator" if "signal" in given else "estimator"]
+        for detail in found if given else ():
+            if detail["type"] == "no_kind" and detail["loc"][0] == "estimators":
+                detail["ctx"] = {"allowed": ", ".join(kinds)}
+        return found
+
     @property
     def measured(self) -> MeasuredSource | None:
         """Reader of the measured record, its file as seen from the working directory; None for simulated data."""
@@ -395,3 +392,18 @@ class Spec(Section):
     def canonical(self) -> dict[str, Any]:
         """Return the specification with all defaults, as plain data."""
         return self.model_dump(mode="json")
+
+
+class SpecPart(Spec):
+    """What is right of a specification that has mistakes; nothing is required of it.
+
+    Parameters
+    ----------
+    experiment : str
+        Name of the experiment; empty if it is wrong
+    estimators : mapping of mappings
+        Estimators that are right, by their names
+    """
+
+    experiment: str = ""
+    estimators: dict[str, EstimatorSection] = {}  # noqa: RUF012

@@ -16,23 +16,11 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.dataset import LoopOptions
 from ctid_cli.simulation.start_points import StartPoint
+from ctid_cli.specification.custom_sections import Kinds, custom_form
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.sections import (
-    ByShape,
-    Coefficients,
-    Kinds,
-    NotNegative,
-    Number,
-    OneOf,
-    Options,
-    Section,
-    Swept,
-    WithKey,
-    custom_form,
-    section_for,
-    variants,
-    without_copies,
-)
+from ctid_cli.specification.sections import Options, Section, WithKey, section_for
+from ctid_cli.specification.sweeps import variants
+from ctid_cli.specification.values import ByShape, Coefficients, NotNegative, Number, OneOf, Swept, without_copies
 
 #: Highest order that the simulation handles to its stated accuracy.
 MAX_ORDER = 12

@@ -68,6 +68,11 @@ class ColumnWriter:
                     if not value.keys() <= self._names.keys():
                         self._names.update(dict.fromkeys(value))
 
+    @property
+    def names(self) -> list[str]:
+        """Return names of the parts of a column with numbers by name."""
+        return list(self._names)
+
     def create(self, group: h5py.Group, count: int) -> None:
         """Create the arrays, the one with the values with what it means."""
         column = self._column
@@ -79,7 +84,7 @@ class ColumnWriter:
         elif column.type == "by name":
             self._names = dict.fromkeys(column.names([self._names]))
             about["columns"] = ", ".join(self._names)
-        for name, empty in self._arrays([]).items():
+        for name, empty in self.arrays([]).items():
             if column.type == "by name" and name == column.name:
                 _write_texts(group, names_of(name), list(self._names))
             self._datasets[name] = _dataset(group, name, (count, *empty.shape[1:]), empty.dtype)
@@ -88,12 +93,13 @@ class ColumnWriter:
 
     def write(self, start: int, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the values of some rows, from a place on."""
-        for name, array in self._arrays([row.get(self._column.name) for row in rows]).items():
+        for name, array in self.arrays(rows).items():
             self._datasets[name][start : start + len(rows)] = array
 
-    def _arrays(self, values: Sequence[Any]) -> dict[str, AnyArray]:
-        """Return values as arrays by name, that with the values last."""
+    def arrays(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
+        """Return the values of some rows that were measured as arrays by name, that with the values last."""
         name = self._column.name
+        values = [row.get(name) for row in rows]
         match self._column.type:
             case "str":
                 return {name: encoded_texts([text or "" for text in values], self._longest)}

@@ -1,18 +1,6 @@
 """The stored estimates of one plan, by column and by row, and as a table of pandas.
 
 However many they are: columns are arrays, read when they are asked for, and rows are made some at a time.
-
-An estimate has *converged* if it satisfies every condition of the specification's ``success``:
-
-- ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
-- ``fit_percent``: the fit on the record it was estimated from is at least this [%];
-- ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
-- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
-  counted from the start, and after its last step from that.
-
-Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
-settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
-converged and counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
 """
 
 from __future__ import annotations
@@ -30,36 +18,29 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.column_arrays import ROWS, AnyArray
+from ctid_cli.storage.column_arrays import ROWS, AnyArray, names_of
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal import JournalReader
 from ctid_cli.storage.manifest import (
     Key,
     Manifest,
     Slot,
-    found_values,
     is_of_signal,
     row_columns,
     swept_names,
     true_values,
 )
 from ctid_cli.storage.sqlite_file import EXPORT
+from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, judged
 
 if TYPE_CHECKING:
     import pandas as pd
 
 #: Columns of the times, which are in the journal only.
 CLOCKS = ("seconds", "cpu_seconds")
-#: What parameters of an estimate are found in, and what says which of these places are filled.
-_OF_PARAMETERS = {
-    "numerator": "length",
-    "denominator": "length",
-    "delay": "",
-    "parameters": "present",
-    "standard_errors": "present",
-    "quantiles": "present",
-}
-_OF_ERRORS = ("standard_errors", "quantiles")
+#: Columns of several numbers, each with a name.
+_BY_NAME = [column.name for column in columns.COLUMNS if column.type == "by name"]
 #: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both.
 Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]]]
 
@@ -72,16 +53,21 @@ def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataF
 def read_stored(folder: Path) -> Estimates:
     """Return the estimates of the latest plan of an experiment."""
     with place.reading_journal(folder) as log:
-        if log is None:
-            # There is a journal without a plan where the run was killed before it had planned anything.
-            if not (folder / EXPORT).exists():
-                raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
-            return Estimates(open_export(folder / EXPORT))
-        exported, times = log.exported(), partial(_times_in, folder)
-        if exported is not None and sha256_of(folder / EXPORT) == exported:
-            return Estimates(open_export(folder / EXPORT), times)
-        log.check()
-        return Estimates(export_in_memory(log), times)
+        return stored_in(folder, log)
+
+
+def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
+    """Return the estimates of the latest plan, from ``runs.h5`` where it holds what the journal does."""
+    if log is None:
+        # There is a journal without a plan where the run was killed before it had planned anything.
+        if not (folder / EXPORT).exists():
+            raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
+        return Estimates(open_export(folder / EXPORT))
+    exported, times = log.exported(), partial(_times_in, folder)
+    if exported is not None and sha256_of(folder / EXPORT) == exported:
+        return Estimates(open_export(folder / EXPORT), times)
+    log.check()
+    return Estimates(export_in_memory(log), times)
 
 
 def _times_in(folder: Path, data_hash: str, estimator_hash: str) -> Any:
@@ -124,8 +110,10 @@ class Estimates:
 
     def chosen(self, which: BoolArray | IndexArray) -> Estimates:
         """Return some of them, whose columns are taken out of those of all."""
-        some = self._some(np.asarray(self.places)[which])
-        some._all = self._all or self
+        places, numbers = self.places, np.flatnonzero(which) if which.dtype == bool else which
+        # An array of a range would be as long as the export, for each of perhaps a thousand groups.
+        some = self._some(places.start + numbers if isinstance(places, range) else places[numbers])
+        some._all = self if self._places is None else self._all
         return some
 
     def _some(self, places: range | IndexArray) -> Estimates:
@@ -232,7 +220,7 @@ class Estimates:
     @property
     def failures(self) -> BoolArray:
         """Return which of them failed."""
-        return np.isin(self.column("status"), [name.encode() for name in columns.FAILURES])
+        return failures({"status": self.column("status")})
 
     # --- comparison with the truth ----------------------------------------------------------------------------------
 
@@ -259,58 +247,26 @@ class Estimates:
         found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:
             return found
-        failures, fits = self.failures, self.column("fit_percent")
+        arrays = self._arrays("status", "fit_percent", *VALUES)
         measures = self.values("measures") if success.get("band") is not None else None
         for block in self.blocks:
             own, truth = slice(block.first, block.last), self._truths[block.cell["hash"]]
-            values = dict(zip(truth, self._found(own, tuple(truth), errors=False)[0].T, strict=True))
-            hits = judged(success, truth, failures[own], values, fits[own], measures and measures[own])
+            some = {name: array if name.endswith("_names") else array[own] for name, array in arrays.items()}
+            values = found_under(tuple(truth), some, block.last - block.first).values
+            hits = judged(success, truth, some, values, measures and measures[own])
             if hits is not None:
                 found[own] = hits
         return found
 
-    def found(self, names: Sequence[str]) -> tuple[Array, Array, Array]:
+    def found(self, names: Sequence[str]) -> Found:
         """Return values, standard errors and quantiles under the true names, NaN where none is, shape (n, p)."""
-        return self._found(slice(None), names)
+        return found_under(names, self._arrays(*VALUES, *ERRORS), len(self))
 
-    def _found(self, own: slice, names: Sequence[str], *, errors: bool = True) -> tuple[Array, Array, Array]:
-        """Return `found` of some of them, or its values only.
-
-        Rows that have the same form take their numbers from the same places: what `found_values` says of places.
-        """
-        there = [name for name in _OF_PARAMETERS if self.has(name) and (errors or name not in _OF_ERRORS)]
-        names_of_forms = [f"{name}_{_OF_PARAMETERS[name]}" for name in there if _OF_PARAMETERS[name]]
-        held = {name: self.column(name)[own] for name in (*there, *names_of_forms)}
-        count = len(range(len(self))[own])
-        forms = [held[name].reshape(count, -1) for name in names_of_forms]
-        form: AnyArray = np.hstack(forms) if forms else np.zeros((count, 1), dtype=int)
-        targets = np.full((3, count, len(names)), np.nan)
-        left = np.ones(count, dtype=bool)
-        while left.any():
-            some = int(left.argmax())
-            alike = left & (form == form[some]).all(axis=1)
-            row = self._places_in(some, held)
-            for target, places in zip(targets, found_values(row, names), strict=True):
-                for k, name in enumerate(names):
-                    at = places[name]
-                    if isinstance(at, tuple):
-                        target[alike, k] = held[at[0]].reshape(count, -1)[alike, at[1]]
-                    elif at is not None:
-                        target[alike, k] = at
-            left &= ~alike
-        return targets[0], targets[1], targets[2]
-
-    def _places_in(self, number: int, held: Mapping[str, AnyArray]) -> dict[str, Any]:
-        """Return one of some rows with the places of its numbers in their place."""
-        row: dict[str, Any] = {"delay": ("delay", 0) if "delay" in held else None}
-        for name, form in _OF_PARAMETERS.items():
-            if form and name in held:
-                there = held[f"{name}_{form}"][number]
-                if form == "length":
-                    row[name] = None if there < 0 else [(name, k) for k in range(there)]
-                else:
-                    row[name] = {part: (name, k) for k, part in enumerate(self.export.parts(name)) if there[k]} or None
-        return row
+    def _arrays(self, *names: str) -> dict[str, AnyArray]:
+        """Return those of some arrays that are there, with the names of their parts."""
+        arrays = {name: self.column(name) for name in names if self.has(name)}
+        parts = {names_of(name): np.array(self.export.parts(name), dtype=object) for name in arrays if name in _BY_NAME}
+        return arrays | parts
 
     # --- rows -------------------------------------------------------------------------------------------------------
 
@@ -367,48 +323,7 @@ class Estimates:
         return frame
 
 
-# --- success and flat tables ----------------------------------------------------------------------------------------
-
-
-def is_converged(row: Mapping[str, Any], success: Mapping[str, Any] | None, truth: Mapping[str, float]) -> bool | None:
-    """Return whether an estimate satisfies the success rule, from the true values by name."""
-    found = {name: _array(value) for name, value in found_values(row, truth)[0].items()}
-    failures = np.array([row["status"] in columns.FAILURES])
-    hits = judged(success, truth, failures, found, _array(row.get("fit_percent")), [row.get("measures")])
-    return None if hits is None else bool(hits[0])
-
-
-def _array(value: float | None) -> Array:
-    return np.array([value], dtype=np.float64)
-
-
-def judged(
-    success: Mapping[str, Any] | None,
-    truth: Mapping[str, float],
-    failures: BoolArray,
-    found: Mapping[str, Array],
-    fit_percent: Array,
-    measures: Sequence[Mapping[str, float | None] | None] | None,
-) -> BoolArray | None:
-    """Return which estimates satisfy the success rule: from what they found by name, NaN where there is nothing."""
-    rule = success or {}
-    conditions: list[BoolArray] = []
-    if rule.get("delay_relative_error") is not None and "delay" in truth:
-        conditions.append(_near(found["delay"], truth["delay"], rule["delay_relative_error"]))
-    others = truth.keys() - {"delay"}
-    if rule.get("parameter_relative_error") is not None and others:
-        conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
-    if rule.get("band") is not None and measures is not None:
-        from ctid_cli.simulation.frequency_measures import is_settled
-
-        conditions.append(np.array([is_settled(one, rule["band"], rule.get("by")) for one in measures], dtype=bool))
-    if rule.get("fit_percent") is not None:
-        conditions.append(fit_percent >= rule["fit_percent"])
-    return np.logical_and.reduce([~failures, *conditions]) if conditions else None
-
-
-def _near(values: Array, true: float, tolerance: float) -> BoolArray:
-    return np.abs(values - true) <= tolerance * abs(true)
+# --- flat tables ----------------------------------------------------------------------------------------
 
 
 def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:

@@ -8,7 +8,7 @@ place in the plan and the number of shards alone, and what is dealt stays where 
 import hashlib
 import json
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import lcm
@@ -272,42 +272,3 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
     else:
         return dict(system.get("truth") or {})
     return values | {"delay": float(system.get("delay") or 0.0)}
-
-
-@cache
-def _coefficients(names: tuple[str, ...]) -> tuple[int, int]:
-    """Return how many of these names are coefficients of a denominator, and of a numerator."""
-    poles, zeros = (sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names) for letter in "ab")
-    return poles, zeros
-
-
-class Found(NamedTuple):
-    """Numbers of an estimate under the names of the true parameters; None where there is none."""
-
-    values: dict[str, float | None]
-    standard_errors: dict[str, float | None]
-    #: Standard errors to each side of 95 % intervals [-].
-    quantiles: dict[str, float | None]
-
-
-def found_values(row: Mapping[str, Any], names: Iterable[str]) -> Found:
-    """Return estimated values, standard errors and quantiles of intervals under the names of the true ones.
-
-    Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
-    ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
-    """
-    wanted = tuple(names)
-    errors, quantiles = (dict(row.get(name) or {}) for name in ("standard_errors", "quantiles"))
-    values = dict(row.get("parameters") or {}) | {"delay": row.get("delay")}
-    b, a = row.get("numerator"), row.get("denominator")
-    poles, zeros = _coefficients(wanted)
-    if a is not None and b is not None and poles == len(a) - 1 > 0:
-        values |= {f"a{k}": value for k, value in enumerate(a[1:], start=1)}
-        # A leading zero is dropped by the model; names keep their powers.
-        own = max(len(b), _coefficients(tuple(errors))[1])
-        padded = dict(enumerate(b, start=own - len(b)))
-        shift = own - zeros
-        values |= {f"b{k}": padded.get(k + shift, 0.0) for k in range(zeros)}
-        for each in (errors, quantiles):
-            each |= {f"b{k}": each.get(f"b{k + shift}") for k in range(zeros)} if shift else {}
-    return Found(*({name: each.get(name) for name in wanted} for each in (values, errors, quantiles)))

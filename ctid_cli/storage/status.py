@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -17,10 +15,11 @@ from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.announcement import who_runs
-from ctid_cli.storage.estimates import Estimates, read_stored
+from ctid_cli.storage.estimates import Estimates, read_stored, stored_in
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.storage.identity import as_text
-from ctid_cli.storage.manifest import Manifest, Planned, Slot, planned_parts, shard_of
+from ctid_cli.storage.journal import JournalReader
+from ctid_cli.storage.manifest import Slot, planned_parts, shard_of
 
 #: A data cell and an estimator by their hashes.
 Part = tuple[str, str]
@@ -133,26 +132,11 @@ class ExperimentStatus(Progress):
 
 def experiment_status(folder: Path) -> ExperimentStatus:
     """Count what is done and what is missing."""
-    done: Counter[Part] = Counter()
-    failed: Counter[Part] = Counter()
     try:
         with place.reading_journal(folder) as log:
-            if log is not None:
-                manifest, aside = log.manifest(), 0
-                planned = Planned(manifest)
-                for row in log.rows():
-                    if row.key in planned:
-                        done[row.data_hash, row.estimator_hash] += 1
-                        failed[row.data_hash, row.estimator_hash] += row.status in columns.FAILURES
-                    else:
-                        aside += 1
-                running = _running(folder) if log.live else None
-                return _status(folder, manifest, done, failed, aside, len(log.origins()) > 1, running)
-        stored = read_stored(folder)
-        for block in stored.blocks:
-            part = (block.cell["hash"], block.hash)
-            done[part], failed[part] = block.last - block.first, int(stored.failures[block.first : block.last].sum())
-        return _status(folder, stored.manifest, done, failed, None, stored.mixed, None)
+            stored = stored_in(folder, log)
+            running = _running(folder) if log is not None and log.live else None
+            return _status(folder, stored, log, running)
     except InUseError:
         # A run that is just beginning has nothing to read yet.
         running = _running(folder)
@@ -177,20 +161,21 @@ def _running(folder: Path) -> dict[str, Any]:
 
 
 def _status(
-    folder: Path,
-    manifest: Manifest,
-    done: Mapping[Part, int],
-    failed: Mapping[Part, int],
-    left_aside: int | None,
-    mixed: bool,
-    running: dict[str, Any] | None,
+    folder: Path, stored: Estimates, log: JournalReader | None, running: dict[str, Any] | None
 ) -> ExperimentStatus:
+    manifest, failures, counted = stored.manifest, stored.failures, dict[Part, tuple[int, int]]()
+    for block in stored.blocks:
+        # Two names may share estimates, which are stored once in a journal.
+        failed = int(failures[block.first : block.last].sum())
+        counted[block.cell["hash"], block.hash] = (block.last - block.first, failed)
+    left_aside = None if log is None else log.count() - sum(done for done, _ in counted.values())
     groups = []
     for estimator, cell, replicates in planned_parts(manifest):
-        part = (cell["hash"], estimator["hash"])
-        counts = (len(replicates) * len(estimator["starts"]), done.get(part, 0), failed.get(part, 0))
-        groups.append(GroupStatus(*counts, estimator["name"], cell["hash"], {**cell["swept"], **estimator["swept"]}))
-    counts = tuple(sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
+        planned = len(replicates) * len(estimator["starts"])
+        found = counted.get((cell["hash"], estimator["hash"]), (0, 0))
+        swept = {**cell["swept"], **estimator["swept"]}
+        groups.append(GroupStatus(planned, *found, estimator["name"], cell["hash"], swept))
+    planned, done, failed = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
     name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)
     shard = None if dealt is None else (dealt.number, dealt.of)
-    return ExperimentStatus(*counts, name, folder, left_aside, mixed, running, found_groups, shard)
+    return ExperimentStatus(planned, done, failed, name, folder, left_aside, stored.mixed, running, found_groups, shard)

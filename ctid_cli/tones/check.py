@@ -6,8 +6,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.fit import WindowTones
-from ctid_cli.tones.kernels import refute
+from ctid_cli.tones.tone_kernels import refute
+from ctid_cli.tones.window_fit import WindowTones
 
 #: Standard error of the growth over half a window, in relative errors of the amplitude: the mean square of u is 1/3.
 GROWTH_ERROR = 3.0**0.5

@@ -1,7 +1,8 @@
 """Every constant of the tracker that decides something, with its source or the measurement that set it.
 
-"Measured" means on ``benchmarks/track_honesty.py``: values that were tried on its signals of seed 1 and then kept,
-where nothing more is said. Those of the compiled fit are in :mod:`ctid_cli.tones.kernels`.
+"Measured" marks values that were set on signals of ``benchmarks/track_honesty.py``, with an earlier form of this
+tracker. What has neither that mark nor a source is a choice; the benchmark tests all of them together. Constants of the
+compiled fit are in :mod:`ctid_cli.tones.tone_kernels`.
 """
 
 # --- what is asked for ----------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.check import Readings, moving, readings_of
 from ctid_cli.tones.find import floor_bins
-from ctid_cli.tones.fit import WindowTones, fit_tones, nearest
-from ctid_cli.tones.kernels import PARAMETERS, keep_readings
+from ctid_cli.tones.tone_kernels import PARAMETERS, keep_readings
+from ctid_cli.tones.window_fit import WindowTones, fit_tones, nearest
 
 
 def readings_at(

@@ -26,7 +26,7 @@ from ctid_cli.signals.excitation import Excitation, Prbs, Step
 from ctid_cli.signals.noise import ArmaNoise, Noise, WhiteNoise
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.dataset import SimulatedSource
-from ctid_cli.storage.manifest import found_values
+from ctid_cli.storage.truth import found_of_rows
 
 from .bands import PUBLISHED
 
@@ -79,10 +79,7 @@ def line_of(system: str, signal: str, snr_db: float, noise: str, runs: int, seed
         data = source.dataset(replicate)
         fit = options.fit(data.record)
         stored = plain(data.result_of(fit, None, None))
-        found = [
-            [np.nan if part[name] is None else part[name] for name in names] for part in found_values(stored, names)
-        ]
-        numbers.append(np.array(found, dtype=float))
+        numbers.append(np.array(found_of_rows([stored], names))[:, 0])
         lengths.append(numbers[-1][1] * numbers[-1][2] / (QUANTILE * ideal_errors(source, data.record, names)))
         robust += stored["covariance"] == "robust"
         converged += stored["status"] == "CONVERGED"

@@ -140,7 +140,7 @@ def test_a_track_as_text_as_a_table_and_as_a_figure():
     flags = np.zeros(40, np.uint16)
     flags[:10] = int(Flag.GAP)
     omega = 2 * np.pi * np.column_stack((np.linspace(9.0, 11.0, 40), np.full(40, 30.0)))
-    online = FrequencyTrack(0.1 * np.arange(40), omega, flags, 0.1 * omega)
+    online = FrequencyTrack(0.1 * np.arange(40), omega, flags)
     assert "tone  frequency [Hz]" in summary(online)
     assert "amplitude" not in summary(online)
     assert "\nWarnings:\n- 25 % of the rows are not valid.\n" in summary(online)

@@ -16,10 +16,10 @@ from ctid_cli.cli._common import guarded
 from ctid_cli.errors import StorageError
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.written_files import TAKEN, why_unusable, write_file
-from tests.running.fakes import FakePlan
+from tests.running.fakes import toy_plan
 
 ROOT = Path(__file__).resolve().parents[2]
-PLAN = FakePlan(runs=1)
+PLAN = toy_plan(runs=1)
 
 
 def ctid(*arguments: object) -> tuple[int, str]:
@@ -39,7 +39,7 @@ def fill_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("storage") / "results"
-    run_experiment(PLAN, place / "toys", jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
+    run_experiment(PLAN, place / "toys", jobs=1, warm=lambda plan: None)
     return place
 
 
@@ -94,7 +94,7 @@ def test_a_read_only_disk_is_not_taken_for_damage(out: Path, monkeypatch: pytest
 
     monkeypatch.setattr(sqlite3, "connect", read_only)
     with pytest.raises(StorageError) as raised:
-        run_experiment(FakePlan(runs=2), out / "toys", jobs=1, warm=lambda plan: None)  # type: ignore[arg-type]
+        run_experiment(toy_plan(runs=2), out / "toys", jobs=1, warm=lambda plan: None)
     text = str(raised.value)
     assert "could not be written (attempt to write a readonly database)" in text
     assert not any(word in text for word in ("repair", "--fresh", "damaged"))

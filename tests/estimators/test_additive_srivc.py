@@ -378,15 +378,15 @@ def test_impossible_options_are_refused(options, message):
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        (modes([0.25, 0.25, 3.0]), r"\(poles=2, zeros=0, .* and the estimator .*\(poles=2, zeros=0, .*\(poles=2"),
-        (MIXED, r"\(poles=1, zeros=1, .*\(poles=2, zeros=0, .* and the estimator"),
-        (RIGID, r"\(poles=0, zeros=0, integrators=2\)"),
+        (modes([0.25, 0.25, 3.0]), r"\{poles: 2, zeros: 0\}, not, in this order, \{poles: 2, zeros: 0\}, \{poles: 2"),
+        (MIXED, r"\{poles: 1, zeros: 1\}.*\{poles: 2, zeros: 0\}.*, not, in this order"),
+        (RIGID, r"\{poles: 0, zeros: 0, integrators: 2\}"),
     ],
 )
 def test_start_of_another_structure_is_refused(start, message):
     with pytest.raises(DataError, match=message):
         AdditiveSrivc(terms=TWO).fit(open_record(TWO_MODES, 200, 0.1, 1), Start(model=start))
-    with pytest.raises(DataError, match="the start has 4 poles and 2 zeros, and the estimator 4 and 1"):
+    with pytest.raises(DataError, match="the start has 4 poles and 2 zeros as one fraction, not 4 poles and 1 zeros"):
         Srivc(4, 1).fit(open_record(TWO_MODES, 200, 0.1, 1), Start(model=TWO_MODES))
 
 
@@ -403,8 +403,12 @@ NOT_PERIODIC = r"beam.csv: one period .* regular clock .* use initial_state 'est
 @pytest.mark.parametrize(
     ("record", "options", "message"),
     [
-        (open_record(TWO_MODES, 6, 0.1, 1), {}, "beam.csv: 6 usable samples for 6 parameters"),
-        (open_record(TWO_MODES, 10, 0.1, 1), {"initial_state": "estimated"}, "10 usable samples for 10 parameters"),
+        (open_record(TWO_MODES, 6, 0.1, 1), {}, "beam.csv: 6 usable samples are too few for 6 parameters"),
+        (
+            open_record(TWO_MODES, 10, 0.1, 1),
+            {"initial_state": "estimated"},
+            "10 usable samples are too few for 10",
+        ),
         (RECORD, {"instruments": "closed_loop"}, "beam.csv: .*instruments 'open_loop'"),
         (
             replace(RECORD, y=np.where(RECORD.t == RECORD.t[5], np.nan, RECORD.y)),

@@ -81,7 +81,7 @@ U, Y = np.sin(3 * T), np.cos(T)
         (record_of(T, U, np.full(100, 7.0)), r"motor.csv: the output is constant \(7\) over the usable samples"),
         (
             record_of(T, U, np.where(T < 9.8, np.nan, Y)),
-            r"motor.csv: \d usable samples for \d parameters.*longer record, a smaller model, or a smaller largest",
+            r"motor.csv: \d usable samples are too few for \d parameters.*longer record, a smaller model, or",
         ),
     ],
     ids=["constant input", "constant output", "too few samples"],
@@ -93,7 +93,7 @@ def test_records_that_tell_nothing_are_refused(estimator, more, record, message)
 
 @pytest.mark.parametrize("estimator", [Svf, Srivc])
 def test_delay_beyond_the_record_leaves_no_samples(estimator):
-    with pytest.raises(DataError, match=r"motor\.csv: 0 usable samples for 3 parameters"):
+    with pytest.raises(DataError, match=r"motor\.csv: 0 usable samples are too few for 3 parameters"):
         estimator(2, 0, delay=50.0).fit(record_of(T, U, Y))
 
 
@@ -101,14 +101,14 @@ def test_delay_beyond_the_record_leaves_no_samples(estimator):
 def test_delay_bounds_beyond_the_record_are_refused(estimator):
     with pytest.raises(DataError, match=r"motor.csv: the greatest delay, 15 s, is not shorter than the record, 9.9 s"):
         estimator(2, 0, (0, 15)).fit(record_of(T, U, Y))
-    with pytest.raises(DataError, match=r"usable samples for 4 parameters"):
+    with pytest.raises(DataError, match=r"usable samples are too few for 4 parameters"):
         estimator(2, 0, (0, 9.7)).fit(record_of(T, U, Y))
 
 
 @pytest.mark.parametrize("estimator", [TdSrivc(2, 0, (2, 12)), UsefulRedundancy(2, 0, (2, 12), bandwidth=2.02)])
 @pytest.mark.parametrize("delay", [1.0, 13.0, -2.0, np.nan])
 def test_starts_outside_the_bounds_are_refused(estimator, delay):
-    with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the bounds 2 to 12 s"):
+    with pytest.raises(DataError, match=f"initial delay, {delay:g} s, lies outside the delay bounds, 2 to 12 s"):
         estimator.fit(make_record(n=1000), Start(delay))
 
 

@@ -1,47 +1,35 @@
-"""A plan of toy estimators that behave, raise, die or dawdle: what the engine must cope with."""
+"""Plans of toy estimators that behave, raise, die or dawdle: what the engine must cope with."""
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
-import json
-import os
-import signal
 import time
-from collections.abc import Sequence
-from copy import copy
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from functools import cached_property
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
+from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
-from ctid_cli.running.job import Job, run_job
+from ctid_cli.estimation.common import Start
+from ctid_cli.inference.fit import Status
+from ctid_cli.running.engine import RunSummary, run_experiment
+from ctid_cli.running.job import DataCell, EstimatorCell, Job, run_job
 from ctid_cli.running.plan import Plan
 from ctid_cli.simulation.dataset import DataSet
-from ctid_cli.storage.manifest import Key, Outcome, Shard
-
-
-class FakeStatus(Enum):
-    CONVERGED = "All is well."
-
-
-@dataclass(frozen=True)
-class FakeModel:
-    numerator: np.ndarray
-    denominator: np.ndarray
-    delay: float
+from ctid_cli.simulation.start_points import NO_START, StartPoint
+from ctid_cli.storage.manifest import Outcome
+from tests.running.hostile import for_ever, misbehave
 
 
 @dataclass(frozen=True)
 class FakeFit:
-    model: FakeModel
+    model: Any
     standard_errors: dict[str, float]
     cost: float
-    status: FakeStatus = FakeStatus.CONVERGED
+    status: Status = Status.CONVERGED
     fit_percent: float = 97.5
     iterations: int = 4
     condition_number: float = float("nan")
@@ -53,52 +41,29 @@ class FakeFit:
 
 
 @dataclass(frozen=True)
-class FakeStart:
-    delay: float | None
-
-
-@dataclass(frozen=True)
 class FakeRecord:
     y: np.ndarray
     replicate: int
 
 
 @dataclass(frozen=True)
-class FakeData:
-    record: FakeRecord
-    validation: None = None
-    true_model: None = None
+class ToySource:
+    """Data sets of noise at some level; that of replicate `hangs_at` is never made."""
 
-    result_of = DataSet.result_of
-    _fresh_record: ClassVar[None] = None
+    level: float
+    seed: int
+    hangs_at: int = -1
 
-
-@dataclass(frozen=True)
-class FakeCell:
-    content: dict[str, Any]
-    swept: dict[str, Any]
-    measures: tuple[()] = ()
-
-    @property
-    def source(self) -> FakeCell:
-        return self
-
-    @cached_property
-    def hash(self) -> str:
-        return content_hash(self.content)
-
-    def dataset(self, replicate: int) -> FakeData:
-        while replicate == self.content.get("hangs_at", -1):
+    def dataset(self, replicate: int) -> DataSet:
+        while replicate == self.hangs_at:
             time.sleep(60)
-        rng = np.random.default_rng([self.content["seed"], replicate])
-        return FakeData(FakeRecord(rng.standard_normal(50) * self.content["level"], replicate))
+        rng = np.random.default_rng([self.seed, replicate])
+        return DataSet(FakeRecord(rng.standard_normal(50) * self.level, replicate))
 
 
 @dataclass(frozen=True)
 class Toy:
-    """Estimates from random numbers; `mischief` happens in replicate `at`."""
-
-    start_from: ClassVar[str | None] = None
+    """Estimates from random numbers; its mischief happens in replicate `at`, until the file `marker` is there."""
 
     mischief: str = "none"
     at: int = -1
@@ -106,8 +71,11 @@ class Toy:
     busy: bool = False
     order: int = 2
     marker: str = ""
+    start_from: str | None = None
 
     def prepare(self, record: FakeRecord) -> Prepared:
+        if self.mischief == "hang in preparation" and record.replicate == self.at:
+            for_ever(1.0)
         if self.mischief == "unusable":
             raise DataError("the input is constant")
         return Prepared(self, record)
@@ -118,144 +86,92 @@ class Prepared:
     toy: Toy
     record: FakeRecord
 
-    def fit(self, start: FakeStart | None) -> FakeFit:
-        toy, here = self.toy, self.record.replicate == self.toy.at
+    def fit(self, start: Start | None) -> FakeFit:
+        toy, y, here = self.toy, self.record.y, self.record.replicate == self.toy.at
         until = time.perf_counter() + toy.seconds
         while toy.busy and time.perf_counter() < until:
             pass
         if toy.seconds and not toy.busy:
             time.sleep(toy.seconds)
-        if here and toy.mischief == "raise":
-            raise ZeroDivisionError(f"{object()} is no good")
-        if here and toy.mischief == "exit":
-            raise SystemExit(3)
-        if here and toy.mischief == "die":
-            os.kill(os.getpid(), signal.SIGSEGV)
-        if here and toy.mischief == "die once" and not Path(toy.marker).exists():
-            Path(toy.marker).touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+        if here and not (toy.marker and Path(toy.marker).exists()):
+            misbehave(toy.mischief, toy.marker)
         shift = 0.0 if start is None or start.delay is None else start.delay
-        b = self.record.y[: toy.order] / 3
-        a = np.concatenate([[1.0], self.record.y[-toy.order :]])
-        model = FakeModel(b, a, 8.0 + 0.1 * shift * float(self.record.y[0]))
-        cost = float(self.record.y @ self.record.y) if toy.mischief != "count threads" else float(blas_threads())
-        errors = {"b0": 0.1, "delay": float("nan") if here else 0.01}
-        return FakeFit(model, errors, cost)
+        model = SimpleNamespace(
+            numerator=y[: toy.order] / 3,
+            denominator=np.concatenate([[1.0], y[-toy.order :]]),
+            delay=8.0 + 0.1 * shift * float(y[0]),
+        )
+        cost = float(blas_threads()) if toy.mischief == "count threads" else float(y @ y)
+        return FakeFit(model, {"b0": 0.1, "delay": float("nan") if here else 0.01}, cost)
+
+
+STARTS = (
+    StartPoint("3", "delay", 3.0),
+    StartPoint("uniform(0, 9)", "delay", "random", (0.0, 9.0)),
+    NO_START,
+)
 
 
 @dataclass(frozen=True)
-class FakeEstimatorCell:
-    name: str
-    estimator: Toy
-    starts: tuple[str, ...]
-    swept: dict[str, Any] = field(default_factory=dict)
-    kind: str = "toy"
+class ToySpec:
+    """What a plan asks of its specification."""
 
-    def only(self, start: str) -> FakeEstimatorCell:
-        """The same estimator from a single start."""
-        return replace(self, starts=(start,))
-
-    @cached_property
-    def content(self) -> dict[str, Any]:
-        return {"kind": self.kind, **self.estimator.__dict__}
-
-    @cached_property
-    def hash(self) -> str:
-        return content_hash(self.content)
-
-
-@dataclass(frozen=True)
-class FakeStartPoint:
-    label: str
-    initial_delay: float | str | None
-
-    def draw(self, seed: int, replicate: int, true_model: object = None) -> FakeStart | None:
-        if self.initial_delay == "random":
-            return FakeStart(float(np.random.default_rng([seed, 3, replicate]).uniform(0, 9)))
-        return None if self.initial_delay is None else FakeStart(float(self.initial_delay))
-
-
-STARTS = {
-    "3": FakeStartPoint("3", 3.0),
-    "uniform(0, 9)": FakeStartPoint("uniform(0, 9)", "random"),
-    "none": FakeStartPoint("none", None),
-}
-
-
-@dataclass(frozen=True)
-class FakeSpec:
+    experiment: str
     content: dict[str, Any]
     text: str
     folder: Path = Path()
+    data: None = None
+    sampling: None = None
+    generator: None = None
+    monte_carlo: None = None
 
     def canonical(self) -> dict[str, Any]:
         return self.content
 
 
-class FakePlan:
-    """Same surface as the real plan: cells of several noise levels, estimators, starts, runs."""
+def toy_plan(
+    *estimators: Toy,
+    runs: int = 6,
+    levels: tuple[float, ...] = (5, 15.5),
+    experiment: str = "toys",
+    text: str = "# toys\n",
+    precision: dict[str, Any] | None = None,
+    limits: dict[str, float] | None = None,
+) -> Plan:
+    """Plan toys on noise of several levels; every second of them takes no start, the others take two."""
+    seed = 7
+    system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 8.0}
+    contents = [{"system": system, "level": level, "seed": seed} for level in levels]
+    cells = []
+    for k, toy in enumerate(estimators or (Toy(), Toy(order=3))):
+        toy = replace(toy, start_from=None if k % 2 else "delay")
+        content = {"kind": "toy", **vars(toy)}
+        cells.append(EstimatorCell(f"toy{k}", "toy", toy, content, content_hash(content), {"order": toy.order}))
+    spec = {
+        "experiment": experiment,
+        "monte_carlo": {"seed": seed, **(precision or {"runs": runs})},
+        "success": {"delay_relative_error": 0.01},
+    }
+    return Plan(
+        spec=ToySpec(experiment, spec | ({"limits": limits} if limits else {}), text),
+        data_cells=tuple(
+            DataCell(content, content_hash(content), {"level": level}, ToySource(level, seed))
+            for level, content in zip(levels, contents, strict=True)
+        ),
+        estimators=tuple(cells),
+        starts=STARTS,
+        replicates=(runs,) * len(levels),
+        spec_hash=content_hash(spec),
+    )
 
-    terms, files = None, ()
-    shard: Shard | None = None
-    manifest, runs, job, asked = Plan.manifest, Plan.runs, Plan.job, Plan.asked
-    data_sets, monte_carlo = Plan.data_sets, Plan.monte_carlo
 
-    def __init__(
-        self,
-        *estimators: Toy,
-        runs: int = 6,
-        levels: tuple[float, ...] = (5, 15.5),
-        seed: int = 7,
-        experiment: str = "toys",
-        names: tuple[str, ...] | None = None,
-        text: str = "# toys\n",
-        precision: dict[str, Any] | None = None,
-        limits: dict[str, float] | None = None,
-    ) -> None:
-        toys = estimators or (Toy(), Toy(order=3))
-        names = names or tuple(f"toy{k}" for k in range(len(toys)))
-        self.experiment, self.replicates = experiment, (runs,) * len(levels)
-        system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 8.0}
-        self.data_cells = tuple(
-            FakeCell({"system": system, "level": level, "seed": seed}, {"level": level}) for level in levels
-        )
-        labels = (("3", "uniform(0, 9)"), ("none",))
-        self.estimators = tuple(
-            FakeEstimatorCell(name, toy, labels[k % 2], {"order": toy.order})
-            for k, (name, toy) in enumerate(zip(names, toys, strict=True))
-        )
-        self.starts = tuple(STARTS.values())
-        content = {
-            "experiment": experiment,
-            "monte_carlo": {"seed": seed, **(precision or {"runs": runs})},
-            "success": {"delay_relative_error": 0.01},
-        }
-        self.spec_hash = content_hash(content)
-        self.spec = FakeSpec(content | ({"limits": limits} if limits else {}), text)
+def run(plan: Plan, place: Path, jobs: int | None = 2, **options: Any) -> RunSummary:
+    """Run toys, for which no kernel is to be compiled."""
+    return run_experiment(plan, place, jobs=jobs, **{"warm": lambda plan: None, **options})
 
-    def with_replicates(self, replicates: Sequence[int]) -> FakePlan:
-        other = copy(self)
-        other.replicates = tuple(replicates)
-        return other
 
-    def part(self, number: int, of: int) -> FakePlan:
-        """One of several shards."""
-        other = copy(self)
-        other.shard = Shard(number, of)
-        return other
-
-    def keys(self, cell: int, replicate: int) -> list[tuple[Key, FakeEstimatorCell, FakeStartPoint]]:
-        data_hash = self.data_cells[cell].hash
-        return [
-            (Key(data_hash, replicate, part.hash, label), part, STARTS[label])
-            for part in self.estimators
-            for label in part.starts
-        ]
-
-    def all_keys(self) -> list[Key]:
-        """Every estimate that is asked for."""
-        places = [(cell, replicate) for cell in range(len(self.data_cells)) for replicate in range(self.runs)]
-        return [key for place in places for key, _, _ in self.keys(*place)]
+def exported(place: Path) -> bytes:
+    return (place / "runs.h5").read_bytes()
 
 
 def outcomes_of(job: Job) -> list[Outcome]:
@@ -274,8 +190,3 @@ def blas_threads() -> int:
             if hasattr(library, function):
                 counts.append(getattr(library, function)())
     return max(counts)
-
-
-def content_hash(content: dict[str, Any]) -> str:
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,18 +1,16 @@
-"""Estimators that take more than they may, or that the machine does not let finish."""
+"""What estimators do that take more than they may, fail, or are not let finish by the machine."""
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import signal
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import numba
 import numpy as np
-
-from tests.running.fakes import FakeFit, FakeRecord, FakeStart, Prepared, Toy
 
 
 @numba.njit(cache=True)
@@ -22,29 +20,30 @@ def for_ever(x: float) -> float:
     return x
 
 
-@dataclass(frozen=True)
-class Hostile(Toy):
-    """Its mischief happens in replicate `at`; where there is a marker, only until that file is there."""
-
-    def prepare(self, record: FakeRecord) -> Prepared:
-        if self.mischief == "hang in preparation" and record.replicate == self.at:
-            for_ever(1.0)
-        return HostilePrepared(self, record)
+class SpeechlessError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
 
 
-@dataclass(frozen=True)
-class HostilePrepared(Prepared):
-    def fit(self, start: FakeStart | None) -> FakeFit:
-        toy = self.toy
-        if self.record.replicate == toy.at and not (toy.marker and Path(toy.marker).exists()):
-            misbehave(toy.mischief)
-        return super().fit(start)
-
-
-def misbehave(mischief: str) -> None:
+def misbehave(mischief: str, marker: str) -> None:
     match mischief:
-        case "loop":
-            for_ever(1.0)
+        case "raise":
+            raise ZeroDivisionError(f"{object()} is no good")
+        case "speak in halves":
+            raise ValueError("half a character: \ud83d, a \0 and\x1b[31m red")
+        case "be speechless":
+            raise SpeechlessError
+        case "exit":
+            raise SystemExit(3)
+        case "leave":
+            os._exit(3)
+        case "die":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case "be killed":
+            os.kill(os.getpid(), signal.SIGKILL)
+        case "be killed once":
+            Path(marker).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
         case "stop":
             os.kill(os.getpid(), signal.SIGSTOP)
         case "sleep":
@@ -55,18 +54,7 @@ def misbehave(mischief: str) -> None:
                 kept.append(np.ones(1_000_000))
         case "ask for too much":
             np.empty(2**45)
-        case "be killed":
-            os.kill(os.getpid(), signal.SIGKILL)
+        case "fill the disk":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         case "open files":
             kept = [os.open("/dev/null", os.O_RDONLY) for _ in range(1_000_000)]
-        case "speak in halves":
-            raise ValueError("half a character: \ud83d, a \0 and\x1b[31m red")
-        case "be speechless":
-            raise SpeechlessError
-        case "leave":
-            os._exit(3)
-
-
-class SpeechlessError(Exception):
-    def __str__(self) -> str:
-        raise RuntimeError("no words")

@@ -9,11 +9,12 @@ from pathlib import Path
 
 from ctid_cli.errors import CtidError
 from ctid_cli.running.engine import Progress, run_experiment
-from tests.running.fakes import FakePlan, Toy
+from ctid_cli.running.plan import Plan
+from tests.running.fakes import Toy, toy_plan
 
 
-def plan(seconds: float = 0.02, runs: int = 20) -> FakePlan:
-    return FakePlan(Toy(seconds=seconds), Toy(order=3, mischief="raise", at=4), runs=runs)
+def plan(seconds: float = 0.02, runs: int = 20) -> Plan:
+    return toy_plan(Toy(seconds=seconds), Toy(order=3, mischief="raise", at=4), runs=runs)
 
 
 def report(progress: Progress) -> None:
@@ -31,15 +32,12 @@ def main() -> int:
     parser.add_argument("--open-files", type=int, help="most files that may be open")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=0.02)
-    parser.add_argument("--shard", help="only a part, as in 2/3")
     options = parser.parse_args()
     if options.file_size:
         resource.setrlimit(resource.RLIMIT_FSIZE, (options.file_size, options.file_size))
     if options.open_files:
         resource.setrlimit(resource.RLIMIT_NOFILE, (options.open_files, options.open_files))
     toys = plan(options.seconds, options.runs)
-    if options.shard:
-        toys = toys.part(*map(int, options.shard.split("/")))
     try:
         summary = run_experiment(toys, options.folder, jobs=options.jobs, progress=report, warm=lambda plan: None)
     except CtidError as error:

@@ -40,7 +40,7 @@ class Random(Measure):
 
 class Tones(Measure):
     def value(self, fit, data):
-        return fit.last.omega[0] / data.source.signal.frequencies_at(np.zeros(1))[0, 0]
+        return fit.track.frequencies[-1, 0] / data.source.signal.frequencies_at(np.zeros(1))[0, 0]
 """
 SYSTEM = """
 experiment: measured

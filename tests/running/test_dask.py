@@ -12,18 +12,18 @@ from typing import Any
 import pytest
 
 from ctid_cli.errors import DataError, RefusedError, UsageError
-from ctid_cli.running.engine import Progress, run_experiment
+from ctid_cli.running.engine import Progress
+from ctid_cli.running.plan import Plan
 from ctid_cli.running.workers import packed, unpacked
 from ctid_cli.signals.files import COPIES
 from ctid_cli.simulation.dataset import require_content
-from tests.running.fakes import FakePlan, Toy
-from tests.running.hostile import Hostile
+from tests.running.fakes import Toy, exported, run, toy_plan
 
 
-def plan() -> Any:
-    hostile = (Hostile("leave", at=3, order=6), Hostile("grow", at=4, order=7))
+def plan() -> Plan:
+    hostile = (Toy("leave", at=3, order=6), Toy("grow", at=4, order=7))
     limits = {"cpu_seconds": 2, "memory_mb": 300}
-    return FakePlan(Toy(seconds=0.05), *hostile, Toy("raise", at=2), levels=(5,), runs=7, limits=limits)
+    return toy_plan(Toy(seconds=0.05), *hostile, Toy("raise", at=2), levels=(5,), runs=7, limits=limits)
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +44,11 @@ def test_a_cluster_gives_the_bytes_of_one_machine_though_a_worker_is_killed(clus
             os.kill(killed[0], signal.SIGKILL)
 
     address = cluster.scheduler_address
-    summary = run_experiment(plan(), tmp_path / "dask", warm=lambda plan: None, dask=address, progress=kill)
+    summary = run(plan(), tmp_path / "dask", dask=address, progress=kill)
     assert killed
     assert (summary.missing, summary.failed, summary.exit_code) == (0, 4, 0)
-    run_experiment(plan(), tmp_path / "here", jobs=2, warm=lambda plan: None)
-    assert (tmp_path / "dask" / "runs.h5").read_bytes() == (tmp_path / "here" / "runs.h5").read_bytes()
+    run(plan(), tmp_path / "here")
+    assert exported(tmp_path / "dask") == exported(tmp_path / "here")
 
 
 def test_a_worker_of_another_platform_is_refused_and_named(
@@ -56,7 +56,7 @@ def test_a_worker_of_another_platform_is_refused_and_named(
 ) -> None:
     monkeypatch.setattr("ctid_cli.storage.identity.numeric_platform", lambda: "abacus")
     with pytest.raises(RefusedError, match=r"worker tcp://\S+ on \S+ is of other code .*platform 'abacus' here, "):
-        run_experiment(plan(), tmp_path, warm=lambda plan: None, dask=cluster.scheduler_address)
+        run(plan(), tmp_path, dask=cluster.scheduler_address)
 
 
 def test_a_worker_of_several_threads_is_refused(tmp_path: Path) -> None:
@@ -64,12 +64,12 @@ def test_a_worker_of_several_threads_is_refused(tmp_path: Path) -> None:
 
     options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None, "silence_logs": 60}
     with LocalCluster(**options) as made, pytest.raises(RefusedError, match="2 threads; start it with --nthreads 1"):
-        run_experiment(plan(), tmp_path, warm=lambda plan: None, dask=made.scheduler_address)
+        run(plan(), tmp_path, dask=made.scheduler_address)
 
 
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no scheduler of dask answers at nowhere://1"):
-        run_experiment(plan(), tmp_path / "toys", warm=lambda plan: None, dask="nowhere://1")
+        run(plan(), tmp_path / "toys", dask="nowhere://1")
     assert not (tmp_path / "toys").exists()
 
 

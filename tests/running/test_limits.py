@@ -11,23 +11,17 @@ import pytest
 
 from ctid_cli.errors import MachineError
 from ctid_cli.running import workers
-from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
-from ctid_cli.running.limits import advice
+from ctid_cli.running.engine import Progress, preview
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage.estimates import read_estimates
-from tests.running.fakes import FakePlan, Toy
-from tests.running.hostile import Hostile
+from tests.running.fakes import Toy, exported, run, toy_plan
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run(plan: Any, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
-    return run_experiment(plan, place, jobs=jobs, warm=lambda plan: None, **options)
-
-
 def toys(*hostile: Toy, runs: int = 3, **options: Any) -> Any:
     """A well-behaved estimator, hostile ones and another good one, which all share data sets."""
-    return FakePlan(Toy(), *hostile, Toy(order=4), levels=(5,), runs=runs, **options)
+    return toy_plan(Toy(), *hostile, Toy(order=4), levels=(5,), runs=runs, **options)
 
 
 def failures(place: Path) -> dict[tuple[str, int, str], str]:
@@ -44,7 +38,7 @@ def messages(place: Path) -> set[str]:
 
 def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "GRACE", 0.2)
-    stop = Hostile("stop", at=0, order=6)
+    stop = Toy("stop", at=0, order=6)
     summary = run(toys(stop, limits={"wall_seconds": 2}), tmp_path)
     assert failures(tmp_path) == {("toy1", 0, "none"): "TIMEOUT"}
     assert messages(tmp_path) == {"not finished after 2 s (limits.wall_seconds)"}
@@ -52,8 +46,8 @@ def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, mon
 
 
 def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
-    hostile = [Hostile("hang in preparation", at=1, order=5), Toy(order=6), Hostile("grow", at=2, order=8)]
-    hostile += [Toy(order=9), Hostile("ask for too much", at=0, order=7)]
+    hostile = [Toy("hang in preparation", at=1, order=5), Toy(order=6), Toy("grow", at=2, order=8)]
+    hostile += [Toy(order=9), Toy("ask for too much", at=0, order=7)]
     run(toys(*hostile, limits={"cpu_seconds": 3, "memory_mb": 300}), tmp_path)
     assert failures(tmp_path) == {
         ("toy1", 1, "none"): "TIMEOUT",
@@ -68,8 +62,9 @@ def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
 
 def test_a_data_set_that_is_never_made_is_a_failure_of_all_its_estimates(tmp_path: Path) -> None:
     plan = toys(runs=2, limits={"wall_seconds": 1})
-    plan.data_cells = (dataclasses.replace(plan.data_cells[0], content=plan.data_cells[0].content | {"hangs_at": 1}),)
-    run(plan, tmp_path)
+    (cell,) = plan.data_cells
+    hanging = dataclasses.replace(cell, source=dataclasses.replace(cell.source, hangs_at=1))
+    run(dataclasses.replace(plan, data_cells=(hanging,)), tmp_path)
     assert {(name, where): status for (name, where, _), status in failures(tmp_path).items()} == {
         ("toy0", 1): "TIMEOUT",
         ("toy1", 1): "TIMEOUT",
@@ -81,7 +76,7 @@ def test_limits_are_no_part_of_results(tmp_path: Path) -> None:
     run(toys(runs=2), tmp_path / "without")
     summary = run(toys(runs=2, limits={"wall_seconds": 600, "memory_mb": 3000}), tmp_path / "with")
     assert summary.failed == 0
-    assert (tmp_path / "with" / "runs.h5").read_bytes() == (tmp_path / "without" / "runs.h5").read_bytes()
+    assert exported(tmp_path / "with") == exported(tmp_path / "without")
     again = run(toys(runs=2, limits={"wall_seconds": 1}), tmp_path / "with")
     assert (again.reused, again.computed) == (again.planned, 0)
 
@@ -90,7 +85,7 @@ def test_a_higher_limit_is_a_reason_to_try_again(tmp_path: Path) -> None:
     marker = tmp_path / "marker"
 
     def plan(**limits: float) -> Any:
-        return toys(Hostile("sleep", at=1, order=5, marker=str(marker)), limits=limits)
+        return toys(Toy("sleep", at=1, order=5, marker=str(marker)), limits=limits)
 
     place = tmp_path / "toys"
     assert run(plan(wall_seconds=1), place).failed == 1
@@ -107,7 +102,7 @@ def test_a_higher_limit_is_a_reason_to_try_again(tmp_path: Path) -> None:
 
 def test_failures_are_tried_again_when_asked(tmp_path: Path) -> None:
     marker = tmp_path / "marker"
-    hostile = [Hostile("speak in halves", at=1, order=5, marker=str(marker)), Toy(order=6), Toy("die", at=0, order=7)]
+    hostile = [Toy("speak in halves", at=1, order=5, marker=str(marker)), Toy(order=6), Toy("die", at=0, order=7)]
     place, plan = tmp_path / "toys", toys(*hostile)
     assert run(plan, place).failed == 2
     assert set(failures(place).values()) == {"FAILED", "CRASHED"}
@@ -120,7 +115,7 @@ def test_failures_are_tried_again_when_asked(tmp_path: Path) -> None:
 
 
 def test_texts_that_no_file_can_hold_are_stored_readably(tmp_path: Path) -> None:
-    run(toys(Hostile("speak in halves", at=0, order=5), Hostile("be speechless", at=1, order=6)), tmp_path)
+    run(toys(Toy("speak in halves", at=0, order=5), Toy("be speechless", at=1, order=6)), tmp_path)
     texts = {message.partition("\n")[0] for message in messages(tmp_path)}
     assert texts == {
         r"ValueError: half a character: \ud83d, a \x00 and\x1b[31m red",
@@ -130,28 +125,27 @@ def test_texts_that_no_file_can_hold_are_stored_readably(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("mischief", "said"),
-    [("be killed", "SIGKILL"), ("ask for too much", "out of memory: Unable to allocate"), ("open files", "[Errno 24]")],
+    ("mischief", "said", "advice"),
+    [
+        ("be killed", "SIGKILL", "memory_mb"),
+        ("ask for too much", "out of memory: Unable to allocate", "memory_mb"),
+        ("open files", "[Errno 24]", "ulimit -n"),
+        ("fill the disk", "[Errno 28]", "TMPDIR"),
+    ],
 )
-def test_what_the_machine_does_is_told_and_not_stored(tmp_path: Path, mischief: str, said: str) -> None:
+def test_what_the_machine_does_is_told_and_not_stored(tmp_path: Path, mischief: str, said: str, advice: str) -> None:
     marker, seen = tmp_path / "marker", list[Progress]()
-    place, plan = tmp_path / "toys", toys(Hostile(mischief, at=1, order=5, marker=str(marker)))
+    place, plan = tmp_path / "toys", toys(Toy(mischief, at=1, order=5, marker=str(marker)))
     summary = run(plan, place, progress=seen.append)
     assert (summary.missing, summary.failed, summary.stopped_by) == (1, 0, "machine")
     assert summary.exit_code == MachineError.exit_code == 8
     assert f"1 are missing (toy1 on replicate 1): {said}" in str(summary.machine_error())
+    assert advice in str(summary.machine_error())
     assert any(each.message.startswith("1 estimate given up, not stored (toy1 on replicate 1)") for each in seen)
     assert failures(place) == {}
     marker.touch()
     again = run(plan, place)
     assert (again.computed, again.missing, again.exit_code) == (1, 0, 0)
-
-
-def test_a_process_that_leaves_each_time_is_its_estimators_failure(tmp_path: Path) -> None:
-    run(toys(Hostile("leave", at=1, order=5)), tmp_path)
-    assert failures(tmp_path) == {("toy1", 1, "none"): "CRASHED"}
-    (message,) = messages(tmp_path)
-    assert message == "the worker process died each time this was computed, the last time alone (exit code 3)"
 
 
 def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_path: Path) -> None:
@@ -166,18 +160,13 @@ def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_p
     assert (done.returncode, len(read_estimates(tmp_path / "toys"))) == (0, 18)
 
 
-@pytest.mark.parametrize(("at_most", "least"), [(1, 1), (3, 3)])
-def test_a_run_stops_after_so_many_failures(tmp_path: Path, at_most: int, least: int) -> None:
-    plan = FakePlan(*[Toy("raise", at=k, order=2 + k) for k in range(8)], Toy(seconds=0.3, order=12), runs=20)
-    summary = run(plan, tmp_path, stop=StopRequest(failures=at_most))
-    assert summary.stopped_by == "failures"
-    assert summary.exit_code == 5
-    assert least <= summary.failed
-    assert summary.missing > 0
-
-
-def test_advice_fits_the_reason() -> None:
-    assert "ulimit -n" in advice("OSError: [Errno 24] Too many open files")
-    assert "memory_mb" in advice("SIGKILL")
-    assert "TMPDIR" in advice("[Errno 28] No space left on device")
-    assert "another machine" in advice("?")
+@pytest.mark.parametrize("at_most", [1, 3])
+def test_a_run_stops_after_so_many_failures(tmp_path: Path, at_most: int) -> None:
+    plan = toy_plan(*[Toy("raise", at=k, order=2 + k) for k in range(8)], Toy(seconds=0.3, order=12), runs=20)
+    seen: list[Progress] = []
+    summary = run(plan, tmp_path, stop=StopRequest(failures=at_most), progress=seen.append)
+    assert (summary.stopped_by, summary.exit_code) == ("failures", 5)
+    assert summary.failed >= at_most
+    assert 0 < summary.computed < summary.planned
+    assert len(read_estimates(tmp_path)) == summary.computed
+    assert sum(each.message.startswith("stopping (failures)") for each in seen) == 1

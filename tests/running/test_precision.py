@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,12 @@ from ctid_cli.inference.monte_carlo import (
     wilson_interval,
 )
 from ctid_cli.running import engine
-from ctid_cli.running.engine import Progress, RunSummary, preview, run_experiment
+from ctid_cli.running.engine import Progress, RunSummary, preview
+from ctid_cli.running.plan import Plan
 from ctid_cli.running.precision import cell_precisions
 from ctid_cli.running.stopping import StopRequest
 from ctid_cli.storage.estimates import read_stored
-from tests.running.fakes import FakePlan
+from tests.running.fakes import exported, run, toy_plan
 
 NOTHING = np.empty((5000, 0))
 
@@ -134,16 +134,8 @@ def small_blocks() -> Iterator[None]:
         yield
 
 
-def plan(**options: Any) -> FakePlan:
-    return FakePlan(levels=(1, 15.5), **({"precision": UNTIL} | options))
-
-
-def run(asked: FakePlan, place: Path, jobs: int = 2, **options: Any) -> RunSummary:
-    return run_experiment(asked, place, jobs=jobs, warm=lambda plan: None, **options)  # type: ignore[arg-type]
-
-
-def sealed(place: Path) -> bytes:
-    return (place / "runs.h5").read_bytes()
+def plan(**options: Any) -> Plan:
+    return toy_plan(levels=(1, 15.5), **({"precision": UNTIL} | options))
 
 
 def sizes(place: Path) -> list[int]:
@@ -177,37 +169,36 @@ def test_neither_workers_nor_interruptions_change_a_byte(
     tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(engine, "COMMIT_SECONDS", 0.0)
-    place, stop, seen = tmp_path / "toys", threading.Event(), 0
+    place = tmp_path / "toys"
 
-    def after(count: int) -> Any:
+    def interrupted(jobs: int, commits: int) -> RunSummary:
+        request, seen = StopRequest(), 0
+
         def listen(progress: Progress) -> None:
             nonlocal seen
             seen += bool(progress.stored)
-            if seen >= count:
-                stop.set()
+            if seen >= commits:
+                request.ask("stop")
 
-        return listen
+        return run(plan(), place, jobs=jobs, stop=request, progress=listen)
 
-    interruptions = 0
-    for count in (1, 1, 20):
-        stop.clear()
-        seen = 0
-        summary = run(plan(), place, jobs=1 + interruptions % 2, stop=StopRequest(stop), progress=after(count))
-        interruptions += summary.exit_code == 5
-    assert interruptions > 0
+    assert interrupted(jobs=1, commits=1).computed > 0
+    # Wherever the first run stopped, the next ones go on from it.
+    assert interrupted(jobs=2, commits=1).reused > 0
+    interrupted(jobs=1, commits=20)
     summary = run(plan(), place)
     assert (summary.exit_code, summary.missing) == (0, 0)
-    assert sealed(place) == sealed(undisturbed)
+    assert exported(place) == exported(undisturbed)
     # Once more there is nothing to do.
-    assert preview(plan(), place).estimates == 0  # type: ignore[arg-type]
+    assert preview(plan(), place).estimates == 0
     assert run(plan(), place).computed == 0
-    assert sealed(place) == sealed(undisturbed)
+    assert exported(place) == exported(undisturbed)
 
 
 def test_estimates_of_other_plans_are_used_and_neither_more_nor_fewer(tmp_path: Path, undisturbed: Path) -> None:
     run(plan(runs=30, precision=None), tmp_path)
     summary = run(plan(), tmp_path)
-    assert sealed(tmp_path) == sealed(undisturbed)
+    assert exported(tmp_path) == exported(undisturbed)
     most, fewer = sizes(undisturbed)
     assert summary.reused == 3 * (30 + fewer)
     assert summary.computed == 3 * (most - 30)

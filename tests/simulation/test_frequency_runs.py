@@ -74,7 +74,7 @@ def test_measures_of_a_made_up_track():
     assert not is_settled(never, 0.05, None)
 
 
-def test_results_are_sealed_and_read_back(tmp_path):
+def test_results_are_exported_and_read_back(tmp_path):
     plan = build_plan(load(tmp_path, SPEC))
     folder = tmp_path / "out"
     summary = run_experiment(plan, folder, jobs=1)

@@ -10,12 +10,13 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage.columns import failed, parameter_names
-from ctid_cli.storage.estimates import export_rows, is_converged, read_estimates, read_stored
+from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import experiment_folders
 from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import slots, true_values
 from ctid_cli.storage.status import experiment_status, find_estimate
+from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
 from tests.storage.made_results import ORIGIN, MadeResults, outcomes_of, plan_of
 
 MANIFEST = plan_of(5).manifest()
@@ -147,60 +148,67 @@ def row(status: str = "CONVERGED", delay: float | None = 8.0, fit: float | None 
     return {"status": status, "delay": delay, "fit_percent": fit}
 
 
+DELAY, FIT, PARAMETERS = {"delay_relative_error": 0.01}, {"fit_percent": 90.0}, {"parameter_relative_error": 0.1}
+TRUE = {"g1_a1": 0.25, "g1_b0": -3.0, "delay": 8.0}
+FRACTION = {"b0": 2.0, "a1": 3.0, "a2": 4.0, "delay": 1.0}
+
+
+def submodel(status: str = "CONVERGED", **parameters: float | None) -> dict[str, Any]:
+    return row(status) | {"parameters": parameters or None}
+
+
 @pytest.mark.parametrize(
-    ("estimate", "success", "true_delay", "expected"),
+    ("estimate", "success", "truth", "expected"),
     [
-        (row(delay=8.079), {"delay_relative_error": 0.01}, 8.0, True),
-        (row(delay=8.081), {"delay_relative_error": 0.01}, 8.0, False),
-        (row("MAX_ITERATIONS", delay=7.93), {"delay_relative_error": 0.01}, 8.0, True),
-        (row(delay=None), {"delay_relative_error": 0.01}, 8.0, False),
-        (row("FAILED", delay=8.0), {"delay_relative_error": 0.01}, 8.0, False),
-        (row("TIMEOUT"), {"fit_percent": 90}, None, False),
-        (row(fit=89.9), {"fit_percent": 90}, None, False),
-        (row(fit=90.0), {"fit_percent": 90}, None, True),
-        (row(fit=None), {"fit_percent": 90}, None, False),
-        (row(delay=9.0), {"delay_relative_error": 0.01, "fit_percent": 90}, 8.0, False),
-        (row(fit=50.0), {"delay_relative_error": 0.01, "fit_percent": 90}, 8.0, False),
-        (row(), {"delay_relative_error": 0.01, "fit_percent": None}, None, None),
-        (row(), None, 8.0, None),
+        (row(delay=8.079), DELAY, TRUE, True),
+        (row(delay=8.081), DELAY, TRUE, False),
+        (row("MAX_ITERATIONS", delay=7.93), DELAY, TRUE, True),
+        (row(delay=None), DELAY, TRUE, False),
+        (row("FAILED", delay=8.0), DELAY, TRUE, False),
+        (row("TIMEOUT"), FIT, {}, False),
+        (row(fit=89.9), FIT, {}, False),
+        (row(fit=90.0), FIT, {}, True),
+        (row(fit=None), FIT, {}, False),
+        (row(delay=9.0), DELAY | FIT, TRUE, False),
+        (row(fit=50.0), DELAY | FIT, TRUE, False),
+        (row(), DELAY | {"fit_percent": None}, {}, None),
+        (row(), None, TRUE, None),
+        (submodel("MAX_ITERATIONS", g1_a1=0.27, g1_b0=-3.2, g1_b1=9.0), PARAMETERS, TRUE, True),
+        (submodel(g1_a1=0.28, g1_b0=-3.2), PARAMETERS, TRUE, False),
+        (submodel(g1_a1=0.25, g1_b0=None), PARAMETERS, TRUE, False),
+        (submodel(g1_a1=0.25), PARAMETERS, TRUE, False),
+        (submodel(), PARAMETERS, TRUE, False),
+        (submodel(g1_a1=0.25, g1_b0=-3.0), PARAMETERS | {"fit_percent": 96.0}, TRUE, False),
+        (submodel(g1_a1=0.25, g1_b0=-3.0), PARAMETERS, {"delay": 0.0}, None),
+        (row() | {"numerator": [2.1], "denominator": [1.0, 2.9, 4.0]}, PARAMETERS, FRACTION, True),
+        (row() | {"numerator": [2.1], "denominator": [1.0, 2.5, 4.0]}, PARAMETERS, FRACTION, False),
+        (row() | {"numerator": [2.1], "denominator": [1.0, 2.9]}, PARAMETERS, FRACTION, False),
+        (row() | {"numerator": [9.0, 2.1], "denominator": [1.0, 2.9, 4.0]}, PARAMETERS, FRACTION, True),
     ],
 )
 def test_success_rule(
-    estimate: dict[str, Any], success: dict[str, Any] | None, true_delay: float | None, expected: bool | None
+    estimate: dict[str, Any], success: dict[str, Any] | None, truth: dict[str, float], expected: bool | None
 ) -> None:
-    truth = {} if true_delay is None else {"delay": true_delay}
-    assert is_converged(estimate, success, truth) is expected
+    arrays = arrays_of_rows([estimate])
+    hits = judged(success, truth, arrays, found_under(tuple(truth), arrays, 1).values, None)
+    assert (None if hits is None else hits.tolist()) == (None if expected is None else [expected])
 
 
-TRUE = {"g1_a1": 0.25, "g1_b0": -3.0}
-
-
-@pytest.mark.parametrize(
-    ("found", "status", "expected"),
-    [
-        ({"g1_a1": 0.27, "g1_b0": -3.2, "g1_b1": 9.0}, "MAX_ITERATIONS", True),
-        ({"g1_a1": 0.28, "g1_b0": -3.2}, "CONVERGED", False),
-        ({"g1_a1": 0.25, "g1_b0": None}, "CONVERGED", False),
-        ({"g1_a1": 0.25}, "CONVERGED", False),
-        (None, "CONVERGED", False),
-        ({"g1_a1": 0.25, "g1_b0": -3.0}, "FAILED", False),
-    ],
-)
-def test_success_rule_of_parameters(found: Any, status: str, expected: bool) -> None:
-    estimate = row(status) | {"parameters": found}
-    success = {"parameter_relative_error": 0.1, "delay_relative_error": None, "fit_percent": None}
-    assert is_converged(estimate, success, TRUE | {"delay": 0.0}) is expected
-    # Together with another rule both must hold, and without true parameters there is nothing to compare with.
-    assert is_converged(estimate, success | {"fit_percent": 96.0}, TRUE) is False
-    assert is_converged(estimate, success, {"delay": 0.0}) is None
-
-
-def test_success_rule_of_the_coefficients_of_a_transfer_function() -> None:
-    success = {"parameter_relative_error": 0.1}
-    found = row("CONVERGED") | {"numerator": [2.1], "denominator": [1.0, 2.9, 4.0]}
-    assert is_converged(found, success, {"b0": 2.0, "a1": 3.0, "a2": 4.0, "delay": 1.0}) is True
-    assert is_converged(found, success, {"b0": 2.0, "a1": 3.5, "a2": 4.0, "delay": 1.0}) is False
-    assert is_converged(found, success, {"b0": 2.0, "a1": 3.0, "delay": 1.0}) is False, "another number of poles"
+def test_coefficients_go_with_their_errors_by_their_power_of_s() -> None:
+    errors = {"b0": 0.3, "b1": 0.4, "a1": 0.1}
+    model = {"numerator": [9.0, 2.0], "denominator": [1.0, 3.0], "standard_errors": errors}
+    dropped = model | {"numerator": [2.0]}
+    two_zeros = {"numerator": [2.0], "denominator": [1.0, 3.0]}
+    arrays = arrays_of_rows([model, dropped, {"delay": 0.5}, two_zeros])
+    nan = np.nan
+    for names, values, deviations in (
+        (("b0", "a1"), [[2, 3], [2, 3], [nan] * 2, [2, 3]], [[0.4, 0.1], [0.4, 0.1], [nan] * 2, [nan] * 2]),
+        (("b0", "b1", "a1"), [[9, 2, 3], [0, 2, 3], [nan] * 3, [0, 2, 3]], None),
+    ):
+        found = found_under(names, arrays, 4)
+        np.testing.assert_array_equal(found.values, np.array(values, dtype=float))
+        if deviations is not None:
+            np.testing.assert_array_equal(found.standard_errors, np.array(deviations))
 
 
 def test_true_values_are_those_of_the_estimated_form() -> None:

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DamageError
+from ctid_cli.storage.announcement import announce
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import reading_journal
@@ -124,6 +125,30 @@ def test_what_can_be_read_of_damaged_results_is_kept(place: Path, export: bool) 
         kept = keep_readable(aside, log, MANIFEST, other, allow_mixed=allow_mixed)
         assert (kept.from_journal > 0) is allow_mixed
         log.close()
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5])
+def test_estimates_that_were_reported_and_are_lost_with_the_log_are_noticed(tmp_path: Path, kept: float) -> None:
+    place, dead = tmp_path / "toys", tmp_path / "dead"
+    place.mkdir()
+    dead.mkdir()
+    log = open_journal(place / "journal.sqlite")
+    session = log.begin(MANIFEST, ORIGIN, "now", {})
+    for outcome in outcomes_of(MANIFEST):
+        log.add([outcome], session)
+    announce(place, "toys", "now", 5, 5, log.count())
+    for name in ("journal.sqlite", "journal.sqlite-wal", "running.json"):
+        (dead / name).write_bytes((place / name).read_bytes())
+    log.close()
+    assert verify(dead).is_intact
+    data = bytearray((dead / "journal.sqlite-wal").read_bytes())
+    data[int(len(data) * kept) + 100] ^= 255
+    (dead / "journal.sqlite-wal").write_bytes(data)
+    assert not verify(dead).is_intact
+    with pytest.raises(DamageError, match="is damaged"):
+        read_estimates(dead)
+    with pytest.raises(DamageError, match="is damaged"):
+        open_journal(dead / "journal.sqlite")
 
 
 def run(spec: Path, out: Path, *more: str) -> list[str]:

@@ -8,7 +8,7 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.processors import in_threads
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.find import Left, Lines, strongest_lines, whiten
-from ctid_cli.tones.kernels import PARAMETERS, find_changes, fit_windows
+from ctid_cli.tones.tone_kernels import PARAMETERS, find_changes, fit_windows
 
 
 class WindowTones(NamedTuple):

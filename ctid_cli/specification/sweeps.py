@@ -1,0 +1,148 @@
+"""Lists of values to sweep: the combinations of a section, and complaints about some of them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel
+
+from ctid_cli.errors import OptionError
+from ctid_cli.specification.messages import Complaint
+from ctid_cli.specification.values import Swept
+from ctid_cli.specification.yaml_source import KeyPath
+
+if TYPE_CHECKING:
+    from ctid_cli.specification.sections import Section
+
+#: Combinations that one section may sweep, and data cells that one experiment may hold.
+MAX_COMBINATIONS = 100_000
+AnySection = TypeVar("AnySection", bound=BaseModel)
+#: A complaint, and the swept values that it is about.
+Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One combination of a section's swept values."""
+
+    values: dict[str, Any]
+    swept: dict[KeyPath, Any]
+    options: Any
+
+
+def variants(section: Section | None) -> list[Variant]:
+    """Return all combinations of a section's swept values, the last one changing fastest; none of no section."""
+    if section is None:
+        return []
+    return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
+
+
+def known_variants(section: Section | None) -> list[Variant]:
+    """Return the same, but none of a custom component: what its options mean is not known."""
+    return [] if section is None or section.custom else variants(section)
+
+
+def case_count(section: Any) -> int:
+    """Return the number of combinations of a section's swept values, before any of them is made."""
+    return math.prod(len(values) for _, values in _axes(section)) if isinstance(section, BaseModel) else 1
+
+
+def _axes(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, list[Any]]]:
+    for name, info in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, BaseModel):
+            yield from _axes(value, (*prefix, name))
+        elif isinstance(value, list) and any(isinstance(mark, Swept) for mark in info.metadata):
+            yield (*prefix, name), value
+
+
+def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], Section]]:
+    axes = list(_axes(section))
+    for point in itertools.product(*(values for _, values in axes)):
+        swept = {path: value for (path, _), value in zip(axes, point, strict=True)}
+        one = section
+        for path, value in swept.items():
+            one = replaced(one, path, value)
+        yield swept, one
+
+
+def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
+    """Return a section with another value at a place in it."""
+    name = str(path[0])
+    inner = value if len(path) == 1 else replaced(getattr(section, name), path[1:], value)
+    return section.model_copy(update={name: inner})
+
+
+def option_complaints(section: Section) -> list[Complaint]:
+    """Return what the option dataclass, if any, has against the values of a section."""
+    if section.target is None:
+        return []
+    axes = dict(_axes(section))
+    count = math.prod(map(len, axes.values()))
+    if count > MAX_COMBINATIONS:
+        return [((), f"the lists in this section combine to {count} cases; at most {MAX_COMBINATIONS} are allowed")]
+    failures: list[Failure] = []
+    tried: list[Mapping[KeyPath, Any]] = []
+    for swept, one in _combinations(section):
+        tried.append(swept)
+        try:
+            one.options()
+        except OptionError as refused:
+            path: KeyPath = (refused.field,) if refused.field else ()
+            if path in swept:
+                # Point at the offending item of the list; its value then needs no repetition.
+                failures.append(((*path, axes[path].index(swept[path])), str(refused), {}))
+            else:
+                failures.append((path, str(refused), swept))
+    return grouped(failures, tried)
+
+
+def grouped(failures: Iterable[Failure], tried: Sequence[Mapping[KeyPath, Any]]) -> list[Complaint]:
+    """Return complaints about combinations, each once, with the swept values that decide on it."""
+    groups: dict[Complaint, list[Mapping[KeyPath, Any]]] = {}
+    for path, message, swept in failures:
+        groups.setdefault((path, message), []).append(swept)
+    complaints: list[Complaint] = []
+    for (path, message), found in groups.items():
+        names = [name for name in found[0] if len(_texts(name, found)) < len(_texts(name, tried))]
+        if not names and len(found) < len(tried):
+            names = list(found[0])
+        if names:
+            texts = {name: ".".join(map(str, name)) for name in names}
+            each = [", ".join(f"{text} = {json.dumps(one[name])}" for name, text in texts.items()) for one in found]
+            labels = list(dict.fromkeys(each))
+            more = f"; and {len(labels) - 3} more" if len(labels) > 3 else ""
+            message += f" (with {'; '.join(labels[:3])}{more})"
+        complaints.append((path, message))
+    return complaints
+
+
+def _texts(name: KeyPath, swept: Iterable[Mapping[KeyPath, Any]]) -> set[str]:
+    return {json.dumps(one[name]) for one in swept}
+
+
+def over(
+    sections: Mapping[KeyPath, Sequence[Variant]],
+    check: Callable[..., Iterable[Complaint]],
+    at_most: int | None = None,
+) -> list[Complaint]:
+    """Return what a check of options says about the combinations of several sections' variants.
+
+    Swept values are called by the place that their section's variants are given under.
+    """
+    failures: list[Failure] = []
+    tried: list[Mapping[KeyPath, Any]] = []
+    for case in itertools.islice(itertools.product(*sections.values()), at_most):
+        tried.append(swept_in(dict(zip(sections, case, strict=True))))
+        failures += [(path, text, tried[-1]) for path, text in check(*(variant.options for variant in case))]
+    return grouped(failures, tried)
+
+
+def swept_in(case: Mapping[KeyPath, Variant]) -> dict[KeyPath, Any]:
+    """Return the swept values of a combination of several sections' variants, by their places."""
+    return {(*at, *path): value for at, variant in case.items() for path, value in variant.swept.items()}

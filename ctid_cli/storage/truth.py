@@ -1,0 +1,151 @@
+"""Estimates compared with the true values: their numbers under the true names, and the rule of success.
+
+An estimate has *converged* if it satisfies every condition of the specification's ``success``:
+
+- ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
+- ``fit_percent``: the fit on the record it was estimated from is at least this [%];
+- ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
+- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
+  counted from the start, and after its last step from that.
+
+Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
+settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
+converged and counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
+
+What is compared are the arrays of ``runs.h5`` by name; :func:`arrays_of_rows` makes them of rows.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.storage import columns
+from ctid_cli.storage.column_arrays import AnyArray, ColumnWriter, names_of
+
+#: Columns with what estimates are compared by.
+_NAMES = ["status", "fit_percent", "delay", "numerator", "denominator", "parameters", "standard_errors", "quantiles"]
+_COLUMNS = [column for column in columns.COLUMNS if column.name in _NAMES]
+#: Arrays that the values under true names are found in, and those of their standard errors and quantiles.
+VALUES = ("delay", "numerator", "numerator_length", "denominator", "denominator_length", "parameters")
+ERRORS = ("standard_errors", "standard_errors_present", "quantiles")
+
+
+class Found(NamedTuple):
+    """Numbers of estimates under the names of the true parameters, NaN where there is none, shape (n, p)."""
+
+    values: Array
+    standard_errors: Array
+    #: Standard errors to each side of 95 % intervals [-].
+    quantiles: Array
+
+
+def arrays_of_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
+    """Return what rows are compared by, as arrays."""
+    arrays: dict[str, AnyArray] = {}
+    for column in _COLUMNS:
+        writer = ColumnWriter(column)
+        writer.include(rows)
+        arrays |= writer.arrays(rows)
+        if column.type == "by name":
+            arrays[names_of(column.name)] = np.array(writer.names, dtype=object)
+    return arrays
+
+
+def found_of_rows(rows: Sequence[Mapping[str, Any]], names: Iterable[str]) -> Found:
+    """Return numbers of rows under the true names."""
+    return found_under(tuple(names), arrays_of_rows(rows), len(rows))
+
+
+def found_under(names: Sequence[str], arrays: Mapping[str, AnyArray], count: int) -> Found:
+    """Return estimated values, standard errors and quantiles of intervals under the names of the true ones.
+
+    Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
+    ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
+    """
+    values, errors, quantiles = (_by_name(name, arrays) for name in ("parameters", "standard_errors", "quantiles"))
+    if "delay" in arrays:
+        values["delay"] = arrays["delay"]
+    poles, zeros = _count("a", names), _count("b", names)
+    if poles and "numerator" in arrays:
+        lengths = arrays["numerator_length"]
+        alike = (arrays["denominator_length"] == poles + 1) & (lengths >= 0)
+        if alike.any():
+            _add_coefficients(values, arrays, alike, poles, zeros)
+            # A leading zero is dropped by the model; the names of its standard errors keep their powers.
+            there = arrays.get("standard_errors_present", np.zeros((count, 0)))
+            own = [there[:, k] for k, name in enumerate(errors) if re.fullmatch(r"b\d+", name)]
+            longest = np.maximum(lengths, np.sum(own, axis=0, dtype=int) if own else 0)
+            for numbers in (errors, quantiles):
+                _shift_numerator(numbers, alike, longest - zeros, zeros)
+    none = np.full(count, np.nan)
+    wanted = [[numbers.get(name, none) for name in names] for numbers in (values, errors, quantiles)]
+    return Found(*(np.array(some, dtype=np.float64).reshape(len(names), count).T for some in wanted))
+
+
+def _by_name(name: str, arrays: Mapping[str, AnyArray]) -> dict[str, Array]:
+    """Return numbers by name, each shape (n,)."""
+    return dict(zip(arrays[names_of(name)], arrays[name].T, strict=True)) if name in arrays else {}
+
+
+def _count(letter: str, names: Iterable[str]) -> int:
+    """Return how many of some names are those of coefficients."""
+    return sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names)
+
+
+def _add_coefficients(
+    values: dict[str, Array], arrays: Mapping[str, AnyArray], alike: BoolArray, poles: int, zeros: int
+) -> None:
+    """Put coefficients under the true names where the model has as many poles as the system."""
+    numerator, denominator, none = arrays["numerator"], arrays["denominator"], np.full(len(alike), np.nan)
+    for k in range(1, poles + 1):
+        values[f"a{k}"] = np.where(alike, denominator[:, k], values.get(f"a{k}", none))
+    for k in range(zeros):
+        places = k + arrays["numerator_length"] - zeros
+        own = numerator[np.arange(len(alike)), np.clip(places, 0, numerator.shape[1] - 1)]
+        values[f"b{k}"] = np.where(alike, np.where(places < 0, 0.0, own), values.get(f"b{k}", none))
+
+
+def _shift_numerator(numbers: dict[str, Array], alike: BoolArray, shifts: IndexArray, zeros: int) -> None:
+    """Put numbers of coefficients ``b`` under the true names, which are so many powers further in each model."""
+    none, own = np.full(len(alike), np.nan), dict(numbers)
+    for k in range(zeros):
+        found = own.get(f"b{k}", none)
+        for shift in np.unique(shifts[alike]).tolist():
+            found = np.where(alike & (shifts == shift), own.get(f"b{k + shift}", none), found)
+        numbers[f"b{k}"] = found
+
+
+def failures(arrays: Mapping[str, AnyArray]) -> BoolArray:
+    """Return which estimates failed."""
+    return np.isin(arrays["status"], [name.encode() for name in columns.FAILURES])
+
+
+def judged(
+    success: Mapping[str, Any] | None,
+    truth: Mapping[str, float],
+    arrays: Mapping[str, AnyArray],
+    values: Array,
+    measures: Sequence[Mapping[str, float | None] | None] | None,
+) -> BoolArray | None:
+    """Return which estimates satisfy the rule of success, from their values under the true names; None without one."""
+    rule, found = success or {}, dict(zip(truth, values.T, strict=True))
+    conditions: list[BoolArray] = []
+    if rule.get("delay_relative_error") is not None and "delay" in truth:
+        conditions.append(_near(found["delay"], truth["delay"], rule["delay_relative_error"]))
+    others = truth.keys() - {"delay"}
+    if rule.get("parameter_relative_error") is not None and others:
+        conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
+    if rule.get("band") is not None and measures is not None:
+        from ctid_cli.simulation.frequency_measures import is_settled
+
+        conditions.append(np.array([is_settled(one, rule["band"], rule.get("by")) for one in measures], dtype=bool))
+    if rule.get("fit_percent") is not None:
+        conditions.append(arrays["fit_percent"] >= rule["fit_percent"])
+    return np.logical_and.reduce([~failures(arrays), *conditions]) if conditions else None
+
+
+def _near(values: Array, true: float, tolerance: float) -> BoolArray:
+    return np.abs(values - true) <= tolerance * abs(true)
