@@ -72,8 +72,12 @@ def test_flags_say_what_is_wrong(options):
     assert flags("an alias") & Flag.INCONSISTENT
 
 
+#: So slow that it is still near the old frequencies when the judged rows have nearly forgotten the step.
+SLOW = DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.1, power="literal")
+
+
 @pytest.mark.parametrize("jump", [True, False])
-@pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
+@pytest.mark.parametrize("options", [*ONLINE, SLOW], ids=lambda options: options.kind)
 def test_no_estimate_from_before_a_step_stays_valid(options, jump):
     true = np.where(T[:, None] < 30.0, [1.8, 3.2], [2.0, 3.0])
     phase = true * T[:, None] if jump else np.vstack([np.zeros(2), np.cumsum(true[:-1], axis=0)]) * INTERVAL
@@ -81,6 +85,16 @@ def test_no_estimate_from_before_a_step_stays_valid(options, jump):
     error = np.abs(track.frequencies - true).max(axis=1)
     assert track.valid[2990:3000].all()
     assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual shows it
+
+
+@pytest.mark.parametrize("options", [{}, {"gated": False}, {"power": "literal"}])
+def test_an_estimate_that_converges_stays_valid(options):
+    # Its residuals sink below what second moments can show.
+    tuning = {"h": 0.1, "d": 0.13, "epsilon": 100.0, "gamma": 0.005, "initial_frequencies": (2.0, 5.0)}
+    track = DremGradient(tones=2, **tuning, **options).track(CLEAN, INTERVAL)
+    assert track.valid[-500:].all()
+    assert track.valid[np.argmax(track.valid) :].all()
+    assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 1e-3
 
 
 @pytest.mark.parametrize("omega", [3.2, 4.0, 6.0, 7.0, 8.5, 11.0, 20.0, 60.0])
