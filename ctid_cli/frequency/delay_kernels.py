@@ -234,20 +234,14 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
             return COMPLEX_ROOTS
     flags = 0
     if not real_roots(polynomial, work, roots):
-        # Real parts of the eigenvalues of the companion matrix, sorted by insertion.
+        # Real parts of the eigenvalues of the companion matrix.
         flags = COMPLEX_ROOTS
         companion = np.zeros((n, n), np.complex128)
         for k in range(n):
             companion[0, k] = -theta[k]
             if k > 0:
                 companion[k, k - 1] = 1.0
-        parts = np.linalg.eigvals(companion).real
-        for i in range(n):
-            place = i
-            while place > 0 and roots[place - 1] < parts[i]:
-                roots[place] = roots[place - 1]
-                place -= 1
-            roots[place] = parts[i]
+        roots[:] = np.sort(np.linalg.eigvals(companion).real)[::-1]
     # The largest cosine is that of the lowest frequency, and order survives the bounds.
     for i in range(n):
         if roots[i] < clock.bottom or roots[i] > clock.top:

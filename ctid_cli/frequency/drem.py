@@ -167,8 +167,8 @@ class DremFiniteTime(DremGradient):
     the regressors hold the noisy signal: a prefilter in front reduces the bias, a smaller gain does not.
 
     An estimate is valid if the regressions of the last ``4 n h`` bear it out: their residuals bound the error of each
-    frequency that they can show; and if the frequencies explain the signal at a second delay. A row that contradicts the
-    estimate invalidates it until all these rows are newer.
+    frequency that they can show; and if the frequencies explain the signal at a second delay. A row that contradicts
+    the estimate invalidates it until all these rows are newer.
 
     References
     ----------
