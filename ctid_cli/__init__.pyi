@@ -75,13 +75,11 @@ from .filtering.filter_set import FilterSet as FilterSet, check_filters as check
 from .estimation.redundancy import RedundantMinimum as RedundantMinimum, minimise_redundantly as minimise_redundantly
 
 # Frequencies of signals
-from .frequency.base import Flag as Flag, FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
-from .frequency.drem_gradient import DremGradient as DremGradient
-from .frequency.drem_finite_time import DremFiniteTime as DremFiniteTime
-from .frequency.drem_window import DremWindow as DremWindow
+from .frequency.flags import Flag as Flag
+from .frequency.base import FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
+from .frequency.drem import DremGradient as DremGradient, DremFiniteTime as DremFiniteTime, DremWindow as DremWindow
 from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
 from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
-from .frequency.tracking import FrequencyEstimate as FrequencyEstimate, Tracker as Tracker
 
 # Tones of recorded signals
 from .tones.track import MissingLine as MissingLine, Track as Track, track as track

@@ -42,9 +42,9 @@ KINDS: dict[str, dict[str, str]] = {
         "additive_srivc": "ctid_cli.estimators.additive_srivc:AdditiveSrivc",
     },
     "frequency_estimator": {
-        "drem_gradient": "ctid_cli.frequency.drem_gradient:DremGradient",
-        "drem_finite_time": "ctid_cli.frequency.drem_finite_time:DremFiniteTime",
-        "drem_window": "ctid_cli.frequency.drem_window:DremWindow",
+        "drem_gradient": "ctid_cli.frequency.drem:DremGradient",
+        "drem_finite_time": "ctid_cli.frequency.drem:DremFiniteTime",
+        "drem_window": "ctid_cli.frequency.drem:DremWindow",
         "restarting_least_squares": "ctid_cli.frequency.restarting_least_squares:RestartingLeastSquares",
     },
 }

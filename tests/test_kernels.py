@@ -16,7 +16,7 @@ from types import CodeType
 import pytest
 
 import ctid_cli
-from ctid_cli.frequency import frequency_kernels
+from ctid_cli.frequency import delay_kernels
 from ctid_cli.frequency.flags import Flag
 
 #: Packages that a kernel may use: Numba compiles what it knows of them into it.
@@ -93,10 +93,10 @@ def test_kernels_read_nothing_of_other_files():
         ("@njit\ndef kernel(x):\n    return x + MOST_TONES", {"MOST_TONES"}),
         ("TWICE = 2 * MOST_TONES\nHALF = TWICE / 4\n@njit\ndef kernel(x):\n    return x + HALF", {"MOST_TONES"}),
         ("@njit\ndef kernel(x):\n    return [y + MOST_TONES for y in x]", {"MOST_TONES"}),
-        ("@njit\ndef kernel(x):\n    return convolve(x, x, x)", {"convolve"}),
-        ("@njit\ndef kernel(x):\n    return inputs.LARGEST_SAMPLE", {"inputs"}),
-        ("@njit\ndef kernel(x: Output):\n    return x.omega", {"Output"}),
-        ("class Pair(NamedTuple):\n    one: Output\n@njit\ndef kernel(x: Pair):\n    return x.one", {"Output"}),
+        ("@njit\ndef kernel(x):\n    return add_row(x, x)", {"add_row"}),
+        ("@njit\ndef kernel(x):\n    return base.LARGEST_SAMPLE", {"base"}),
+        ("@njit\ndef kernel(x: Clock):\n    return x.delay", {"Clock"}),
+        ("class Pair(NamedTuple):\n    one: Clock\n@njit\ndef kernel(x: Pair):\n    return x.one", {"Clock"}),
         ("@njit\ndef kernel(x: Any):\n    return x", {"Any"}),
         (
             "def made(k):\n    @njit\n    def kernel(x):\n        return k\n    return kernel\nkernel = made(1)",
@@ -110,10 +110,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 from ctid_cli.arrays import Array
-from ctid_cli.frequency import inputs
-from ctid_cli.frequency.inputs import MOST_TONES
-from ctid_cli.frequency.frequency_kernels import Output
-from ctid_cli.frequency.prefilter import convolve
+from ctid_cli.frequency import base
+from ctid_cli.frequency.base import MOST_TONES
+from ctid_cli.frequency.delay_kernels import Clock, add_row
 OWN = 3
 """
     (tmp_path / "case.py").write_text(head + source)
@@ -130,7 +129,7 @@ OWN = 3
 
 def test_flags_of_kernels_are_those_of_estimates():
     bits = list(Flag)[:8]
-    assert [getattr(frequency_kernels, flag.name) for flag in bits] == bits
+    assert [getattr(delay_kernels, flag.name) for flag in bits] == bits
 
 
 #: A kernel that calls another one of its file, which reads a constant of it.

@@ -1,10 +1,9 @@
-"""Frequencies of multi-sinusoidal signals: online estimators and batch references.
+"""Frequencies of multi-sinusoidal signals in finite time, of whole records or sample by sample.
 
-An online estimator is a frozen dataclass of options. ``tracker = options.start(interval)`` takes samples one by one,
-``tracker.update(sample)``, or many at once, ``tracker.run(samples)``, with the same numbers bit for bit;
-``tracker.state()`` and ``options.restore(interval, state)`` stop and go on in the middle of a signal. A batch estimator
-(``online`` is False) has ``options.estimate(samples, interval)``. Every estimate carries flags that say why it must not
-be trusted, if so, and a sentence for each.
+An estimator is a frozen dataclass of options. ``options.track(samples, interval)`` gives the frequencies at every
+sample of a record; ``online = options.start(interval)`` takes one sample after the other, ``online.update(sample)``,
+with the same numbers up to rounding. Every row carries flags that say why it must not be trusted, if so, and a sentence
+for each.
 
 The recommended tracker is :class:`RestartingLeastSquares` with a prefilter. :class:`DremGradient`,
 :class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones. :func:`fit_sinusoids` finds

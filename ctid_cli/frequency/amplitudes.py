@@ -7,18 +7,11 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.frequency_kernels import flag_uncertain
-from ctid_cli.frequency.inputs import LARGEST_SAMPLE, MOST_TONES, series_of
-from ctid_cli.frequency.tracking import FrequencyEstimate
+from ctid_cli.frequency.base import LARGEST_SAMPLE, MOST_TONES, series_of
 from ctid_cli.signals.checks import require_positive
 
 #: Below this ratio of the singular values the sinusoids cannot be told apart.
 SINGULAR = 1e-10
-#: A residual below this fraction of the signal (root mean squares) is rounding, and may as well be this large.
-ROUNDING = 1e-13
-#: Probability with which white noise alone has a tone that is called one.
-FALSE_TONE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +97,7 @@ def fit_sinusoids(samples: ArrayLike, interval: float, omega: ArrayLike, *, bias
         require_positive("omega", float(frequency), "rad/s")
     # The middle of the record as origin of time: sines and cosines are then as different as the record allows.
     middle = 0.5 * (t[0] + t[-1])
-    _, coefficients, residual = fit_amplitudes(y, t - middle, frequencies, bias=bias)
+    coefficients, residual = fit_amplitudes(y, t - middle, frequencies, bias=bias)
     n = frequencies.size
     phases = np.arctan2(coefficients[n : 2 * n], coefficients[:n]) - frequencies * middle
     phases = np.pi - np.mod(np.pi - phases, 2.0 * np.pi)
@@ -122,8 +115,8 @@ def present_samples(samples: ArrayLike, interval: float) -> tuple[Array, Array]:
     return values[places], interval * places.astype(np.float64)
 
 
-def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, Array]:
-    """Sines, cosines and, if asked for, a constant by least squares: columns, coefficients, residual."""
+def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array]:
+    """Fit sines, cosines and, if asked for, a constant by least squares; return coefficients and residual."""
     angles = t[:, None] * omega
     design = np.hstack([np.sin(angles), np.cos(angles), np.ones((t.size, int(bias)))])
     count, unknowns = design.shape
@@ -133,47 +126,4 @@ def fit_amplitudes(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Arr
     if singular_values[-1] < SINGULAR * singular_values[0]:
         close = "too close to each other, to zero or to a multiple of the sampling frequency for so short a record"
         raise DataError(f"the samples cannot tell the sinusoids apart: frequencies are {close}.")
-    return design, coefficients, y - design @ coefficients
-
-
-def frequency_errors(y: Array, t: Array, omega: Array, *, bias: bool) -> tuple[Array, Array, float]:
-    r"""Gauss-Newton step of the frequencies, and the error that the residual could make."""
-    n = omega.size
-    time = t - 0.5 * (t[0] + t[-1])
-    design, coefficients, residual = fit_amplitudes(y, time, omega, bias=bias)
-    slopes = time[:, None] * (design[:, n : 2 * n] * coefficients[:n] - design[:, :n] * coefficients[n : 2 * n])
-    # What of the slopes the amplitudes cannot follow.
-    orthogonal, _ = np.linalg.qr(design)
-    slopes -= orthogonal @ (orthogonal.T @ slopes)
-    misfit, floor = float(residual @ residual), ROUNDING**2 * float(y @ y)
-    scales = np.linalg.norm(slopes, axis=0)
-    if not (scales > 0).all():
-        return np.zeros(n), np.full(n, np.inf), misfit
-    q, r = np.linalg.qr(slopes / scales)
-    if np.abs(np.diag(r)).min() < SINGULAR:
-        return np.zeros(n), np.full(n, np.inf), misfit
-    inverse = np.linalg.inv(r)
-    step = inverse @ (q.T @ residual) / scales
-    return step, np.linalg.norm(inverse, axis=1) / scales * np.sqrt(misfit + floor), misfit
-
-
-def estimate_of(y: Array, t: Array, omega: Array, uncertainty: Array, flags: Flag, *, bias: bool) -> FrequencyEstimate:
-    r"""The estimate of a whole record, with the flags that its uncertainties and its amplitudes call for.
-
-    The weakest tone is compared with the strongest that white noise of the residual's size would seem to have: each of
-    the N/2 ordinates of the periodogram of white noise of variance s^2 exceeds ``N A^2/4 = g s^2`` with the probability
-    ``exp(-g)``, the largest with ``N/2 exp(-g)`` (R. A. Fisher, "Tests of significance in harmonic analysis", *Proc.
-    Royal Society A* 125 (1929) 54-59, for many samples).
-    """
-    n, length = omega.size, float(t[-1] - t[0])
-    flags |= Flag(flag_uncertain(omega, uncertainty, np.zeros(n), length, length))
-    try:
-        _, coefficients, residual = fit_amplitudes(y, t - 0.5 * (t[0] + t[-1]), omega, bias=bias)
-    except DataError:
-        return FrequencyEstimate(omega, flags | Flag.UNDETERMINED, uncertainty)
-    variance = float(residual @ residual) / max(y.size - coefficients.size - n, 1)
-    weakest = float((coefficients[:n] ** 2 + coefficients[n : 2 * n] ** 2).min())
-    strongest_of_noise = 4.0 * variance / y.size * np.log(0.5 * y.size / FALSE_TONE)
-    if not weakest > strongest_of_noise:
-        flags |= Flag.UNDETERMINED
-    return FrequencyEstimate(omega, flags, uncertainty)
+    return coefficients, y - design @ coefficients

@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import IntFlag
 from typing import ClassVar
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
 from ctid_cli.text import ShownAsTable
 
@@ -24,50 +24,6 @@ from ctid_cli.text import ShownAsTable
 MOST_TONES = 8
 #: A sample larger than this counts as missing: its powers would overflow.
 LARGEST_SAMPLE = 1e30
-
-
-class Flag(IntFlag):
-    """Reasons for which an estimate is marked invalid; an estimate is valid exactly if it has none.
-
-    Notes
-    -----
-    Tracks store the flags as unsigned 16-bit integers; ``track.flags & Flag.GAP`` selects one reason.
-    """
-
-    STARTING = 1
-    GAP = 2
-    CHANGED = 4
-    UNDETERMINED = 8
-    UNCERTAIN = 16
-    COMPLEX_ROOTS = 32
-    OUT_OF_BOUNDS = 64
-    INCONSISTENT = 128
-    NOT_CONVERGED = 256
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """One sentence for each flag that is set: what happened, and what to change."""
-        return tuple(MEANINGS[flag] for flag in Flag if flag in self)
-
-
-#: What each flag tells the user.
-MEANINGS: dict[Flag, str] = {
-    Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
-    Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
-    Flag.CHANGED: "The signal changed: the estimate is held until all samples from before have left the delays.",
-    Flag.UNDETERMINED: "The signal has fewer tones, or two that look alike at this delay; use fewer tones.",
-    Flag.UNCERTAIN: (
-        "Noise, a bias or another tone may move a frequency by a tenth of itself or of the distance to the next one; "
-        "use a prefilter, more tones or a longer record."
-    ),
-    Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
-    Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
-    Flag.INCONSISTENT: (
-        "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one (use a "
-        "smaller h), or the estimate lags behind a change."
-    ),
-    Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,16 @@
 """Frequencies by least squares on the delay regression, restarted when the signal changes: the recommended tracker."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.delay_options import ROWS_PER_TONE, DelayRegression
-from ctid_cli.frequency.frequency_kernels import DETECTOR_SPAN, Fit, Restarting, advance_restarting
-from ctid_cli.frequency.tracking import Recursion
+from ctid_cli.frequency.delay_kernels import Fit, Restarting, restarting_fits
+from ctid_cli.frequency.delay_regression import ROWS_PER_TONE, DelayRegression, Online
 from ctid_cli.signals.checks import require_choice, require_positive
 
 Solution = Literal["least_squares", "total_least_squares"]
@@ -16,6 +18,7 @@ Solution = Literal["least_squares", "total_least_squares"]
 #: The data that the detector needs before it may raise an alarm: so many h, and so many lengths of the prefilter.
 ARMING_SPAN = 1.43
 ARMING_PREFILTERS = 2
+#: The halves of the data are first compared after so many lengths of the prefilter.
 MIXED_PREFILTERS = 8
 #: Memory if none is given, in units of h.
 DEFAULT_MEMORY = 100.0
@@ -71,8 +74,8 @@ class RestartingLeastSquares(DelayRegression):
     >>> t = 0.01 * np.arange(3000)
     >>> w = np.where(t < 15, 1.8, 2.0)
     >>> y = np.sin(w * t) + np.cos(3 * t) + 0.1 * np.random.default_rng(0).standard_normal(3000)
-    >>> track = RestartingLeastSquares(tones=2, h=0.7, prefilter=1.0).start(0.01).run(y)
-    >>> track.omega[[1400, 2900]].round(2), track.valid[[1400, 1700, 2900]]
+    >>> track = RestartingLeastSquares(tones=2, h=0.7, prefilter=1.0).track(y, 0.01)
+    >>> track.frequencies[[1400, 2900]].round(2), track.valid[[1400, 1700, 2900]]
     (array([[1.8, 3. ],
            [2. , 3. ]]), array([ True, False,  True]))
     """
@@ -89,33 +92,43 @@ class RestartingLeastSquares(DelayRegression):
         if self.memory is not None:
             require_positive("memory", self.memory, "s")
 
-    def _recursion(self, interval: float) -> Recursion:
-        n, clock, weights = self.tones, self._clock(interval), self._weights(interval)
-        length = weights.size - 1
-        memory = DEFAULT_MEMORY * clock.delay if self.memory is None else self.memory
-        self._require_samples(memory, memory / interval, interval)
-        arming = max(round(ARMING_SPAN * clock.lag), 2 * ROWS_PER_TONE * n)
+    def start(self, interval: float) -> Online:
+        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        return OnlineRestarting(self, interval)
+
+
+class OnlineRestarting(Online):
+    """The restarting fit, sample by sample."""
+
+    def __init__(self, options: RestartingLeastSquares, interval: float) -> None:
+        super().__init__(options, interval)
+        n, lag, length = options.tones, self.clock.lag, self.weights.size - 1
+        memory = DEFAULT_MEMORY * self.clock.delay if options.memory is None else options.memory
+        options.require_samples(memory, memory / interval, interval)
+        arming = max(round(ARMING_SPAN * lag), 2 * ROWS_PER_TONE * n)
         whitener = np.empty((0, 0))
-        if self.solution == "total_least_squares":
-            covariance = noise_covariance(clock.table, weights, clock.lag)
+        if options.solution == "total_least_squares":
+            covariance = noise_covariance(self.table, self.weights, lag)
             whitener = np.ascontiguousarray(np.linalg.inv(np.linalg.cholesky(covariance)))
-        settings = Restarting(
-            max(1, round(DETECTOR_SPAN * clock.lag)),
-            max(arming, ARMING_PREFILTERS * length),
-            max(arming, MIXED_PREFILTERS * length),
-            self._rows_before_valid(clock),
-            length + 2 * n * clock.lag + 1,
-            memory / interval,
-            whitener,
+        self._settings = Restarting(
+            armed=max(arming, ARMING_PREFILTERS * length),
+            compared=max(arming, MIXED_PREFILTERS * length),
+            enough=options.rows_before_valid(self.clock),
+            flush=length + 2 * n * lag + 1,
+            memory=memory / interval,
+            whitener=whitener,
         )
-        samples, estimate = np.full(2 * n * clock.lag + 1, np.nan), np.full((3, n), np.nan)
-        newer, older, check = np.zeros((3, n + 1, n + 1))
-        fit = Fit(samples, newer, older, check, estimate, np.zeros(4), np.zeros(6, np.int64))
-        return Recursion(advance_restarting, (clock, settings), (fit,), weights, notes=self._notes(clock))
+        older, newer, check = np.zeros((3, n + 1, n + 1))
+        self._fit = Fit(older, newer, check, np.full(n, np.nan), np.full(n, np.nan), np.zeros(4), np.zeros(5, np.int64))
+
+    def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
+        """Take samples, and write the frequencies and the flags at their instants."""
+        rows, second_rows = self.rows(samples)
+        restarting_fits(rows, second_rows, np.isnan(samples), self.clock, self._settings, self._fit, omega, flags)
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
-    """Covariance of the regression rows of filtered white noise."""
+    """Return the covariance of the regression rows of filtered white noise."""
     places = np.arange(table.shape[1])
     correlation = np.array([weights[j * lag :] @ weights[: max(weights.size - j * lag, 0)] for j in places])
     R = correlation[np.abs(places[:, None] - places)] / correlation[0]

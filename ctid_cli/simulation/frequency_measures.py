@@ -27,7 +27,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.frequency.base import Flag, FrequencyEstimator, FrequencyTrack
+from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb

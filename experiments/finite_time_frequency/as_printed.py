@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.regression import determinant_from_tones, theta_of
+from ctid_cli.frequency.delay_regression import theta_of
 from ctid_cli.reporting.layout import Table, number
 from ctid_cli.studies.catalogue import find_study
 
@@ -58,11 +58,25 @@ def settled(estimator: Any, name: str, samples: Array) -> str:
     return f"{time:.3g}" if np.isfinite(time) else "never"
 
 
+def determinant_from_tones(parts: Array, omega: Array, lag: int, spacing: int) -> Array:
+    """Determinant of the stacked regressors by its closed form.
+
+    ``phi(t) = 2^n sum_i [c_i^(n-1) ... c_i 1] y_i(t - n h)``, hence
+    ``det = 2^(n n) det[y_i(t - n h - j d)] prod_(i<j) (c_i - c_j)``.
+    """
+    count, n = parts.shape
+    c = np.cos(omega * lag * INTERVAL)
+    vandermonde = np.prod([c[i] - c[j] for i in range(n) for j in range(i + 1, n)])
+    instants = np.arange(2 * n * lag + (n - 1) * spacing, count)
+    stacked = parts[instants[:, None] - n * lag - spacing * np.arange(n)]
+    return np.asarray(2.0 ** (n * n) * vandermonde * np.linalg.det(stacked))
+
+
 def rms_determinant(name: str, h: float, d: float) -> float:
     """Root mean square of the determinant of the mixed regression."""
     delays = (round(h / INTERVAL), round(d / INTERVAL))
-    determinant = determinant_from_tones(tones(name), np.array(EXPERIMENTS[name][1]), *delays, INTERVAL)
-    return float(np.sqrt(np.nanmean(determinant**2)))
+    determinant = determinant_from_tones(tones(name), np.array(EXPERIMENTS[name][1]), *delays)
+    return float(np.sqrt(np.mean(determinant**2)))
 
 
 def epsilon() -> Iterator[list[str]]:

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.drem_finite_time import DremFiniteTime
-from ctid_cli.frequency.drem_gradient import DremGradient
-from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.base import FrequencyTrack
+from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
-from ctid_cli.frequency.tracking import FrequencyTrack
 from ctid_cli.studies.claim import Claim, near, within
 
 #: Standard deviation of noise between -0.2 and 0.2.
@@ -81,7 +79,7 @@ def signal(name: str, interval: float, duration: float, seed: int | None = None,
 def settle(track: FrequencyTrack, truth: Array, band: float, since: float = 0.0, until: float = np.inf) -> float:
     """Time after `since` from which on both errors stay below a band; infinite if they do not."""
     chosen = (track.t >= since - 1e-9) & (track.t < until - 1e-9)
-    error = np.abs(track.omega - truth).max(axis=1)[chosen]
+    error = np.abs(track.frequencies - truth).max(axis=1)[chosen]
     outside = np.flatnonzero(~(error < band))
     if not outside.size:
         return 0.0
@@ -117,14 +115,14 @@ def tracker(prefilter: float = 1.0, h: float = 0.7, **options: Any) -> Restartin
 
 def exact(interval: float = 0.001, slack: int = 0) -> Iterator[Claim]:
     """Finite time without noise; `slack` samples for a coarser clock."""
-    track = drem(DremFiniteTime, "A").start(interval).run(signal("A", interval, 60.0))
+    track = drem(DremFiniteTime, "A").track(signal("A", interval, 60.0), interval)
     first = round(0.66 / interval) + slack
-    yield at_most("A: error from 0.66 s on", np.abs(track.omega[first:] - TRUTH).max(), 1e-8)
+    yield at_most("A: error from 0.66 s on", np.abs(track.frequencies[first:] - TRUTH).max(), 1e-8)
     yield at_most("A: valid samples before", track.valid[: round(0.66 / interval)].sum(), 0)
     for first_row, begin in ((1, 3.6), (0, 3.2)):
-        track = drem(DremFiniteTime, "D", first_row=first_row).start(interval).run(signal("D", interval, 30.0))
+        track = drem(DremFiniteTime, "D", first_row=first_row).track(signal("D", interval, 30.0), interval)
         first = round(begin / interval)
-        error = np.abs(track.omega - stepped(interval, 30.0)[0]).max(axis=1)
+        error = np.abs(track.frequencies - stepped(interval, 30.0)[0]).max(axis=1)
         yield at_most(f"D, first row {first_row}: error from {begin} s on", error[first + slack :].max(), 1e-10)
         yield within(f"D, first row {first_row}: error just before", error[first - 1], low=0.01)
         yield at_most(f"D, first row {first_row}: valid samples before", track.valid[:first].sum(), 0)
@@ -132,32 +130,32 @@ def exact(interval: float = 0.001, slack: int = 0) -> Iterator[Claim]:
 
 def gradient(interval: float = 0.001) -> Iterator[Claim]:
     """Settling times of the gradient estimate."""
-    track = drem(DremGradient, "A").start(interval).run(signal("A", interval, 60.0))
+    track = drem(DremGradient, "A").track(signal("A", interval, 60.0), interval)
     for band, target in ((0.05, 10.14), (0.01, 13.66), (1e-3, 19.57)):
         yield near(f"A within {band:g} [s]", settle(track, TRUTH, band), target, 0.05)
-    track = drem(DremGradient, "A", gated=False).start(interval).run(signal("A", interval, 60.0))
+    track = drem(DremGradient, "A", gated=False).track(signal("A", interval, 60.0), interval)
     yield near("A within 0.05, zero-filled [s]", settle(track, TRUTH, 0.05), 15.4, 0.3)
     truth = stepped(interval)[0]
-    track = drem(DremGradient, "D").start(interval).run(signal("D", interval, 90.0))
+    track = drem(DremGradient, "D").track(signal("D", interval, 90.0), interval)
     for band, before, after in ((0.05, 6.34, 6.33), (0.01, 8.26, 9.97), (1e-3, 10.80, 15.55)):
         yield near(f"D within {band:g} before the step [s]", settle(track, truth, band, 0.0, STEP), before, 0.05)
         yield near(f"D within {band:g} after the jump [s]", settle(track, truth, band, STEP), after, 0.05)
-    track = drem(DremGradient, "D").start(interval).run(signal("D", interval, 90.0, jump=False))
+    track = drem(DremGradient, "D").track(signal("D", interval, 90.0, jump=False), interval)
     yield near("D within 0.001 after the step, continuous [s]", settle(track, truth, 1e-3, STEP), 14.1, 0.1)
 
 
 def disturbed(interval: float = 0.001) -> Iterator[Claim]:
     """A tone that the model does not have."""
-    track = drem(DremFiniteTime, "B").start(interval).run(signal("B", interval, 60.0))
-    mean = (track.omega[round(50.0 / interval) :] - TRUTH).mean(axis=0)
+    track = drem(DremFiniteTime, "B").track(signal("B", interval, 60.0), interval)
+    mean = (track.frequencies[round(50.0 / interval) :] - TRUTH).mean(axis=0)
     yield near("B: finite time, mean error, first", mean[0], 0.0039, 0.0005)
     yield near("B: finite time, mean error, second", mean[1], -0.0232, 0.001)
     yield near("B: finite time within 0.05 [s]", settle(track, TRUTH, 0.05), 6.83, 0.1)
     # A moving average over one period removes the third tone.
     length = round(2 * np.pi / 15 / interval)
     averaged = np.convolve(signal("B", interval, 60.0), np.full(length, 1.0 / length), mode="valid")
-    track = drem(DremFiniteTime, "B").start(interval).run(averaged)
-    final = np.abs(track.omega[round(50.0 / interval) :] - TRUTH).max()
+    track = drem(DremFiniteTime, "B").track(averaged, interval)
+    final = np.abs(track.frequencies[round(50.0 / interval) :] - TRUTH).max()
     yield at_most("B: finite time after a moving average", final, 1e-5)
 
 
@@ -165,15 +163,15 @@ def noisy(seeds: int = 60, tracked: int = 10, interval: float = 0.001) -> Iterat
     """Bias of the finite-time estimate in noise, and a tracker with a prefilter that has none."""
     errors = np.array(
         [
-            drem(DremFiniteTime, "C").start(interval).run(signal("C", interval, 20.0, seed)).omega[-1] - TRUTH
+            drem(DremFiniteTime, "C").track(signal("C", interval, 20.0, seed), interval).frequencies[-1] - TRUTH
             for seed in range(seeds)
         ]
     )
     yield near("C: finite time, bias of the second", errors[:, 1].mean(), 0.032, 0.003)
     rms = []
     for seed in range(tracked):
-        track = tracker().start(interval).run(signal("C", interval, 60.0, seed), fft=True)
-        rms.append(np.sqrt(np.mean((track.omega[round(50.0 / interval) :] - TRUTH) ** 2, axis=0)))
+        track = tracker().track(signal("C", interval, 60.0, seed), interval)
+        rms.append(np.sqrt(np.mean((track.frequencies[round(50.0 / interval) :] - TRUTH) ** 2, axis=0)))
     yield at_most("C: tracker with prefilter, median rms error", np.median(rms, axis=0).max(), 2e-4)
 
 
@@ -182,10 +180,10 @@ def steps(interval: float = 0.001, slack: float = 0.0) -> Iterator[Claim]:
     truth = stepped(interval)[0]
     for jump in (True, False):
         y, reading = signal("D", interval, 90.0, jump=jump), "jump" if jump else "continuous"
-        track = window("D").start(interval).run(y)
+        track = window("D").track(y, interval)
         yield at_most(f"window of 4 s, within 1e-6, {reading} [s]", settle(track, truth, 1e-6, STEP), 7.605 + slack)
         for prefilter, limit in ((0.0, 2.85), (1.0, 3.90)):
-            track = tracker(prefilter).start(interval).run(y, fft=True)
+            track = tracker(prefilter).track(y, interval)
             name = f"tracker, prefilter {prefilter:g} s, within 1e-6, {reading} [s]"
             yield at_most(name, settle(track, truth, 1e-6, STEP), limit + slack)
 
@@ -195,7 +193,7 @@ def tracked_step(seed: int, *, jump: bool, interval: float = 0.001) -> tuple[flo
     truth = stepped(interval)[0]
     y = signal("D", interval, 90.0, jump=jump)
     y = y + SIGMA * np.random.default_rng(seed).standard_normal(y.size)
-    track = tracker().start(interval).run(y, fft=True)
+    track = tracker().track(y, interval)
     changed = (track.flags & Flag.CHANGED) > 0
     begins = track.t[1:][changed[1:] & ~changed[:-1]]
     return settle(track, truth, 0.02, STEP), int((begins < STEP).sum()), int((begins > STEP + 10.0).sum())
@@ -212,11 +210,11 @@ def robust(seeds: int = 20, first: int = 1000) -> Iterator[Claim]:
     interval = 0.001
     t = clock(interval, 60.0)
     omega = np.column_stack([np.select([t < 30 - 1e-9, t < 31 - 1e-9], [1.8, 2.2], 2.0), np.where(t < 30, 3.2, 3.0)])
-    track = tracker(0.0).start(interval).run(from_frequencies(omega, interval, jump=False))
+    track = tracker(0.0).track(from_frequencies(omega, interval, jump=False), interval)
     yield at_most("second step within 1e-6, no noise [s]", settle(track, omega, 1e-6, 31.0), 3.9)
     # The same behind a prefilter: the restart mixes the last two steps, which only a comparison of halves can show.
     omega = np.column_stack([np.where(t < 33 - 1e-9, 1.8, 1.2), np.select([t < 30 - 1e-9], [3.0], 4.0)])
-    track = tracker(1.0).start(interval).run(from_frequencies(omega, interval, jump=False), fft=True)
+    track = tracker(1.0).track(from_frequencies(omega, interval, jump=False), interval)
     name = "second step within 1e-6, prefilter 1 s, no noise [s]"
     yield at_most(name, settle(track, omega, 1e-6, 33.0), 9.0)
 
@@ -225,7 +223,7 @@ def quiet(seeds: int = 10, duration: float = 600.0, interval: float = 0.001) -> 
     """No alarm on a long stationary signal."""
     alarms = 0
     for seed in range(seeds):
-        track = tracker().start(interval).run(signal("C", interval, duration, 5000 + seed), fft=True)
+        track = tracker().track(signal("C", interval, duration, 5000 + seed), interval)
         alarms += int(((track.flags & Flag.CHANGED) > 0).any())
     yield at_most(f"records of {duration:g} s with a false alarm, of {seeds}", alarms, 0)
 
@@ -239,11 +237,10 @@ def efficient(seeds: int = 100, first: int = 2000, interval: float = 0.001, dura
     for seed in range(first, first + seeds):
         y = clean + np.random.default_rng(seed).uniform(-0.2, 0.2, t.size)
         estimates = {
-            "least squares with prefilter": tracker().start(interval).run(y, fft=True).omega[-1],
+            "least squares with prefilter": tracker().track(y, interval).frequencies[-1],
             "total least squares without": tracker(0.0, solution="total_least_squares")
-            .start(interval)
-            .run(y)
-            .omega[-1],
+            .track(y, interval)
+            .frequencies[-1],
         }
         for name, omega in estimates.items():
             errors.setdefault(name, []).append(omega - TRUTH)

@@ -101,7 +101,7 @@ def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = list(measured.settling(study["two-tones"]))
     y = acceptance.signal("A", 0.01, 60.0)
     for name, kind in (("finite_time", acceptance.DremFiniteTime), ("gradient", acceptance.DremGradient)):
-        track = acceptance.drem(kind, "A").start(0.01).run(y)
+        track = acceptance.drem(kind, "A").track(y, 0.01)
         row = one(rows, estimator=name)
         for band in measured.BANDS:
             assert row[f"within_{band:g}"] == pytest.approx(acceptance.settle(track, acceptance.TRUTH, band))

@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from ctid_cli.frequency.drem_finite_time import DremFiniteTime
-from ctid_cli.frequency.drem_gradient import DremGradient
-from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.delay_kernels import Clock, decode
+from ctid_cli.frequency.delay_regression import delay_table
+from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.frequency.frequency_kernels import decode, decoding_memory
-from ctid_cli.frequency.regression import delay_table
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
 INTERVAL = 0.01
@@ -50,9 +48,11 @@ def regression_rows(y, n, lag):
 def frequencies_of(theta, delay, *, lowest=0.0, highest=None):
     """Frequencies that belong to the parameters of the delay regression, and their flags."""
     theta = np.ascontiguousarray(theta, dtype=float)
-    omega, memory = np.empty(theta.size), decoding_memory(theta.size)
-    bottom = -1.0 if highest is None else np.cos(highest * delay)
-    flags = decode(
-        theta, delay, bottom, np.cos(lowest * delay), memory.polynomial, memory.quotient, memory.roots, omega
-    )
-    return omega, Flag(flags)
+    omega = np.empty(theta.size)
+    return omega, Flag(decode(theta, clock_of(delay, lowest, highest), np.empty(theta.size), omega))
+
+
+def clock_of(delay, lowest=0.0, highest=None):
+    """A regression of which only the delay and the bounds matter."""
+    bottom = -1.0 if highest is None else float(np.cos(highest * delay))
+    return Clock(1.0, 1, float(delay), 1, 1.0, bottom, float(np.cos(lowest * delay)), 1)

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.drem_finite_time import DremFiniteTime
-from ctid_cli.frequency.drem_gradient import DremGradient
-from ctid_cli.frequency.drem_window import DremWindow
+from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 
@@ -46,7 +44,7 @@ ONLINE = [
 @pytest.mark.parametrize("name", NO_TWO_TONES)
 @pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
 def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
-    track = options.start(INTERVAL).run(NO_TWO_TONES[name])
+    track = options.track(NO_TWO_TONES[name], INTERVAL)
     assert not track.valid.any()
 
 
@@ -54,11 +52,10 @@ def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
 @pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
 def test_valid_estimates_are_right(options, noise):
     y = CLEAN + noise * NOISE
-    track = options.start(INTERVAL).run(y)
-    error = np.abs(track.omega - TRUTH)
+    track = options.track(y, INTERVAL)
+    error = np.abs(track.frequencies - TRUTH)
     valid = track.valid
     assert (error[valid] < 0.1).all()  # what certain means here: a tenth of the distance
-    assert (np.abs(track.omega[-1] - TRUTH) <= track.uncertainty[-1] + 1e-6).all()
     if noise <= 1e-3:
         assert valid[-500:].all()
         assert error[-500:].max() < 1e-2
@@ -67,7 +64,7 @@ def test_valid_estimates_are_right(options, noise):
 @pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
 def test_flags_say_what_is_wrong(options):
     def flags(name):
-        return Flag(int(options.start(INTERVAL).run(NO_TWO_TONES[name]).flags[-1]))
+        return Flag(int(options.track(NO_TWO_TONES[name], INTERVAL).flags[-1]))
 
     assert flags("zero") & Flag.UNDETERMINED
     assert flags("noise") & Flag.UNCERTAIN
@@ -80,33 +77,52 @@ def test_flags_say_what_is_wrong(options):
 def test_no_estimate_from_before_a_step_stays_valid(options, jump):
     true = np.where(T[:, None] < 30.0, [1.8, 3.2], [2.0, 3.0])
     phase = true * T[:, None] if jump else np.vstack([np.zeros(2), np.cumsum(true[:-1], axis=0)]) * INTERVAL
-    track = options.start(INTERVAL).run(np.sin(phase).sum(axis=1))
-    error = np.abs(track.omega - true).max(axis=1)
+    track = options.track(np.sin(phase).sum(axis=1), INTERVAL)
+    error = np.abs(track.frequencies - true).max(axis=1)
     assert track.valid[2990:3000].all()
     assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual shows it
+
+
+def test_rows_of_two_signals_bear_nothing_out():
+    # So slow an estimate keeps the old frequencies, and judged rows from both sides of the step suit them for a while.
+    true = np.where(T[:, None] < 30.0, [1.8, 3.2], [2.0, 3.0])
+    y = np.sin(true[:, 0] * T) + np.cos(true[:, 1] * T)
+    track = DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.1, power="literal").track(y, INTERVAL)
+    assert track.valid[2900:3000].all()
+    assert not track.valid[3005:].any()
+
+
+@pytest.mark.parametrize("options", [{}, {"gated": False}, {"power": "literal"}])
+def test_an_estimate_that_converges_stays_valid(options):
+    # Its residuals sink below what second moments can show.
+    tuning = {"h": 0.1, "d": 0.13, "epsilon": 100.0, "gamma": 0.005, "initial_frequencies": (2.0, 5.0)}
+    track = DremGradient(tones=2, **tuning, **options).track(CLEAN, INTERVAL)
+    assert track.valid[-500:].all()
+    assert track.valid[np.argmax(track.valid) :].all()
+    assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 1e-3
 
 
 @pytest.mark.parametrize("omega", [3.2, 4.0, 6.0, 7.0, 8.5, 11.0, 20.0, 60.0])
 def test_every_alias_of_one_tone_is_noticed(omega):
     # pi/h is 3.14 rad/s here; all of these are seen as something below it.
-    track = RestartingLeastSquares(tones=1, h=1.0).start(INTERVAL).run(np.sin(omega * T + 0.3))
-    assert (track.omega[-1] < np.pi).all()
+    track = RestartingLeastSquares(tones=1, h=1.0).track(np.sin(omega * T + 0.3), INTERVAL)
+    assert (track.frequencies[-1] < np.pi).all()
     assert not track.valid.any()
 
 
 def test_tones_that_look_alike_at_the_delay_are_one():
     # cos(w h) is the same for 2 and 2 pi/0.7 - 2 rad/s; at another delay they are two.
     y = np.sin(2 * T) + np.sin((2 * np.pi / 0.7 - 2) * T)
-    assert not RestartingLeastSquares(tones=2, h=0.7).start(INTERVAL).run(y).valid.any()
-    track = RestartingLeastSquares(tones=2, h=0.4).start(INTERVAL).run(y)
+    assert not RestartingLeastSquares(tones=2, h=0.7).track(y, INTERVAL).valid.any()
+    track = RestartingLeastSquares(tones=2, h=0.4).track(y, INTERVAL)
     assert track.valid[-1000:].all()
 
 
 def test_five_tones_are_valid_only_once_they_are_known():
     omega = np.array([1.0, 2.0, 3.0, 4.2, 5.5])
     y = np.sin(np.outer(T, omega) + np.arange(5)).sum(axis=1)
-    track = RestartingLeastSquares(tones=5, h=0.4).start(INTERVAL).run(y)
-    error = np.abs(track.omega - omega).max(axis=1)
+    track = RestartingLeastSquares(tones=5, h=0.4).track(y, INTERVAL)
+    error = np.abs(track.frequencies - omega).max(axis=1)
     assert error[410] > 1e-3  # right after the delays are filled
     assert error[track.valid].max() < 1e-4
     assert track.valid[-2000:].all()
@@ -116,9 +132,9 @@ def test_five_tones_are_valid_only_once_they_are_known():
 @pytest.mark.parametrize("options", ONLINE, ids=lambda options: options.kind)
 def test_extreme_amplitudes_give_no_wrong_number(options, scale):
     with np.errstate(all="raise"):
-        track = options.start(INTERVAL).run(scale * CLEAN)
+        track = options.track(scale * CLEAN, INTERVAL)
     if track.valid.any():
-        assert np.abs(track.omega[track.valid] - TRUTH).max() < 0.1
+        assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 0.1
 
 
 STREAM = 0.004 * np.arange(4000)
@@ -152,11 +168,10 @@ def test_in_a_stream_an_event_makes_valid_estimates_wrong_for_a_stated_time_only
     # All samples that the memory, the delays and the prefilter hold are then from after the event.
     until = options.memory + options.prefilter + 2 * options.h
     y = EVENTS[event] + 0.007 * np.random.default_rng(seed).standard_normal(STREAM.size)
-    track = options.start(0.004).run(y)
+    track = options.track(y, 0.004)
     true = np.where(ENDS & ("frequency" in event), 78.0, 75.0)
-    error = np.abs(track.omega[:, 0] - true)
+    error = np.abs(track.frequencies[:, 0] - true)
     assert not (track.valid & (error > 0.1 * true)).any()
-    beyond = track.valid & (error > track.uncertainty[:, 0]) & (error > 1e-3 * true)
-    assert not beyond[STREAM > 10.0 + until].any()
+    assert not (track.valid & (error > 0.05 * true))[STREAM > 10.0 + until].any()
     assert track.valid[-500:].mean() > 0.9
     assert track.valid[1000:2400].all()

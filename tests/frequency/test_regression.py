@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
 
-from ctid_cli.frequency.frequency_kernels import form_row, mix_rows
-from ctid_cli.frequency.regression import delay_table, determinant_from_tones, minor_plan, theta_of, whole_delay
+from ctid_cli.frequency.delay_regression import delay_table, theta_of, whole_delay
+from ctid_cli.frequency.drem import mix
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from tests.frequency.signals import AMPLITUDES, OMEGA, regression_rows, tones
 
 INTERVAL = 0.002
@@ -15,12 +16,26 @@ LAG, SPACING = 200, 150
 
 
 def mixed(matrix):
-    """Psi and Delta of one stacked regression through the compiled mixing."""
-    n = matrix.shape[0]
-    workspace = np.empty((n, n + 1)), np.empty(2 ** (n + 1)), np.empty(n + 1)
-    # Row j of the stack lies j places before the newest.
-    scale = mix_rows(np.ascontiguousarray(matrix[::-1]), n - 1, 0, 1, minor_plan(n), *workspace)
-    return workspace[2][:n], workspace[2][n], scale
+    """Psi and Delta of one stacked regression."""
+    [row] = mix([line[None, :] for line in matrix])
+    return row[:-1], row[-1]
+
+
+def determinant_from_tones(parts, omega, lag, spacing, interval):
+    """Determinant of the stacked regressors by its closed form, of rows 0, ..., n - 1; NaN where one is missing.
+
+    ``phi(t) = 2^n sum_i [c_i^(n-1) ... c_i 1] y_i(t - n h)``, hence
+    ``det = 2^(n n) det[y_i(t - n h - j d)] prod_(i<j) (c_i - c_j)``.
+    """
+    count, n = parts.shape
+    c = np.cos(np.asarray(omega) * lag * interval)
+    vandermonde = np.prod([c[i] - c[j] for i in range(n) for j in range(i + 1, n)])
+    first = 2 * n * lag + (n - 1) * spacing
+    instants = np.arange(first, count)
+    stacked = parts[instants[:, None] - n * lag - spacing * np.arange(n)]
+    determinant = np.full(count, np.nan)
+    determinant[first:] = 2.0 ** (n * n) * vandermonde * np.linalg.det(stacked)
+    return determinant
 
 
 @pytest.mark.parametrize("n", range(1, 9))
@@ -46,17 +61,21 @@ def test_regression_holds_from_2nh_on_and_not_before(n):
 
 
 @pytest.mark.parametrize("n", range(1, 6))
-def test_streamed_rows_are_those_of_the_whole_record(n):
+def test_rows_that_are_filtered_are_those_of_the_products(n):
     y = tones(n, 2 * n * 7 + 40).sum(axis=1)
     psi, phi = regression_rows(y, n, 7)
-    table = delay_table(n).astype(float)
-    history, row = np.full(2 * n * 7 + 1, np.nan), np.empty(n + 1)
-    for k, sample in enumerate(y):
-        history[k % history.size] = sample
-        complete = form_row(history, k % history.size, 7, table, row)
-        assert complete == (k >= 2 * n * 7)
-        if complete:
-            np.testing.assert_allclose(row, [*phi[k], psi[k]], rtol=1e-12, atol=1e-12)
+    rows = RestartingLeastSquares(tones=n, h=0.07).start(0.01).rows(y)[0]
+    np.testing.assert_allclose(rows, np.column_stack([phi, psi]), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("length", "difference"), [(0.0, 0.0), (1.0, 0.0), (0.0, 0.7), (1.0, 0.7), (0.013, 0.01)])
+def test_prefilter_is_a_hann_window_and_a_difference(length, difference):
+    weights = RestartingLeastSquares(tones=1, h=0.4, prefilter=length, difference=difference).weights(0.01)
+    order, shift = round(length / 0.01), round(difference / 0.01)
+    assert weights.size == order + shift + 1
+    window = np.hanning(order + 3)[1:-1]
+    expected = np.convolve(window / window.sum(), [1.0, *[0.0] * (shift - 1), -1.0] if shift else [1.0])
+    np.testing.assert_allclose(weights, expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("n", range(1, 6))
@@ -91,15 +110,15 @@ def test_mean_square_of_the_determinant_for_two_tones():
 @given(st.integers(1, 8), st.integers(0, 2**31))
 def test_mixing_is_cramers_rule(n, seed):
     matrix = np.random.default_rng(seed).standard_normal((n, n + 1))
-    right, delta, scale = mixed(matrix)
+    right, delta = mixed(matrix)
+    scale = np.prod(np.linalg.norm(matrix, axis=1))
     assert delta == pytest.approx(np.linalg.det(matrix[:, :n]), rel=1e-9, abs=1e-12 * scale)
     np.testing.assert_allclose(matrix[:, :n] @ right, delta * matrix[:, n], atol=1e-11 * scale)
-    assert scale == pytest.approx(np.prod(np.linalg.norm(matrix, axis=1)))
 
 
 def test_mixing_of_a_singular_matrix_is_finite():
     # Two equal rows of the regressors, different right-hand sides: no theta at all, but finite numbers.
-    right, delta, _ = mixed(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]]))
+    right, delta = mixed(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]]))
     assert delta == 0.0
     np.testing.assert_array_equal(right, [-4.0, 2.0])
 
@@ -126,9 +145,3 @@ def test_delays_are_whole_intervals(delay, interval, count):
 def test_delays_below_half_an_interval_are_refused():
     with pytest.raises(ValueError, match=r"h = 0.004 s is shorter than half a sampling interval of 0.01 s"):
         whole_delay("h", 0.004, 0.01)
-
-
-@pytest.mark.parametrize("n", [0, 9, 2.0, True])
-def test_impossible_numbers_of_tones_are_refused(n):
-    with pytest.raises(ValueError, match="tones must be an integer from 1 to 8"):
-        delay_table(n)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from ctid_cli.estimators.additive_srivc import AdditiveFit
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.useful_redundancy import RedundantFit
-from ctid_cli.frequency.tracking import FrequencyTrack
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fit import Fit, Status
 from ctid_cli.inference.sensitivities import Structure
@@ -42,7 +42,7 @@ def test_results_and_data_are_short_to_read():
     record = Record(t, np.where(t == 0, np.nan, t), HeldSignal(t, t, "foh"), name="dryer.csv")
     assert repr(record) == "Record('dryer.csv', 1000 samples from 0 to 99.9 s, every 0.1 s, 1 missing)"
     assert repr(record.input) == "HeldSignal(1000 values from 0 to 99.9 s, foh)"
-    track = FrequencyTrack(t, np.ones((1000, 2)), (t < 25).astype(np.uint16), np.ones((1000, 2)))
+    track = FrequencyTrack(t, np.ones((1000, 2)), (t < 25).astype(np.uint16))
     assert repr(track) == "FrequencyTrack(1000 rows of 2 frequencies, 0.75 of them valid)"
 
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from ctid_cli.frequency.base import Flag, FrequencyTrack
+from ctid_cli.frequency.base import FrequencyTrack
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone

@@ -1,0 +1,257 @@
+r"""The delay regression of a multi-sinusoidal signal, and what all estimators on it share.
+
+For ``y = sum A_i sin(w_i t + p_i)`` and a delay h, with ``c_i = cos(w_i h)`` and
+``prod(c - c_i) = c^n + theta_1 c^(n-1) + ... + theta_n``, the operator ``prod(Z^2 + 1 - 2 c_i Z)`` annihilates y, where
+Z delays by h. Written out, ``psi = phi' theta`` with ``psi = -(Z^2 + 1)^n y`` and
+``phi_k = (2 Z)^k (Z^2 + 1)^(n-k) y``: a linear regression for theta that holds exactly from t = 2 n h on.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import comb, gcd
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import OptionError
+from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack, require_bounds, series_of
+from ctid_cli.frequency.delay_kernels import Clock
+from ctid_cli.signals.checks import require_not_negative, require_positive
+
+#: Longest delay in sampling intervals: the samples of twice n delays are kept.
+LONGEST_DELAY = 10_000_000
+#: The second delay is near this fraction of the first, as far from every simple ratio as can be.
+GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
+#: A number without a common divisor lies within this distance of any place, for all delays that are allowed.
+SEARCHED = 100
+#: Verdicts are given so many times in a delay h, but at most so many samples apart.
+VERDICTS_PER_DELAY = 64
+MOST_BETWEEN = 8
+#: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
+NOTEWORTHY_ROUNDING = 0.01
+#: An estimate is valid after this many rows for each tone, and after this fraction of n h: before, the rows are too few
+#: or too much alike to show that they disagree.
+ROWS_PER_TONE = 4
+STARTING_SPAN = 0.25
+#: Samples of a record that are taken at a time: what is computed of them stays below 100 MB.
+BLOCK = 1 << 15
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayRegression(FrequencyEstimator):
+    """Options of an estimator on the delay regression."""
+
+    #: Further options that say for how long samples are kept [s].
+    _kept: ClassVar[tuple[str, ...]] = ()
+
+    h: float
+    prefilter: float = 0.0
+    difference: float = 0.0
+    lowest_frequency: float = 0.0
+    highest_frequency: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("h", self.h, "s")
+        require_not_negative("prefilter", self.prefilter, "s")
+        require_not_negative("difference", self.difference, "s")
+        require_bounds(self.lowest_frequency, self.highest_frequency)
+        self._highest(self.h)
+
+    @property
+    def _stacked_over(self) -> float:
+        """Time that the rows of an estimate reach back [s]."""
+        return 0.0
+
+    @abstractmethod
+    def start(self, interval: float) -> Online:
+        """Begin an estimation before its first sample, with the sampling interval [s]."""
+
+    def track(self, samples: ArrayLike, interval: float) -> FrequencyTrack:
+        """Estimate the frequencies at every sample of a record.
+
+        Parameters
+        ----------
+        samples : array_like, shape (N,)
+            Signal on a regular clock [signal unit]; NaN where missing.
+        interval : float
+            Sampling interval [s].
+
+        Returns
+        -------
+        FrequencyTrack
+            Frequencies at these instants.
+
+        Raises
+        ------
+        DataError
+            If the samples are not a series of real numbers.
+        ValueError
+            If the options do not fit to the sampling interval.
+        """
+        online, y = self.start(interval), series_of(samples)
+        omega, flags = np.empty((y.size, self.tones)), np.zeros(y.size, np.uint16)
+        for first in range(0, y.size, BLOCK):
+            part = slice(first, first + BLOCK)
+            online.advance(y[part], omega[part], flags[part])
+        return FrequencyTrack(interval * np.arange(y.size, dtype=float), omega, flags)
+
+    def check(self, count: int, interval: float) -> None:
+        """Refuse delays that are longer than a record of ``count`` samples, and options that its clock cannot have."""
+        duration = interval * count
+        # First of all, since the estimation would keep all the samples of such a time.
+        for name in ("prefilter", "difference", *self._kept):
+            value = getattr(self, name)
+            if value > duration:
+                raise OptionError(name, f"{name} = {value:g} s is longer than the record, {duration:g} s")
+        filled = 2 * self.tones * self.h + self.prefilter + self.difference + self._stacked_over
+        if filled >= duration:
+            ends = f"the record ends at {duration:g} s; take a smaller h"
+            raise OptionError("h", f"its delays are filled after {filled:g} s, {ends}")
+        self.start(interval)
+
+    def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
+        """Say that a frequency has an alias at the delay, or that the clock does not have the delay."""
+        if highest * self.h > np.pi:
+            limit = f"with h = {self.h:g} s, frequencies above pi/h = {np.pi / self.h:.4g} rad/s"
+            yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
+        delay = whole_delay("h", self.h, interval) * interval
+        if abs(delay - self.h) > NOTEWORTHY_ROUNDING * self.h:
+            whole = f"no whole number of sampling intervals of {interval:g} s"
+            yield "h", f"h = {self.h:g} s is {whole}; {delay:g} s is used."
+
+    def clock(self, interval: float) -> Clock:
+        """Return the regression at a sampling interval [s]."""
+        lag = whole_delay("h", self.h, interval)
+        second, every = second_lag(lag), max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
+        delay = lag * interval
+        bottom, top = float(np.cos(self._highest(delay) * delay)), float(np.cos(self.lowest_frequency * delay))
+        return Clock(float(interval), lag, delay, second, second * interval, bottom, top, every)
+
+    def weights(self, interval: float) -> Array:
+        """Return the impulse response in front of the regression, shape (L + 1,).
+
+        ``w_k = sin^2(pi (k + 1)/(L + 2))``, scaled to the sum 1: the Hann window without its two zeros. It keeps every
+        sinusoid, and an exact estimate exact.
+        """
+        order, shift = (
+            whole_delay(name, getattr(self, name), interval) if getattr(self, name) > 0 else 0
+            for name in ("prefilter", "difference")
+        )
+        weights = np.sin(np.pi * np.arange(1, order + 2) / (order + 2)) ** 2
+        weights = np.pad(weights / weights.sum(), (0, shift))
+        return weights - np.roll(weights, shift) if shift else weights
+
+    def rows_before_valid(self, clock: Clock) -> int:
+        """Return the rows that must have arrived before an estimate can be valid."""
+        return max(ROWS_PER_TONE * self.tones, int(STARTING_SPAN * self.tones * clock.lag))
+
+    def require_samples(self, memory: float, samples: float, interval: float) -> None:
+        """Refuse a memory [s] of fewer samples than an estimate needs."""
+        needed = ROWS_PER_TONE * self.tones
+        if samples < needed:
+            few = f"{samples:.3g} samples of {interval:g} s, fewer than the {needed} that {self.tones} tones need."
+            raise OptionError("memory", f"memory = {memory:g} s holds {few}")
+
+    def _highest(self, delay: float) -> float:
+        """Upper bound of the frequencies at a delay [s], if the bounds make sense."""
+        unique = np.pi / delay
+        highest = unique if self.highest_frequency is None else float(self.highest_frequency)
+        if highest > unique * (1.0 + 1e-12):
+            seen = f"frequencies above pi/h = {unique:g} rad/s are seen as lower ones"
+            asked = f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
+            raise OptionError("h", f"with h = {delay:g} s, {seen}, but {asked}")
+        require_bounds(self.lowest_frequency, highest)
+        return min(highest, unique)
+
+
+class Online(ABC):
+    """An estimation that takes one sample, or a block of samples, after the other.
+
+    Both pass through the same code: a block of one gives the numbers of a whole record, up to rounding.
+    """
+
+    def __init__(self, options: DelayRegression, interval: float, *, past: float = np.nan) -> None:
+        require_positive("interval", interval, "s")
+        self.options, self.clock = options, options.clock(interval)
+        self.weights = options.weights(interval)
+        self.table = delay_table(options.tones)
+        self._seen = 0
+        self._unfiltered = Tail(np.full(self.weights.size - 1, past))
+        self._filtered = Tail(np.full(2 * options.tones * self.clock.lag, past))
+
+    @abstractmethod
+    def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
+        """Take samples, and write the frequencies and the flags at their instants."""
+
+    def update(self, sample: float) -> FrequencyTrack:
+        """Take the next sample, NaN if it is missing; return the one row of the track at its instant."""
+        omega, flags = np.empty((1, self.options.tones)), np.zeros(1, np.uint16)
+        self.advance(series_of([float(sample)]), omega, flags)
+        self._seen += 1
+        return FrequencyTrack(np.array([(self._seen - 1) * self.clock.interval]), omega, flags)
+
+    def rows(self, samples: Array) -> tuple[Array, Array]:
+        """Return the rows ``[phi psi]`` at h and at the second delay; NaN where a sample is missing."""
+        if self.weights.size > 1:
+            samples = np.convolve(self._unfiltered.extended(samples), self.weights, "valid")
+        newest_first = np.lib.stride_tricks.sliding_window_view(
+            self._filtered.extended(samples), 2 * self.options.tones * self.clock.lag + 1
+        )[:, ::-1]
+        second = newest_first[:, : 2 * self.options.tones * self.clock.second_lag + 1 : self.clock.second_lag]
+        return newest_first[:, :: self.clock.lag] @ self.table.T, second @ self.table.T
+
+
+class Tail:
+    """The newest rows of a stream: what a delay, a filter or a mixing needs of the past."""
+
+    def __init__(self, kept: Array) -> None:
+        self._kept = kept
+
+    def extended(self, new: Array) -> Array:
+        """Return the rows kept and the new ones, and keep the last of them."""
+        whole = np.concatenate((self._kept, new))
+        self._kept = whole[len(new) :].copy()
+        return whole
+
+
+def delay_table(tones: int) -> Array:
+    """Return the coefficients of ``[phi psi] = table @ [y(t), y(t - h), ... y(t - 2 n h)]``."""
+    table = np.zeros((tones + 1, 2 * tones + 1))
+    for k in range(1, tones + 1):
+        for i in range(tones - k + 1):
+            table[k - 1, k + 2 * i] = 2**k * comb(tones - k, i)
+    for i in range(tones + 1):
+        table[tones, 2 * i] = -comb(tones, i)
+    return table
+
+
+def whole_delay(name: str, delay: float, interval: float) -> int:
+    """Return the sampling intervals nearest to a delay."""
+    require_positive("interval", interval, "s")
+    if delay / interval > LONGEST_DELAY:
+        longest = f"{LONGEST_DELAY:,} sampling intervals of {interval:g} s"
+        raise OptionError(name, f"{name} = {delay:g} s is more than {longest}; keep fewer of the samples.")
+    count = round(delay / interval)
+    if count < 1:
+        raise OptionError(name, f"{name} = {delay:g} s is shorter than half a sampling interval of {interval:g} s.")
+    return count
+
+
+def second_lag(lag: int) -> int:
+    """Return the second delay for a given first one, in sampling intervals."""
+    if lag == 1:
+        return 1  # no alias lies below the Nyquist frequency
+    wanted = GOLDEN_FRACTION * lag
+    near = range(max(1, round(wanted) - SEARCHED), min(lag, round(wanted) + SEARCHED + 1))
+    return min((m for m in near if gcd(m, lag) == 1), key=lambda m: abs(m - wanted))
+
+
+def theta_of(omega: ArrayLike, delay: float) -> Array:
+    """Return the parameters of the regression that belong to given frequencies."""
+    return np.asarray(np.poly(np.cos(np.asarray(omega, dtype=float) * delay))[1:])

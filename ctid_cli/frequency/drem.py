@@ -1,0 +1,368 @@
+r"""Frequencies by dynamic regressor extension and mixing (DREM) of the delay regression.
+
+The regression is stacked at n instants, d apart, and multiplied by the adjugate of the regressor matrix:
+``Psi_k = Delta theta_k`` with one determinant Delta for all k, a scalar regression for each parameter.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ctid_cli.arrays import Array
+from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, gradient_steps, judge_rows, slide
+from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.signals.checks import require_integer, require_positive
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixingOptions(DelayRegression):
+    """Options of an estimator on the mixed regressions."""
+
+    _kept: ClassVar[tuple[str, ...]] = ("d",)
+
+    d: float
+    first_row: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("d", self.d, "s")
+        require_integer("first_row", self.first_row, 0, 1000)
+
+    @property
+    def _stacked_over(self) -> float:
+        return (self.first_row + self.tones - 1) * self.d
+
+
+@dataclass(frozen=True, kw_only=True)
+class DremGradient(MixingOptions):
+    r"""Frequencies by gradient descent on each mixed regression: exponential convergence from the initial frequencies.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    h : float
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+    d : float
+        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+    epsilon : float, default 1.0
+        Normalisation of the mixed regression [-].
+    gamma : float or tuple of float, default 1.0
+        Adaptation gain, one for all parameters or one for each.
+    initial_frequencies : tuple of float, optional
+        Frequencies to begin with [rad/s]; by default spread over the bounds. Above pi/h they alias, which only moves
+        the beginning.
+    first_row : int, default 1
+        Number of the first stacked row; 1 as published, 0 begins one d earlier.
+    power : int or "literal", default 1
+        Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
+    gated : bool, default True
+        Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
+    prefilter : float, default 0.0
+        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+    difference : float, default 0.0
+        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)``, solved exactly over each sampling interval with Delta and
+    Psi_k held, so that no gain is too large. The rate of convergence is ``gamma_k`` times the mean of ``Delta^2``. The
+    recursion is that of :class:`DremFiniteTime`, which gives the same estimate
+    without the part of the initial value.
+
+    References
+    ----------
+    S. Aranovskiy, A. Bobtsov, R. Ortega and A. Pyrkin, "Performance enhancement of parameter estimators via dynamic
+    regressor extension and mixing", *IEEE Trans. Automatic Control* 62 (2017) 3546-3550. doi:10.1109/TAC.2016.2614889
+    """
+
+    kind: ClassVar[str] = "drem_gradient"
+    finite_time: ClassVar[bool] = False
+
+    epsilon: float = 1.0
+    gamma: float | tuple[float, ...] = 1.0
+    initial_frequencies: tuple[float, ...] | None = None
+    power: int | Literal["literal"] = 1
+    gated: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("epsilon", self.epsilon, "-")
+        if isinstance(self.gamma, Sequence):
+            self.keep_one_for_each("gamma", "-")
+        else:
+            require_positive("gamma", self.gamma, "-")
+        self.keep_one_for_each("initial_frequencies", "rad/s")
+        if self.power != "literal":
+            require_integer("power", self.power, 1)
+
+    def start(self, interval: float) -> Online:
+        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        return OnlineGradient(self, interval)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DremFiniteTime(DremGradient):
+    r"""Frequencies in finite time: the gradient estimate of each mixed regression, without its initial value.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    h : float
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+    d : float
+        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+    epsilon : float, default 1.0
+        Normalisation of the mixed regression [-].
+    gamma : float or tuple of float, default 1.0
+        Adaptation gain, one for all parameters or one for each.
+    initial_frequencies : tuple of float, optional
+        Frequencies shown before there is an estimate [rad/s]; by default spread over the bounds. Above pi/h they alias.
+    first_row : int, default 1
+        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
+    power : int or "literal", default 1
+        Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
+    gated : bool, default True
+        Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
+    prefilter : float, default 0.0
+        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+    difference : float, default 0.0
+        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    With ``Delta = eps^p det Phi`` and ``Psi = eps^p adj(Phi) Psi_f`` held over each interval Ts, the gradient estimate
+    ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` is ``theta_k(t) = z_k + (1 - q_k) theta_k(0)`` with
+    ``z_k += m_k (Psi_k/Delta - z_k)``, ``q_k += m_k (1 - q_k)``, ``m_k = 1 - exp(-gamma_k Delta^2 Ts)``. The
+    finite-time estimate ``z_k/q_k`` is the published ``(theta_k - theta_k(0) W_k)/(1 - W_k)`` with ``W_k = 1 - q_k``,
+    free of the cancellation in its numerator. Without noise it is exact from ``t = 2 n h + (first_row + n - 1) d`` on;
+    after a change of the signal it forgets the past only as fast as the gradient estimate does. Noise biases it, since
+    the regressors hold the noisy signal: a prefilter in front reduces the bias, a smaller gain does not.
+
+    An estimate is valid if the regressions of the last ``4 n h`` bear it out: their residuals bound the error of each
+    frequency that they can show; and if the frequencies explain the signal at a second delay. A row that contradicts
+    the estimate invalidates it until all these rows are newer.
+
+    References
+    ----------
+    A. Vediakova, A. Vedyakov, A. Pyrkin, A. Bobtsov and V. Gromov, "Frequency estimation of multi-sinusoidal signals in
+    finite-time", 2020. S. Aranovskiy, A. Bobtsov, R. Ortega and A. Pyrkin, "Performance enhancement of parameter
+    estimators via dynamic regressor extension and mixing", *IEEE Trans. Automatic Control* 62 (2017) 3546-3550.
+    doi:10.1109/TAC.2016.2614889
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli.frequency.drem import DremFiniteTime
+    >>> t = 0.01 * np.arange(400)
+    >>> track = DremFiniteTime(tones=2, h=0.6, d=0.4).track(np.sin(2 * t) + np.cos(3 * t), 0.01)
+    >>> bool(track.valid[300]), bool(track.valid[-1]), track.frequencies[-1].round(9)
+    (False, True, array([2., 3.]))
+    """
+
+    kind: ClassVar[str] = "drem_finite_time"
+    finite_time: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class DremWindow(MixingOptions):
+    r"""Frequencies by least squares on each mixed regression over a sliding window.
+
+    Parameters
+    ----------
+    tones : int
+        Number of sinusoids n, 1 to 8.
+    h : float
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+    d : float
+        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+    memory : float
+        Length of the window [s]; rounded to whole sampling intervals.
+    first_row : int, default 1
+        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
+    prefilter : float, default 0.0
+        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+    difference : float, default 0.0
+        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    ``theta_k(t) = sum Delta Psi_k / sum Delta^2`` over the last ``memory`` seconds. It is the limit for small gains of
+    ``(theta_k(t) - theta_k(t - T) W)/(1 - W)``, ``W = exp(-gamma int_(t-T)^t Delta^2)``, the finite-time estimate that
+    starts anew at every instant; there is no gain to choose. Exact, without noise, from
+    ``2 n h + (first_row + n - 1) d`` on, and again that much and one ``memory`` after a change. The sums are those of
+    the samples in the window alone: a block of old samples is summed backwards once, and the newer ones forwards, so no
+    rounding error accumulates.
+
+    References
+    ----------
+    R. Ortega, S. Aranovskiy, A. Pyrkin, A. Astolfi and A. Bobtsov, "New results on parameter estimation via dynamic
+    regressor extension and mixing: continuous and discrete-time cases", *IEEE Trans. Automatic Control* 66 (2021)
+    2265-2272. doi:10.1109/TAC.2020.3003651
+    """
+
+    kind: ClassVar[str] = "drem_window"
+    _kept: ClassVar[tuple[str, ...]] = ("d", "memory")
+
+    memory: float
+
+    def start(self, interval: float) -> Online:
+        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        return OnlineWindow(self, interval)
+
+
+class OnlineMixing(Online):
+    """Delays, mixing and verdict of an estimator on the mixed regressions, with a window of rows to judge it by."""
+
+    #: Factor ``eps^p`` of Delta and Psi.
+    scale = 1.0
+
+    def __init__(self, options: MixingOptions, interval: float, window: int, *, past: float = np.nan) -> None:
+        super().__init__(options, interval, past=past)
+        n = options.tones
+        self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
+        self._reach = 2 * n * self.clock.lag + int(self._ages[-1]) + 1
+        self._flush = 2 * n * self.clock.lag + window
+        self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
+        self._enough = min(options.rows_before_valid(self.clock), window)
+        self._used = 0.0
+        width = n + 3 + 2 * (n + 1) ** 2
+        self._sliding = np.zeros((window, width)), np.zeros(width), np.zeros(1, np.int64)
+        self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50])
+
+    @abstractmethod
+    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
+        """Return theta and the number of rows it rests on, of ``[Psi Delta]``, its sums and the rows so far."""
+
+    def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
+        """Take samples, and write the frequencies and the flags at their instants."""
+        n, count = omega.shape[1], samples.size
+        rows, second_rows = self.rows(samples)
+        history = self._mixed_rows.extended(rows)
+        # A regression whose square is too large for a number is not used.
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
+            found = np.isfinite(mixed).all(axis=1) & np.isfinite(mixed[:, n] ** 2)
+            mixed[~found] = np.nan
+            parts = (
+                mixed[:, n:] * mixed,
+                found[:, None],
+                np.isfinite(rows[:, :1]),
+                products(rows),
+                products(second_rows),
+            )
+        entries = np.nan_to_num(np.hstack(parts), copy=False)
+        # [Delta Psi, Delta^2, mixed rows, rows, second moments of the rows at h and at the second delay]
+        sums = np.empty(entries.shape)
+        slide(entries, *self._sliding, sums)
+        used = self._used + np.cumsum(found, dtype=float)
+        self._used = used[-1]
+        theta, support = self.estimates(mixed, sums, used)
+        unexcited = ~(sums[:, n] > 0.0)
+        flags[~found & (used > 0)] |= int(Flag.GAP)
+        flags[support < self._enough] |= int(Flag.STARTING)
+        flags[unexcited & (used > 0)] |= int(Flag.UNDETERMINED)
+        interval, judged = self.clock.interval, np.where(unexcited, 0.0, sums[:, n + 2])
+        spans, elapsed = (self._reach + support) * interval, (self._reach + used) * interval
+        grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
+        judging = self.clock, self._flush, *self._judged
+        judge_rows(theta, rows, grams, judged, spans, elapsed, *judging, omega, flags)
+
+
+class OnlineGradient(OnlineMixing):
+    """The gradient or finite-time estimate, sample by sample."""
+
+    def __init__(self, options: DremGradient, interval: float) -> None:
+        n, lag = options.tones, whole_delay("h", options.h, interval)
+        super().__init__(options, interval, JUDGED_SPANS * n * lag, past=np.nan if options.gated else 0.0)
+        self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
+        initial = options.initial_frequencies
+        if initial is None:
+            lowest, highest = np.arccos((self.clock.top, self.clock.bottom)) / self.clock.delay
+            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
+        gains = np.full(n, interval) * np.asarray(options.gamma, dtype=float)
+        self._descent = gains, theta_of(initial, self.clock.delay), options.finite_time, np.zeros((2, n))
+
+    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
+        """Return theta by gradient steps, and the mixed rows so far."""
+        theta = np.empty((len(mixed), self.options.tones))
+        gradient_steps(mixed, *self._descent, theta)
+        return theta, used
+
+
+class OnlineWindow(OnlineMixing):
+    """Least squares on the mixed regressions of a sliding window, sample by sample."""
+
+    def __init__(self, options: DremWindow, interval: float) -> None:
+        window = whole_delay("memory", options.memory, interval)
+        options.require_samples(options.memory, window, interval)
+        super().__init__(options, interval, window)
+
+    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
+        """Return theta of the window, NaN where Delta vanishes all the time, and the mixed rows in the window."""
+        n = self.options.tones
+        squares = sums[:, n : n + 1]
+        return np.divide(sums[:, :n], squares, out=np.full((len(sums), n), np.nan), where=squares > 0), sums[:, n + 1]
+
+
+def products(rows: Array) -> Array:
+    """Return the products of all pairs of columns, shape (N, m m)."""
+    return (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+
+
+def mix(rows: Sequence[Array]) -> Array:
+    """Return ``[adj(Phi) Psi, det Phi]`` of n stacked rows ``[phi psi]``, each of shape (N, n + 1).
+
+    Laplace expansion along the last row: every minor of the first rows is computed once, and finite though singular.
+    """
+    n = len(rows)
+    minors: dict[tuple[int, ...], Array] = {(): np.ones(len(rows[0]))}
+    for size, row in enumerate(rows, start=1):
+        columns = np.ascontiguousarray(row.T)
+        minors = {
+            chosen: sum(
+                (-1) ** (size - 1 - place) * columns[column] * minors[chosen[:place] + chosen[place + 1 :]]
+                for place, column in enumerate(chosen)
+            )
+            for chosen in combinations(range(n + 1), size)
+        }
+    everything = range(n + 1)
+    # Column psi moves from the last place to place k: n - 1 - k exchanges.
+    mixed = [(-1) ** (n - 1 - k) * minors[tuple(c for c in everything if c != k)] for k in range(n)]
+    return np.column_stack([*mixed, minors[tuple(range(n))]])

@@ -1,0 +1,128 @@
+"""One sample in, one estimate out: the same numbers as of the whole record, however that is cut."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.frequency import delay_regression
+from ctid_cli.frequency.drem import DremFiniteTime
+from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
+from ctid_cli.kinds import KINDS, classes
+from ctid_cli.specification.messages import option_docs
+from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
+
+ESTIMATORS = online_estimators()
+IDS = [f"{number}-{estimator.kind}" for number, estimator in enumerate(ESTIMATORS)]
+each = pytest.mark.parametrize("options", ESTIMATORS, ids=IDS)
+
+
+def eventful(count=1500):
+    """Two tones with noise, a gap, a step and an infinite sample."""
+    y = tones(2, count).sum(axis=1) + 0.01 * np.random.default_rng(0).standard_normal(count)
+    y[800:] = 1.3 * tones(2, count, omega=OMEGA[2] * 1.2).sum(axis=1)[800:]
+    y[500:503] = np.nan
+    y[1200] = np.inf
+    return y
+
+
+def same(one, other):
+    np.testing.assert_allclose(one.t, other.t, rtol=1e-15)
+    assert np.array_equal(one.flags, other.flags)
+    np.testing.assert_allclose(one.frequencies[one.valid], other.frequencies[one.valid], rtol=1e-9)
+    # Complex roots and roots on the bounds pass rounding on enlarged.
+    np.testing.assert_allclose(one.frequencies, other.frequencies, rtol=1e-5)
+
+
+@each
+def test_samples_one_by_one_give_the_numbers_of_the_record(options):
+    y = eventful()
+    track, online = options.track(y, INTERVAL), options.start(INTERVAL)
+    single = [online.update(sample) for sample in y]
+    joined = (np.concatenate([getattr(row, name) for row in single]) for name in ("t", "frequencies", "flags"))
+    same(type(track)(*joined), track)
+    # The signal was made so that something happens to every estimator.
+    assert len(set(track.flags.tolist())) > 2
+    assert (np.nanstd(track.frequencies[1000:], axis=0) > 0).all()
+
+
+@each
+def test_blocks_of_any_length_give_the_same_numbers(options, monkeypatch):
+    y = eventful()
+    whole = options.track(y, INTERVAL)
+    monkeypatch.setattr(delay_regression, "BLOCK", 37)
+    same(options.track(y, INTERVAL), whole)
+
+
+@each
+def test_no_samples_are_no_estimates(options):
+    track = options.track(np.empty(0), INTERVAL)
+    assert track.frequencies.shape == (0, 2)
+    assert track.flags.shape == track.valid.shape == track.t.shape == (0,)
+
+
+@pytest.mark.parametrize("samples", [np.zeros((5, 2)), np.zeros(5, complex), np.array(["a"]), 3.0])
+def test_what_is_no_series_of_numbers_is_refused(samples):
+    with pytest.raises(DataError, match="one series of real numbers"):
+        RestartingLeastSquares(tones=2, h=0.4).track(samples, INTERVAL)
+
+
+def test_integers_are_numbers():
+    y = np.round(100 * tones(2, 600).sum(axis=1)).astype(int)
+    options = RestartingLeastSquares(tones=2, h=0.4)
+    same(options.track(y, INTERVAL), options.track(y.astype(float), INTERVAL))
+
+
+@pytest.mark.parametrize("interval", [0.0, -0.1, np.nan, np.inf])
+@each
+def test_impossible_intervals_are_refused(options, interval):
+    with pytest.raises(ValueError, match="interval must be a positive number"):
+        options.start(interval)
+
+
+def test_estimates_explain_themselves():
+    online = RestartingLeastSquares(tones=2, h=0.4).start(INTERVAL)
+    estimate = online.update(1.0)
+    assert not estimate.valid[0]
+    assert estimate.flags[0] == Flag.STARTING
+    assert estimate.reasons(0) == ("Too few samples have arrived since the start or since the last restart.",)
+    assert online.update(1.0).t[0] == INTERVAL
+
+
+def test_the_table_of_estimators_names_all_kinds():
+    assert sorted(KINDS["frequency_estimator"]) == [
+        "drem_finite_time",
+        "drem_gradient",
+        "drem_window",
+        "restarting_least_squares",
+    ]
+    for kind, estimator in classes("frequency_estimator").items():
+        assert estimator.kind == kind
+        assert set(option_docs(estimator)) == {item.name for item in fields(estimator) if item.init}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"prefilter": 0.004}, r"prefilter = 0\.004 s is shorter than half a sampling interval"),
+        ({"h": 1e300}, r"h = 1e\+300 s is more than 10,000,000 sampling intervals"),
+        ({"h": 1e6}, r"h = 1e\+06 s is more than 10,000,000 sampling intervals"),
+    ],
+)
+def test_delays_that_a_clock_cannot_have_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        RestartingLeastSquares(**{"tones": 1, "h": 0.4, **options}).start(INTERVAL)
+
+
+@pytest.mark.parametrize(
+    ("options", "blamed"),
+    [({"d": 11.0}, "d"), ({"prefilter": 11.0}, "prefilter"), ({"h": 2.4}, "h"), ({"difference": 9.0}, "h")],
+)
+def test_delays_longer_than_the_record_are_refused(options, blamed):
+    estimator = DremFiniteTime(**{"tones": 2, "h": 0.4, "d": 0.3, **options})
+    with pytest.raises(OptionError) as refused:
+        estimator.check(1000, INTERVAL)
+    assert refused.value.field == blamed
+    estimator.check(10_000, INTERVAL)
