@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origi
 
 import numpy as np
 import pydantic
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from ctid_cli.arrays import Array
@@ -24,21 +24,17 @@ from ctid_cli.custom_code import reason
 from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.signals.sampling import geometric_sizes
 from ctid_cli.specification.messages import Complaint, explained, option_docs, several_wrong
-from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_complaints
+from ctid_cli.specification.sweeps import MAX_COMBINATIONS, SweptModel, option_complaints
 from ctid_cli.specification.values import ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
 
 
-class Section(BaseModel):
+class Section(SweptModel):
     """A mapping of the specification."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, validate_default=True, defer_build=True)
 
-    #: Option dataclass that the section describes, if it describes one.
-    target: ClassVar[type | None] = None
     #: Sentences for keys that belong to another form of the section.
     elsewhere: ClassVar[Mapping[str, str]] = {}
-    #: Whether the option dataclass is one that the user wrote.
-    custom: ClassVar[bool] = False
     #: What to say of a section that gives nothing; empty if it may.
     if_empty: ClassVar[str] = ""
 

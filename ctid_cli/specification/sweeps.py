@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel
 
@@ -16,14 +16,24 @@ from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.values import Swept
 from ctid_cli.specification.yaml_source import KeyPath
 
-if TYPE_CHECKING:
-    from ctid_cli.specification.sections import Section
-
 #: Combinations that one section may sweep, and data cells that one experiment may hold.
 MAX_COMBINATIONS = 100_000
 AnySection = TypeVar("AnySection", bound=BaseModel)
 #: A complaint, and the swept values that it is about.
 Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
+
+
+class SweptModel(BaseModel):
+    """A part of the specification whose lists are swept."""
+
+    #: Option dataclass that it describes, if it describes one.
+    target: ClassVar[type | None] = None
+    #: Whether the option dataclass is one that the user wrote.
+    custom: ClassVar[bool] = False
+
+    def options(self) -> Any:
+        """Build the options; an OptionError says which of them is refused and why."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -35,14 +45,14 @@ class Variant:
     options: Any
 
 
-def variants(section: Section | None) -> list[Variant]:
+def variants(section: SweptModel | None) -> list[Variant]:
     """Return all combinations of a section's swept values, the last one changing fastest; none of no section."""
     if section is None:
         return []
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
 
 
-def known_variants(section: Section | None) -> list[Variant]:
+def known_variants(section: SweptModel | None) -> list[Variant]:
     """Return the same, but none of a custom component: what its options mean is not known."""
     return [] if section is None or section.custom else variants(section)
 
@@ -61,7 +71,7 @@ def _axes(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, l
             yield (*prefix, name), value
 
 
-def _combinations(section: Section) -> Iterator[tuple[dict[KeyPath, Any], Section]]:
+def _combinations(section: SweptModel) -> Iterator[tuple[dict[KeyPath, Any], SweptModel]]:
     axes = list(_axes(section))
     for point in itertools.product(*(values for _, values in axes)):
         swept = {path: value for (path, _), value in zip(axes, point, strict=True)}
@@ -78,7 +88,7 @@ def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
     return section.model_copy(update={name: inner})
 
 
-def option_complaints(section: Section) -> list[Complaint]:
+def option_complaints(section: SweptModel) -> list[Complaint]:
     """Return what the option dataclass, if any, has against the values of a section."""
     if section.target is None:
         return []
