@@ -21,16 +21,16 @@ UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = 16, 32, 64, 128
 NEWTON_STEPS = 60
 #: Second moments summed over many samples carry relative errors of about this size.
 ROUNDING = 4e-15
-#: A squared residual below so many times that is not known from the moments.
+#: A squared residual below this multiple of that is not known from the moments.
 DETERMINED = 10.0
 #: Added to the unit diagonal of scaled second moments where the best fit must exist even if it is not unique.
 REGULARISATION = 1e-10
-#: An estimation younger than so many periods, or beats of neighbours, is less certain than its misfit shows.
+#: An estimation younger than this number of periods, or beats of neighbours, is less certain than its misfit shows.
 FIRST_PERIODS = 2.0
 #: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of
 #: the frequency itself and of the distance to its neighbours.
 CERTAIN_FRACTION = 0.1
-#: The frequencies are inconsistent if they leave so many times the smallest possible squared residual.
+#: The frequencies are inconsistent if they leave more than this multiple of the smallest possible squared residual.
 WORSE_THAN_BEST = 10.0
 #: Residuals of new rows, averaged over this fraction of h, are compared with those of the estimate's own rows.
 DETECTOR_SPAN = 1.0 / 14.0
@@ -255,14 +255,14 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
 
 
 @njit(cache=True, nogil=True)
-def room_of(omega: Array, place: int) -> float:
-    """How far a frequency can be wrong before it is another one."""
-    room = omega[place]
+def smallest_gap(omega: Array, place: int) -> float:
+    """Return the distance of a frequency to its nearest neighbour, or to zero."""
+    gap = omega[place]
     if place > 0:
-        room = min(room, omega[place] - omega[place - 1])
+        gap = min(gap, omega[place] - omega[place - 1])
     if place + 1 < omega.size:
-        room = min(room, omega[place + 1] - omega[place])
-    return float(room)
+        gap = min(gap, omega[place + 1] - omega[place])
+    return float(gap)
 
 
 @njit(cache=True, nogil=True)
@@ -270,7 +270,7 @@ def lasts_a_period(omega: Array, elapsed: float) -> bool:
     """Whether a time [s] holds a period of every frequency, and a beat of all neighbours."""
     least = np.inf
     for i in range(omega.size):
-        least = min(least, room_of(omega, i))
+        least = min(least, smallest_gap(omega, i))
     return bool(least * elapsed >= 2.0 * np.pi)
 
 
@@ -316,12 +316,12 @@ def flag_uncertain(
         for k in range(n):
             square += direction[k] * slopes[k]
             length += abs(direction[k]) * scales[k]
-        room = room_of(omega, i)
+        gap = smallest_gap(omega, i)
         error = np.sqrt(max(square, 0.0) * misfit)
-        if room * enough < 2.0 * np.pi:
-            error *= (2.0 * np.pi / max(room * enough, 1e-30)) ** 5
+        if gap * enough < 2.0 * np.pi:
+            error *= (2.0 * np.pi / max(gap * enough, 1e-30)) ** 5
         # Rounding does not shrink with time, and is not enlarged by the lack of it.
-        if not error + ROUNDING * size * length <= CERTAIN_FRACTION * room:
+        if not error + ROUNDING * size * length <= CERTAIN_FRACTION * gap:
             return UNCERTAIN
     return 0
 
@@ -358,7 +358,7 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
 
 #: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
 MIXED_NEGLIGIBLE = 1e-4
-#: An estimate is judged by the residuals of so many times n h.
+#: An estimate is judged by the residuals of this multiple of n h.
 JUDGED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
 SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
@@ -476,12 +476,12 @@ def judge_rows(
 # --- least squares that restart when the signal changes ------------------------------------------------------------
 
 
-#: The estimate is computed anew with every row at first, then every so many.
+#: The estimate is computed anew with every row at first, then after this number of rows.
 REFRESH = 10
 EAGER_ROWS = 40
 #: Rows for each tone before the first estimate.
 FIRST_ROWS_PER_TONE = 2
-#: Older data are dropped if the whole fit leaves so many times the mean squared residual of the newer data alone.
+#: Older data are dropped if the whole fit leaves more than this multiple of the mean squared residual of newer ones.
 MIXED_RATIO = 6.0
 #: A fit that leaves no larger fraction of the regressand's second moment is exact, however short its data are.
 EXACT = 1e-13
@@ -544,7 +544,7 @@ def solve(gram: Array, whitener: Array, theta: Array) -> bool:
 
 @njit(cache=True, nogil=True)
 def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
-    """Frequencies of a fit to so many rows since so many; flags, and whether the fit may judge new samples.
+    """Frequencies of a fit to a number of rows since a restart; flags, and whether the fit may judge new samples.
 
     It may if it is certain, or has been there for so long that its misfit is not that of a beginning.
     """

@@ -29,7 +29,7 @@ LONGEST_DELAY = 10_000_000
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
 #: A number without a common divisor lies within this distance of any place, for all delays that are allowed.
 SEARCHED = 100
-#: Verdicts are given so many times in a delay h, but at most so many samples apart.
+#: Verdicts per delay h, and the greatest number of samples between two of them.
 VERDICTS_PER_DELAY = 64
 MOST_BETWEEN = 8
 #: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.

@@ -15,10 +15,10 @@ from ctid_cli.signals.checks import require_choice, require_positive
 
 Solution = Literal["least_squares", "total_least_squares"]
 
-#: The data that the detector needs before it may raise an alarm: so many h, and so many lengths of the prefilter.
+#: The data that the detector needs before it may raise an alarm: a number of h, and of lengths of the prefilter.
 ARMING_SPAN = 1.43
 ARMING_PREFILTERS = 2
-#: The halves of the data are first compared after so many lengths of the prefilter.
+#: The halves of the data are first compared after this number of lengths of the prefilter.
 MIXED_PREFILTERS = 8
 #: Memory if none is given, in units of h.
 DEFAULT_MEMORY = 100.0
