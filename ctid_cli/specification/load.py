@@ -187,7 +187,7 @@ def _with_file(
         if place == ("data",) and spec.measured is not None:
             spec.measured.dataset(0)
         elif place == ("sampling",):
-            spec.samplings[0].options.times(None)
+            located(variants(section)[0].options, spec.folder).times(None)
         else:
             source = located(variants(section)[0].options, spec.folder)
             read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)

@@ -23,7 +23,7 @@ from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
 from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
-from ctid_cli.specification.sweeps import Variant, known_variants, variants
+from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
 from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
 from ctid_cli.specification.yaml_source import KeyPath, YamlSource
@@ -336,12 +336,6 @@ class Spec(Section):
         loop = None if self.loop is None else variants(self.loop)[0].options
         source: MeasuredSource = replace(located(self.data.options(), self.folder), loop=loop)
         return source
-
-    @property
-    def samplings(self) -> list[Variant]:
-        """Variants of the sampling scheme, their files as seen from the working directory; none of a custom one."""
-        known = known_variants(self.sampling)
-        return [replace(variant, options=located(variant.options, self.folder)) for variant in known]
 
     @property
     def generator(self) -> tuple[tuple[str, ...], Section] | None:

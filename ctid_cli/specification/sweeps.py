@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import json
 import math
@@ -21,6 +22,11 @@ MAX_COMBINATIONS = 100_000
 AnySection = TypeVar("AnySection", bound=BaseModel)
 #: A complaint, and the swept values that it is about.
 Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
+#: What a check is given, with the swept values that it comes from.
+Case = tuple[Any, Mapping[KeyPath, Any]]
+#: All that checks are given, by its name and its place.
+Cases = Mapping[str, Mapping[KeyPath, Sequence[Case]]]
+Check = Callable[..., Iterator[Complaint]]
 
 
 class SweptModel(BaseModel):
@@ -50,11 +56,6 @@ def variants(section: SweptModel | None) -> list[Variant]:
     if section is None:
         return []
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
-
-
-def known_variants(section: SweptModel | None) -> list[Variant]:
-    """Return the same, but none of a custom component: what its options mean is not known."""
-    return [] if section is None or section.custom else variants(section)
 
 
 def case_count(section: Any) -> int:
@@ -136,21 +137,24 @@ def _texts(name: KeyPath, swept: Iterable[Mapping[KeyPath, Any]]) -> set[str]:
     return {json.dumps(one[name]) for one in swept}
 
 
-def over(
-    sections: Mapping[KeyPath, Sequence[Variant]],
-    check: Callable[..., Iterable[Complaint]],
-    at_most: int | None = None,
-) -> list[Complaint]:
-    """Return what a check of options says about the combinations of several sections' variants.
+def checked(cases: Cases, checks: Iterable[Check], at_most: int | None = None) -> Iterator[Complaint]:
+    """Yield what checks have against options that are right by themselves.
 
-    Swept values are called by the place that their section's variants are given under.
+    The arguments of a check are named after the cases that it is given, each combination of them in turn. A place that
+    it yields begins with the name of an argument, which stands for the place of that case.
     """
-    failures: list[Failure] = []
-    tried: list[Mapping[KeyPath, Any]] = []
-    for case in itertools.islice(itertools.product(*sections.values()), at_most):
-        tried.append(swept_in(dict(zip(sections, case, strict=True))))
-        failures += [(path, text, tried[-1]) for path, text in check(*(variant.options for variant in case))]
-    return grouped(failures, tried)
+    for check in checks:
+        names = list(inspect.signature(check).parameters)
+        for places in itertools.product(*(cases.get(name, {}) for name in names)):
+            at = dict(zip(names, places, strict=True))
+            failures: list[Failure] = []
+            tried: list[Mapping[KeyPath, Any]] = []
+            given = itertools.product(*(cases[name][place] for name, place in at.items()))
+            for combination in itertools.islice(given, at_most):
+                tried.append({path: value for _, swept in combination for path, value in swept.items()})
+                for (first, *rest), text in check(*(options for options, _ in combination)):
+                    failures.append(((*at.get(str(first), (first,)), *rest), text, tried[-1]))
+            yield from grouped(failures, tried)
 
 
 def swept_in(case: Mapping[KeyPath, Variant]) -> dict[KeyPath, Any]:
