@@ -6,8 +6,9 @@ The classes of ctid are registered with the bases: ``isinstance(WhiteNoise(varia
 import copy
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -252,6 +253,13 @@ class CustomFit(Fit):
         return dict(self.named_errors)
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """An estimator with a record, of which nothing is computed before a start is known."""
+
+    fit: Callable[..., Any]
+
+
 @dataclass(frozen=True)
 class CustomEstimation:
     """A custom estimator in the place of one of ctid's."""
@@ -263,37 +271,34 @@ class CustomEstimation:
         """What it takes from a start."""
         return getattr(self.options, "start_from", None)
 
-    def prepare(self, record: Record) -> "PreparedCustom":
+    def prepare(self, record: Record) -> Prepared:
         """Compute nothing before a start is known."""
-        return PreparedCustom(self.options, record)
+        return Prepared(partial(self._fit, record))
 
-
-@dataclass(frozen=True, eq=False)
-class PreparedCustom:
-    """A custom estimator with a record."""
-
-    options: Any
-    record: Record
-
-    def fit(self, start: Any = None) -> Fit:
-        """Estimate from copies of the options and of the record, without what no measurement has.
-
-        No estimate depends on what was estimated before, in this process or in another.
-        """
-        record, what = self.record, f"{type(self.options).__name__}.fit"
+    def _fit(self, record: Record, start: Any = None) -> Fit:
+        """Estimate from a copy of the record, without what no measurement has."""
         given = replace(record, input=replace(record.input), noise_free=None)
-        changes = ComponentError(f"{what} changes the record that it is given; copy first: y = record.y.copy()")
-        try:
-            found = copy.deepcopy(self.options).fit(given, start)
-        except ValueError as error:
-            if "read-only" in str(error):
-                raise changes from error
-            raise
+        found = called(self.options, "fit", given, start)
         pairs = [(given.t, record.t), (given.y, record.y), (given.input.t, record.input.t)]
         pairs += [(given.input.values, record.input.values)]
         if not all(np.array_equal(now, then, equal_nan=True) for now, then in pairs):
-            raise changes
-        return taken(found, record, what)
+            raise _changes(self.options, "fit")
+        return taken(found, record, f"{type(self.options).__name__}.fit")
+
+
+def called(options: Any, method: str, *given: Any) -> Any:
+    """Return what a method of a copy of the options returns: no estimate depends on those before it."""
+    try:
+        return getattr(copy.deepcopy(options), method)(*given)
+    except ValueError as error:
+        if "read-only" in str(error):
+            raise _changes(options, method) from error
+        raise
+
+
+def _changes(options: Any, method: str) -> ComponentError:
+    what = f"{type(options).__name__}.{method}"
+    return ComponentError(f"{what} changes the record that it is given; copy first: y = np.array(samples)")
 
 
 def value_of(measure: Measure, fit: Any, data: Any) -> float:

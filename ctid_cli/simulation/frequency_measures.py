@@ -17,10 +17,10 @@ A track of one row is an estimate of the whole record: it has ``omega``, ``rms``
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,7 +32,7 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import Disturbance, SineDisturbance, SumOfSinusoids, disturb
-from ctid_cli.simulation.components import ComponentError, is_custom
+from ctid_cli.simulation.components import ComponentError, Prepared, called, is_custom
 
 #: Units of the measures, in the order of columns.
 MEASURE_UNITS = {
@@ -223,9 +223,14 @@ class FrequencyEstimation:
     options: FrequencyEstimator
     start_from: ClassVar[None] = None
 
-    def prepare(self, record: SignalRecord) -> PreparedFrequencies:
+    def prepare(self, record: SignalRecord) -> Prepared:
         """Compute nothing before the fit."""
-        return PreparedFrequencies(self.options, record)
+        return Prepared(partial(self._fit, record))
+
+    def _fit(self, record: SignalRecord, start: None = None) -> FrequencyFit:
+        track = called(self.options, "track", record.samples, record.interval)
+        _require_track(track, self.options, record, f"{type(self.options).__name__}.track")
+        return FrequencyFit(self.options, track)
 
     def compile(self, interval: float) -> None:
         """Compile the kernels of the estimator; those of custom ones are compiled where they are tried."""
@@ -233,27 +238,6 @@ class FrequencyEstimation:
             # A record so short may be too short for it.
             with suppress(ValueError, DataError):
                 self.options.track(np.zeros(COMPILED_WITH), interval)
-
-
-@dataclass(frozen=True, eq=False)
-class PreparedFrequencies:
-    """An estimator of frequencies with a record."""
-
-    options: FrequencyEstimator
-    record: SignalRecord
-
-    def fit(self, start: None = None) -> FrequencyFit:
-        """Estimate the frequencies with a copy of the options: no estimate depends on those before it."""
-        what = f"{type(self.options).__name__}.track"
-        try:
-            track = copy.deepcopy(self.options).track(self.record.samples, self.record.interval)
-        except ValueError as error:
-            if "read-only" in str(error):
-                change = f"{what} changes the samples that it is given; copy first: y = np.array(samples)"
-                raise ComponentError(change) from error
-            raise
-        _require_track(track, self.options, self.record, what)
-        return FrequencyFit(self.options, track)
 
 
 def _require_track(track: Any, options: FrequencyEstimator, record: SignalRecord, what: str) -> None:

@@ -52,7 +52,7 @@ def custom_form(part: str) -> Any:
             target = find_class(str(value["kind"]), context.get("folder", Path()))
             form = _custom_section(target, wanted, value["kind"])
         except CustomCodeError as error:
-            raise several_wrong("custom", [(("kind",), str(error), False)]) from None
+            raise several_wrong("custom", [(("kind",), str(error))]) from None
         given = {"name": target.__name__, **value} if part == "measure" else value
         return form.model_validate(given, context=info.context)
 

@@ -190,7 +190,9 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     random = [k for k, point in enumerate(delays) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
-    if spec.signal is None and (spec.loop is None or has_relay(spec)) and not broken & {"loop", "data", "excitation"}:
+    relay = spec.loop is not None and hasattr(spec.loop.controller, "relay")
+    # To estimators a record in a loop with a relay is one in open loop.
+    if spec.signal is None and (spec.loop is None or relay) and not broken & {"loop", "data", "excitation"}:
         give = "give loop, or data.reference and loop.controller for a measured record"
         message = f"closed-loop instruments need the reference and the controller; {give}"
         for name, section in spec.estimators.items():
@@ -225,11 +227,6 @@ def _of_worlds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
 
 def _is_regular(spec: Spec) -> bool:
     return spec.sampling is None or spec.sampling.target is RegularSampling
-
-
-def has_relay(spec: Spec) -> bool:
-    """Return whether a relay closes the loop: to estimators the record is one in open loop."""
-    return spec.loop is not None and hasattr(spec.loop.controller, "relay")
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -14,11 +14,11 @@ from ctid_cli.simulation.dataset import LoopOptions, file_sha256, joined, locate
 from ctid_cli.specification.custom_sections import names_code
 from ctid_cli.specification.joint_checks import joint_complaints, too_many_cases
 from ctid_cli.specification.joint_warnings import joint_warnings
-from ctid_cli.specification.messages import Complaint, Located, explained, shown
+from ctid_cli.specification.messages import Complaint, explained, shown
 from ctid_cli.specification.presence import presence_complaints
 from ctid_cli.specification.spec import Spec, SpecPart
 from ctid_cli.specification.sweeps import case_count, replaced, variants
-from ctid_cli.specification.yaml_source import OVERRIDE_FILE, KeyPath, YamlSource, parse_yaml, read_yaml, written
+from ctid_cli.specification.yaml_source import KEY, OVERRIDE_FILE, KeyPath, YamlSource, parse_yaml, read_yaml, written
 
 
 def load_spec(
@@ -46,7 +46,7 @@ def load_spec(
         message = f"the file must hold a mapping that begins with 'experiment: name', not {shown(tree)}"
         raise SpecError([source.problem((), "the file is empty" if tree is None else message)])
     spec, complaints = _validated(source, folder, allow_code)
-    broken = frozenset(str(where[0]) for where, _, _ in complaints if where)
+    broken = frozenset(str(where[0]) for where, _ in complaints if where)
     if too_many := too_many_cases(spec):
         raise SpecError([source.problem((), too_many)])
     spec, about_files = _with_files(spec, own=isinstance(given, Mapping), anywhere=allow_outside)
@@ -58,8 +58,7 @@ def load_spec(
         return found.wrong if found is not None else ()
 
     joint = joint_complaints(spec, broken, tried, files_are_good=not about_files)
-    complaints += [(where, message, False) for where, message in (*about_files, *joint)]
-    _require_none(source, complaints)
+    _require_none(source, [*complaints, *about_files, *joint])
     spec._warnings = tuple(str(source.problem(where, message)) for where, message in (*joint_warnings(spec), *odd))
     return spec
 
@@ -82,9 +81,9 @@ def load_loop(path: Path) -> LoopOptions:
     section, problems = part.loop, [problem for problem in problems if problem[0][0] == "loop"]
     if section is not None and section.reference is not None:
         message = "belongs to simulated data; that of a record is a column, --reference"
-        problems = [(("loop", "reference"), message, True)]
+        problems = [(("loop", "reference", KEY), message)]
     elif case_count(section) > 1:
-        problems = [(("loop",), "has lists of values; a record was taken in one loop: keep one of each", False)]
+        problems = [(("loop",), "has lists of values; a record was taken in one loop: keep one of each")]
     _require_none(source, problems)
     assert section is not None
     options: LoopOptions = section.options()
@@ -99,9 +98,9 @@ def json_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 
 
-def _require_none(source: YamlSource, complaints: Sequence[Located]) -> None:
+def _require_none(source: YamlSource, complaints: Sequence[Complaint]) -> None:
     """Raise what is wrong, each problem once and in the order of the file."""
-    problems = {source.problem(where, message, key=at_key) for where, message, at_key in complaints}
+    problems = {source.problem(where, message) for where, message in complaints}
     if problems:
         in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
         raise SpecError(in_order)
@@ -119,7 +118,7 @@ def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
             yield path
 
 
-def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Located]]:
+def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Complaint]]:
     """Return what is right of a specification, and all that is wrong with its sections by themselves."""
     tree = source.tree
     # A specification may come from anywhere.
@@ -128,22 +127,22 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     spec, complaints = _right_part(tree, folder)
-    complaints += [(where, message, True) for where, message in presence_complaints(spec, tree)]
+    complaints += [((*where, KEY), message) for where, message in presence_complaints(spec, tree)]
     # What is wrong is left out of what is looked at next.
-    wrong = {str(where[0]) for where, _, _ in complaints if where and where[0] != "estimators"}
+    wrong = {str(where[0]) for where, _ in complaints if where and where[0] != "estimators"}
     spec = spec.model_copy(update=dict.fromkeys(wrong & Spec.model_fields.keys()))
     spec._folder, spec._source = folder, source
     return spec, complaints
 
 
-def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Located]]:
+def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Complaint]]:
     """Return the sections, and estimators, that are right by themselves, and what is wrong with the others."""
     context = {"folder": folder, "of_signal": tree.get("signal") is not None}
     try:
         return Spec.model_validate(tree, context=context), []
     except ValidationError as error:
         complaints = [explained(detail, {}) for detail in error.errors(include_url=False)]
-    places = [where for where, _, _ in complaints]
+    places = [where for where, _ in complaints]
     right = {name: value for name, value in tree.items() if not any(where[:1] == (name,) for where in places)}
     named = tree.get("estimators")
     if isinstance(named, Mapping):

@@ -9,13 +9,11 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from ctid_cli.specification.yaml_source import KeyPath
+from ctid_cli.specification.yaml_source import KEY, KeyPath
 from ctid_cli.text import did_you_mean
 
 #: Key path inside a section, and what is wrong there.
 Complaint = tuple[KeyPath, str]
-#: The same, and whether it is about the key more than about its value.
-Located = tuple[KeyPath, str, bool]
 
 #: Begins the tags of unions, which pydantic puts into the places of errors; no text from YAML holds it.
 TAG = "\0"
@@ -53,31 +51,27 @@ def wrong(message: str) -> PydanticCustomError:
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
-def several_wrong(title: str, problems: Iterable[Located]) -> ValidationError:
+def several_wrong(title: str, problems: Iterable[Complaint]) -> ValidationError:
     """Return one validation error that holds several problems."""
-    details = [
-        InitErrorDetails(
-            type=PydanticCustomError("said", "{message}", {"message": message, "at_key": at_key}), loc=path, input=None
-        )
-        for path, message, at_key in problems
-    ]
+    details = [InitErrorDetails(type=wrong(message), loc=path, input=None) for path, message in problems]
     return ValidationError.from_exception_data(title, details)
 
 
-def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Located:
+def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint:
     """Return the place and the sentence of an error in a section whose fields have the given descriptions."""
     parts = [str(part) for part in error["loc"]]
-    path = tuple(part for part in error["loc"] if not str(part).startswith(TAG) and part != "[key]")
+    path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
-    at_key = context.get("at_key", False) or kind in ("missing", "extra_forbidden") or "[key]" in parts
     path, kind, value, context = _told(path, kind, value, context)
     if kind not in SENTENCES:
-        return path, error["msg"], at_key
+        return path, error["msg"]
+    if kind in ("missing", "extra_forbidden"):
+        path = (*path, KEY)
     words = _words(path, descriptions) | {"shown": shown(value)} | context
     if kind == "literal_error":
         words["allowed"] = context["expected"].replace(" or ", ", ")
     hints = [tag.removeprefix(TAG) for tag in parts if tag.startswith(HINT)]
-    return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints), at_key
+    return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints)
 
 
 def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tuple[KeyPath, str, Any, dict[str, Any]]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origi
 
 import numpy as np
 import pydantic
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from ctid_cli.arrays import Array
@@ -24,15 +24,20 @@ from ctid_cli.custom_code import reason
 from ctid_cli.errors import CtidError, OptionError
 from ctid_cli.signals.sampling import geometric_sizes
 from ctid_cli.specification.messages import Complaint, explained, option_docs, several_wrong
-from ctid_cli.specification.sweeps import MAX_COMBINATIONS, SweptModel, option_complaints
+from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_complaints
 from ctid_cli.specification.values import ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
+from ctid_cli.specification.yaml_source import KEY
 
 
-class Section(SweptModel):
+class Section(BaseModel):
     """A mapping of the specification."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, validate_default=True, defer_build=True)
 
+    #: Option dataclass that it describes, if it describes one.
+    target: ClassVar[type | None] = None
+    #: Whether the option dataclass is one that the user wrote.
+    custom: ClassVar[bool] = False
     #: Sentences for keys that belong to another form of the section.
     elsewhere: ClassVar[Mapping[str, str]] = {}
     #: What to say of a section that gives nothing; empty if it may.
@@ -57,19 +62,17 @@ class Section(SweptModel):
     @classmethod
     def _in_plain_words(cls, value: Any, handler: pydantic.ModelWrapValidatorHandler[Section]) -> Section:
         required = cls.requirements(value) if isinstance(value, Mapping) else ()
-        problems = [(path, message, True) for path, message in required]
+        problems = [((*path, KEY), message) for path, message in required]
         try:
             section = handler(value)
         except ValidationError as error:
             problems += [explained(detail, cls.descriptions()) for detail in cls.details(error, value)]
         else:
-            if not problems:
-                found = option_complaints(section) or section.complaints()
-                problems = [(path, message, False) for path, message in found]
+            problems = problems or option_complaints(section) or list(section.complaints())
             if not problems:
                 return section
         other = cls.elsewhere
-        said = [(at, other.get(str(at[0]), text) if at else text, key) for at, text, key in problems]
+        said = [(at, other.get(str(at[0]), text) if at else text) for at, text in problems]
         raise several_wrong(cls.__name__, said)
 
     @classmethod

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
@@ -29,19 +29,6 @@ Cases = Mapping[str, Mapping[KeyPath, Sequence[Case]]]
 Check = Callable[..., Iterator[Complaint]]
 
 
-class SweptModel(BaseModel):
-    """A part of the specification whose lists are swept."""
-
-    #: Option dataclass that it describes, if it describes one.
-    target: ClassVar[type | None] = None
-    #: Whether the option dataclass is one that the user wrote.
-    custom: ClassVar[bool] = False
-
-    def options(self) -> Any:
-        """Build the options; an OptionError says which of them is refused and why."""
-        raise NotImplementedError
-
-
 @dataclass(frozen=True)
 class Variant:
     """One combination of a section's swept values."""
@@ -51,7 +38,7 @@ class Variant:
     options: Any
 
 
-def variants(section: SweptModel | None) -> list[Variant]:
+def variants(section: Any) -> list[Variant]:
     """Return all combinations of a section's swept values, the last one changing fastest; none of no section."""
     if section is None:
         return []
@@ -72,7 +59,7 @@ def _axes(section: BaseModel, prefix: KeyPath = ()) -> Iterator[tuple[KeyPath, l
             yield (*prefix, name), value
 
 
-def _combinations(section: SweptModel) -> Iterator[tuple[dict[KeyPath, Any], SweptModel]]:
+def _combinations(section: Any) -> Iterator[tuple[dict[KeyPath, Any], Any]]:
     axes = list(_axes(section))
     for point in itertools.product(*(values for _, values in axes)):
         swept = {path: value for (path, _), value in zip(axes, point, strict=True)}
@@ -89,7 +76,7 @@ def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
     return section.model_copy(update={name: inner})
 
 
-def option_complaints(section: SweptModel) -> list[Complaint]:
+def option_complaints(section: Any) -> list[Complaint]:
     """Return what the option dataclass, if any, has against the values of a section."""
     if section.target is None:
         return []

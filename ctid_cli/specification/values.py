@@ -99,6 +99,6 @@ def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item
         # Lists and sections have no hash; what is equal reads alike.
         text = repr(item + 0.0 if type(item) in (int, float) else item)
         if text in seen:
-            raise several_wrong("list", [((k,), f"{called(item)} is in this list twice; keep one of them", False)])
+            raise several_wrong("list", [((k,), f"{called(item)} is in this list twice; keep one of them")])
         seen.add(text)
     return values

@@ -30,6 +30,8 @@ from ctid_cli.text import did_you_mean
 
 #: Keys and list indices that lead from the top of a file to a value.
 KeyPath = tuple[str | int, ...]
+#: Ends the path of a key, where it is the key that is wrong and not its value; pydantic's word for it.
+KEY = "[key]"
 
 #: A specification is written by hand; anything larger is some other file, or an alias that multiplies itself.
 MAX_BYTES = 250_000
@@ -90,17 +92,18 @@ class YamlSource:
     nodes: dict[KeyPath, tuple[Any, Any]] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
-    def place(self, path: KeyPath, *, key: bool = False) -> Place:
+    def place(self, path: KeyPath) -> Place:
         """Return where a problem with a key path is to be reported: of a mapping, and where a key is amiss, its key."""
+        key = False
         while path and path not in self.nodes:
             path, key = path[:-1], True
         value, name = self.nodes.get(path, (None, None))
         node = name if name is not None and (key or isinstance(value, yaml.MappingNode)) else value
         return Place(self.file, 1, 1) if node is None else Place.of(node.start_mark)
 
-    def problem(self, path: KeyPath, message: str, *, key: bool = False) -> Problem:
+    def problem(self, path: KeyPath, message: str) -> Problem:
         """Return a problem at a key path."""
-        return self.place(path, key=key).problem(path, message)
+        return self.place(path).problem(path, message)
 
     def build(self, node: Any, path: KeyPath = (), name: Any = None, parents: tuple[Any, ...] = ()) -> Any:
         """Return the value of a node; what is wrong with it goes to the problems."""
@@ -131,7 +134,7 @@ class YamlSource:
                 if name.value == "<<":
                     wrong = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
                 elif name.value in mapping:
-                    first = self.place(here, key=True).line
+                    first = self.place((*here, KEY)).line
                     wrong = f"the key {path_text((name.value,))!r} is given twice, first on line {first}; keep one"
             if wrong:
                 self.problems.append(Place.of(name.start_mark).problem(here, wrong))
@@ -164,7 +167,7 @@ class YamlSource:
 def path_text(path: KeyPath) -> str:
     """Return a key path as users write it."""
     text = ""
-    for part in path:
+    for part in path[:-1] if path[-1:] == (KEY,) else path:
         word = part if isinstance(part, int) or len(part) <= MAX_KEY else part[: MAX_KEY - 1] + "…"
         text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{word}"
     return text

@@ -4,11 +4,9 @@ import pytest
 
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.sampling import geometric_sizes
 from tests.specification.written import CLOSED_LOOP as CLOSED
-from tests.specification.written import MEASURED_LOOP as MEASURED
-from tests.specification.written import RECORD, changed, load, problems
+from tests.specification.written import changed, load
 
 
 def test_it_is_accepted(tmp_path):
@@ -101,72 +99,3 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
     assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
         ("both", "none"), ("one", "none"), ("search", "0.1"),
     ]  # fmt: skip
-
-
-def test_given_parameters(tmp_path):
-    given = (
-        "{additive: [{numerator: [3.1], denominator: [0.26, 0.25, 1]}, {numerator: [1], denominator: [0.02, 0.01, 1]}]}"
-    )
-    plan = build_plan(load(tmp_path, CLOSED, f"starts.parameters={given}"))
-    (start,) = plan.starts
-    assert start.label.startswith("given ")
-    model = start.draw(None, 0).model
-    assert model.theta.tolist() == [0.25, 0.26, 3.1, 0.01, 0.02, 1.0]
-    # Other values are another start: the label is part of the identity of an estimate.
-    other = build_plan(load(tmp_path, CLOSED, f"starts.parameters={given.replace('3.1', '3.2')}"))
-    assert other.starts[0].label != start.label
-
-
-def test_parameters_near_those_of_one_fraction(tmp_path):
-    # Poles at -1 and -0.5 +- 1.94j: the partial fractions are of the first order, and of the second with a zero.
-    fraction = "system={numerator: [3, 1], denominator: [1, 2, 5, 4]}"
-    rest = ["loop=null", "excitation={kind: gaussian}", "success=null"]
-    estimators = "estimators={both: {kind: additive_srivc, terms: [{poles: 1, zeros: 0}, {poles: 2, zeros: 1}]}}"
-    plan = build_plan(load(tmp_path, CLOSED, fraction, estimators, *rest))
-    data = plan.data_cells[0].dataset(0)
-    model = plan.starts[0].draw(1, 0, data.true_model).model
-    assert model.terms == (Term(1, 0), Term(2, 1))
-    assert plan.terms == (Term(1, 0), Term(2, 1)), "those of the estimator, since the system has none"
-    (problem,) = problems(
-        tmp_path, CLOSED, "system={numerator: [1], denominator: [1, 2, 1]}", "loop=null", "excitation={kind: gaussian}",
-        "success=null", "estimators={one: {kind: srivc, poles: 2, zeros: 0}}",
-    )  # fmt: skip
-    assert problem.key == "starts.parameters[0]"
-    assert "cannot be written as a sum of submodels: the pole at -1" in problem.message
-
-
-def test_coloured_noise(tmp_path):
-    noise = "noise={kind: arma, numerator: [1, 0.5], denominator: [1, -0.85], innovation_variance: 0.02}"
-    plan = build_plan(load(tmp_path, CLOSED, noise))
-    assert plan.data_cells[0].source.noise == ArmaNoise((1.0, 0.5), (1.0, -0.85), innovation_variance=0.02)
-
-
-# -- measured records -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def record_file(tmp_path):
-    (tmp_path / "record.csv").write_text(RECORD)
-    return tmp_path / "record.csv"
-
-
-def test_a_measured_record_in_a_loop(tmp_path, record_file):
-    plan = build_plan(load(tmp_path, MEASURED, "data.estimation_samples=30", "data.offset=remove"))
-    (cell,) = plan.data_cells
-    assert cell.content["loop"]["controller"] == {"numerator": [0.5, -0.4], "denominator": [1.0, -1.0]}
-    data = cell.dataset(0)
-    loop = data.record.loop
-    reference = [(k // 3) % 2 for k in range(30)]
-    assert loop.reference.tolist() == pytest.approx([r - sum(reference) / 30 for r in reference])
-    assert loop.controller.numerator.tolist() == [0.5, -0.4]
-    assert data.validation.loop is None
-    assert build_plan(load(tmp_path, MEASURED, "loop.enters=input")).data_cells[0].hash != cell.hash
-    swept = build_plan(load(tmp_path, MEASURED, "loop.enters=[controller, input]"))
-    assert [cell.source.loop.enters for cell in swept.data_cells] == ["controller", "input"]
-
-
-def test_a_measured_loop_needs_a_regular_clock(tmp_path, record_file):
-    record_file.write_text(RECORD.replace("0.7,", "0.75,", 1))
-    (problem,) = problems(tmp_path, MEASURED)
-    assert (problem.line, problem.key) == (2, "data.file")
-    assert "a closed loop needs a regular clock: its controller is discrete" in problem.message

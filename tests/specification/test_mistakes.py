@@ -16,19 +16,25 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_what_is_said_and_nothing_else(tmp_path, name):
-    base, case = CASES[name]
-    files = {"parts.py": CUSTOM_PARTS, "gains.py": "GAIN = 2.0\n", "record.csv": RECORD}
+def said(folder, base, case):
+    """Return what is said of a case: a file of this folder, or a text, with changes and overrides."""
+    files = {"parts.py": CUSTOM_PARTS, "gains.py": "GAIN = 2.0\n", "record.csv": RECORD} | case.get("files", {})
     for file, old, new in case.get("code", ()):
         files[file] = changed(files[file], (old, new))
     for file, content in files.items():
-        (tmp_path / file).write_text(content, encoding="utf-8")
-    text = changed((HERE / f"{base}.yaml").read_text(encoding="utf-8"), *case.get("change", ()))
+        if content is not None:
+            (folder / file).write_text(content, encoding="utf-8")
+    text = case["text"] if base == "other" else (HERE / f"{base}.yaml").read_text(encoding="utf-8")
     try:
-        found = {"warns": list(load(tmp_path, text, *case.get("set", ()), allow_code=base == "custom").warnings)}
+        spec = load(folder, changed(text, *case.get("change", ())), *case.get("set", ()), allow_code=True)
+        found = {"warns": list(spec.warnings)}
     except SpecError as error:
         found = {"says": [str(problem) for problem in error.problems]}
-    said = {kind: [line.replace(f"{tmp_path}/spec.yaml:", "") for line in lines] for kind, lines in found.items()}
-    expected = {kind: case[kind] for kind in ("says", "warns") if kind in case}
-    assert {kind: [line.replace(f"{tmp_path}/", "") for line in lines] for kind, lines in said.items()} == expected
+    names = (f"{folder}/spec.yaml:", f"{folder}/")
+    return {kind: [line.replace(names[0], "").replace(names[1], "") for line in found[kind]] for kind in found}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_said_and_nothing_else(tmp_path, name):
+    base, case = CASES[name]
+    assert said(tmp_path, base, case) == {kind: case[kind] for kind in ("says", "warns") if kind in case}

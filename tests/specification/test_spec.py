@@ -4,7 +4,6 @@ import copy
 import hashlib
 import json
 import math
-import shutil
 from dataclasses import fields
 from pathlib import Path
 
@@ -21,6 +20,8 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
 from tests.specification.written import (
     CLOSED_LOOP,
+    CUSTOM,
+    CUSTOM_PARTS,
     MEASURED,
     MEASURED_LOOP,
     OPEN_LOOP,
@@ -33,40 +34,6 @@ from tests.specification.written import (
 )
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("empty", "", "the file is empty"),
-        ("comment", "# nothing\n", "the file is empty"),
-        ("list", "- a\n- b\n", "not a list"),
-        ("text", "experiment", "not the text"),
-    ],
-)
-def test_files_that_hold_no_mapping(tmp_path, name, text, message):
-    (problem,) = problems(tmp_path, text)
-    assert (problem.line, problem.column) == (1, 1)
-    assert message in problem.message
-
-
-def test_nothing_random_needs_no_monte_carlo(tmp_path):
-    changes = [
-        ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: step\n  time: 1.0\n"),
-        ("monte_carlo: {runs: 10, seed: 1}\n", ""),
-        (", {uniform: [0, 9]}]", "]"),
-    ]
-    plan = build_plan(load(tmp_path, changed(SIMULATED, *changes), "noise=null"))
-    assert plan.runs == 1
-    assert plan.data_cells[0].dataset(0).record.n_samples == 4000
-
-
-def test_overrides_are_checked_like_the_file(tmp_path):
-    spec = load(tmp_path, SIMULATED, "noise.snr_db=20", "estimators.one.variant=plain", "success.fit_percent=9e1")
-    canonical = spec.canonical()
-    assert canonical["noise"]["snr_db"] == 20.0
-    assert canonical["estimators"]["one"]["variant"] == "plain"
-    assert (canonical["success"]["delay_relative_error"], canonical["success"]["fit_percent"]) == (0.01, 90.0)
 
 
 def test_canonical_form_fills_defaults_and_comes_back(tmp_path):
@@ -116,7 +83,7 @@ def test_hashes_are_what_they_were():
         canonical_json([float("nan")])
 
 
-BASES = [yaml.safe_load(text) for text in (SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP)]
+BASES = [yaml.safe_load(text) for text in (SIMULATED, CLOSED_LOOP, SIGNAL, OPEN_LOOP, MEASURED, MEASURED_LOOP, CUSTOM)]
 VALUES = [None, [], {}, -1, 0, 2, 0.5, 1e300, 1e-300, math.nan, math.inf, True, "", "x", [1, 1], [1, -2], {"kind": "x"}]
 SECTIONS = [(name, section) for tree in BASES for name, section in tree.items()]
 
@@ -133,7 +100,8 @@ def places(node):
 @given(st.data())
 def test_whatever_is_wrong_ends_in_problems_with_their_places(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("spec")
-    (folder / "record.csv").write_text(RECORD, encoding="utf-8")
+    for name, text in (("record.csv", RECORD), ("parts.py", CUSTOM_PARTS), ("gains.py", "GAIN = 2.0")):
+        (folder / name).write_text(text, encoding="utf-8")
     tree = copy.deepcopy(data.draw(st.sampled_from(BASES)))
     for _ in range(data.draw(st.integers(1, 4))):
         node, key = data.draw(st.sampled_from(list(places(tree)) or [(tree, "experiment")]))
@@ -144,7 +112,7 @@ def test_whatever_is_wrong_ends_in_problems_with_their_places(tmp_path_factory, 
             tree[name] = copy.deepcopy(section)
     found = []
     try:
-        build_plan(load(folder, yaml.safe_dump(tree, sort_keys=False)))
+        build_plan(load(folder, yaml.safe_dump(tree, sort_keys=False), allow_code=True))
     except SpecError as error:
         found = error.problems
     assert all(problem.line >= 1 and problem.column >= 1 and problem.message for problem in found)
@@ -163,29 +131,6 @@ def test_a_measured_record(tmp_path):
     assert spec.warnings == ()
 
 
-@pytest.mark.parametrize(
-    ("record", "message"),
-    [
-        (None, "there is no such file"),
-        ("", "the file is empty"),
-        ("t,u,y\n", "no data"),
-        ("t,u,z\n0,0,0\n", "y"),
-        ("t,u,y\n0,0,0\n1,1,x\n", "record.csv:3"),
-        ("t,u,y\n" + "".join(f"{k % 7},{k % 2},{k}\n" for k in range(50)), "record.csv:9"),
-        ("t,u,y\n" + "".join(f"{k},1,{k}\n" for k in range(50)), "the input 'u' is constant (1)"),
-        ("t,u,y\n" + "".join(f"{k},{k % 2},\n" for k in range(50)), "no sample of the output"),
-        ("t,u,y\n" + "".join(f"{k},{k % 2},{k if k > 30 else ''}\n" for k in range(50)), "used for estimation"),
-        ("t,u,y\n" + "".join(f"{k},{k % 2},{k}\n" for k in range(20)), "30 samples are asked for and the file has 20"),
-    ],
-)
-def test_records_that_cannot_be_used(tmp_path, record, message):
-    if record is not None:
-        (tmp_path / "record.csv").write_text(record)
-    (problem,) = problems(tmp_path, MEASURED)
-    assert (problem.line, problem.column, problem.key) == (2, 14, "data.file")
-    assert message in problem.message
-
-
 def test_content_hash_of_a_file_is_checked(tmp_path):
     (tmp_path / "record.csv").write_text(RECORD)
     pinned = changed(MEASURED, ("offset", f"sha256: {'0' * 64}, offset"))
@@ -193,23 +138,6 @@ def test_content_hash_of_a_file_is_checked(tmp_path):
     assert (problem.line, problem.key) == (2, "data.sha256")
     good = load(tmp_path, MEASURED).data.sha256
     assert load(tmp_path, pinned.replace("0" * 64, good))
-
-
-def test_an_input_file(tmp_path):
-    from_file = ("  kind: prbs\n  stages: 10\n  clock_period: 0.05\n", "  kind: file\n  file: record.csv\n")
-    text = changed(SIMULATED, from_file)
-    (problem,) = problems(tmp_path, text)
-    assert (problem.line, problem.column, problem.key) == (5, 9, "excitation.file")
-    (tmp_path / "record.csv").write_text(RECORD)
-    spec = load(tmp_path, text)
-    (cell, _) = build_plan(spec).data_cells
-    assert "file" not in cell.content["excitation"], "the place of a file is no part of its identity"
-    elsewhere = tmp_path / "elsewhere"
-    shutil.copytree(tmp_path, elsewhere)
-    assert build_plan(load(elsewhere, text)).data_cells[0].hash == cell.hash
-    assert build_plan(load(elsewhere, text)).spec_hash == build_plan(spec).spec_hash
-    (tmp_path / "record.csv").write_text(RECORD + "5.1,1,1\n")
-    assert build_plan(load(tmp_path, text)).data_cells[0].hash != cell.hash
 
 
 def test_a_file_of_instants(tmp_path):
