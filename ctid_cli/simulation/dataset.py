@@ -339,12 +339,8 @@ class MeasuredSource:
         if replicate != 0:
             raise ValueError(f"a measured record has replicate 0 only, not {replicate}")
         file = self.file if self.sha256 is None else require_content(self.file, self.sha256)
-        columns: dict[str, Any] = {
-            "time": self.time,
-            "input": self.input,
-            "output": self.output,
-            "reference": self.reference,
-        }
+        columns: dict[str, Any]
+        columns = {"time": self.time, "input": self.input, "output": self.output, "reference": self.reference}
         measured = read_measurement(file, **columns, hold=self.hold, in_seconds=True)
         whole = measured.record
         t, u, y = whole.t, whole.input.values, whole.y

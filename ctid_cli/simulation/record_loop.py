@@ -20,29 +20,24 @@ def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
     """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
     record, r = measured.record, measured.reference_values
     assert r is not None
-    if isinstance(loop.controller, Relay):
-        raise DataError(
-            f"{record.name}: {_IGNORE.format('closed-loop instruments need a linear controller, no relay')}"
-        )
     _check_units(measured, loop)
-    if record.interval is None:
+    why, controller = "", loop.at(record.interval or 1.0).controller
+    if isinstance(controller, Relay):
+        why = "closed-loop instruments need a linear controller, no relay"
+    elif record.interval is None:
         why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
-        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
-    controller = loop.at(record.interval).controller
-    left = unexplained(record, r, controller, loop.enters)
-    if not left <= UNEXPLAINED:
+    elif not (left := unexplained(record, r, controller, loop.enters)) <= UNEXPLAINED:
         made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
         why = (
             f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
             "controller in continuous time, another sampling interval, sign or reference, or limits of the actuator "
             "do that, and estimates with it would be wrong"
         )
-        raise DataError(f"{record.name}: {_IGNORE.format(why)}")
+    if why:
+        cure = "correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
+        raise DataError(f"{record.name}: {why}; {cure}")
     closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
     return replace(measured, record=closed)
-
-
-_IGNORE = "{}; correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
 
 
 def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:

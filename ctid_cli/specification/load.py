@@ -159,15 +159,16 @@ def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Co
     complaints: list[Complaint] = []
     for place, section in sections.items():
         if hasattr(section, "sha256") and not section.custom:
-            spec, found = _with_file(spec, place, section, own=own, anywhere=anywhere)
-            complaints += found
+            try:
+                content = _checked_content(spec, place, section, own=own, anywhere=anywhere)
+                spec = replaced(spec, (*place, "sha256"), content)
+            except DataError as error:
+                complaints.append(((*place, error.field or "file"), str(error)))
     return spec, complaints
 
 
-def _with_file(
-    spec: Spec, place: tuple[str, ...], section: Any, *, own: bool, anywhere: bool
-) -> tuple[Spec, list[Complaint]]:
-    """Return the specification with the content hash of one file filled in, and what is wrong with the file.
+def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, anywhere: bool) -> str:
+    """Return the content hash of a file that can be used.
 
     Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
     """
@@ -175,23 +176,19 @@ def _with_file(
     open_to_all = own or is_inside(file, spec.folder)
     if not (anywhere or open_to_all):
         ask = "if you trust the specification, repeat the command with --allow-outside (or CTID_ALLOW_OUTSIDE=1)"
-        return spec, [((*place, "file"), f"lies outside the folder of the specification and is not read; {ask}")]
-    readable = False
+        raise DataError(f"lies outside the folder of the specification and is not read; {ask}")
+    content = file_sha256(file)
+    if section.sha256 not in (None, content):
+        raise DataError(f"the SHA-256 of {file} is {content}; is it another file?", "sha256")
+    options = located(variants(section)[0].options, spec.folder)
     try:
-        content = file_sha256(file)
-        readable = True
-        if section.sha256 not in (None, content):
-            return spec, [((*place, "sha256"), f"the SHA-256 of {file} is {content}; is it another file?")]
-        spec = replaced(spec, (*place, "sha256"), content)
-        if place == ("data",) and spec.measured is not None:
+        if spec.measured is not None:
             spec.measured.dataset(0)
         elif place == ("sampling",):
-            located(variants(section)[0].options, spec.folder).times(None)
+            options.times(None)
         else:
-            source = located(variants(section)[0].options, spec.folder)
-            read_held_signal(source.file, time=source.time, input=source.input, hold=source.hold)
+            read_held_signal(options.file, time=options.time, input=options.input, hold=options.hold)
     except DataError as error:
         silent = f"{file} cannot be used; it lies outside the folder, so that nothing of it is repeated here"
-        said = str(error) if open_to_all or not readable else f"{silent}: 'ctid check' says what is wrong with it"
-        return spec, [((*place, "file"), said)]
-    return spec, []
+        raise DataError(str(error) if open_to_all else f"{silent}: 'ctid check' says what is wrong with it") from None
+    return content

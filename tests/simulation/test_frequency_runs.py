@@ -7,7 +7,6 @@ import pytest
 
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 from ctid_cli.simulation.frequency_measures import (
@@ -16,8 +15,6 @@ from ctid_cli.simulation.frequency_measures import (
     measure_track,
 )
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.storage.estimates import export_rows, read_estimates, read_stored
-from tests.running.fakes import outcomes_of
 from tests.specification.written import SIGNAL as SPEC
 from tests.specification.written import load
 
@@ -72,23 +69,3 @@ def test_measures_of_a_made_up_track():
     never = measure_track(made(t, first), t, true, signal, Measuring(0.05), alarms=True)
     assert (never["settling_time_1"], never["settling_after_step_1"]) == (2.0, None)
     assert not is_settled(never, 0.05, None)
-
-
-def test_results_are_exported_and_read_back(tmp_path):
-    plan = build_plan(load(tmp_path, SPEC))
-    folder = tmp_path / "out"
-    summary = run_experiment(plan, folder, jobs=1)
-    assert (summary.computed, summary.failed) == (4, 0)
-    stored = read_stored(folder)
-    outcomes = outcomes_of(plan.job(0, 0))
-    assert {outcome.key for outcome in outcomes} < stored.results.keys()
-    for outcome in outcomes:
-        assert stored.results[outcome.key]["measures"] == outcome.result["measures"]
-    flat = export_rows(read_estimates(folder))
-    assert {"omega_1", "settling_after_step_2", "rms_2", "false_alarms", "converged"} <= set(flat)
-    assert not {"numerator", "delay", "b0", "measures"} & set(flat)
-    restarting = flat[flat["estimator"] == "restarting"]
-    assert restarting["converged"].all()
-    assert (restarting["settling_after_step_1"] < 8).all()
-    again = run_experiment(plan, folder, jobs=1)
-    assert (again.computed, again.reused) == (0, 4)

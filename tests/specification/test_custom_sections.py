@@ -81,19 +81,17 @@ def test_a_class_with_a_fitting_fit_alone_is_an_estimator(folder):
 
 def test_every_folder_has_neighbours_of_its_own(folder, tmp_path_factory):
     other = tmp_path_factory.mktemp("other")
-    (other / "gains.py").write_text("GAIN = 3.0\n", encoding="utf-8")
     (other / "inner").mkdir()
-    (other / "inner" / "__init__.py").write_text("from .deep import DEEP\n", encoding="utf-8")
-    (other / "inner" / "deep.py").write_text("import gains\nDEEP = 2 * gains.GAIN\n", encoding="utf-8")
-    lines = [
-        "from inner import deep, DEEP",
-        "import inner.deep",
-        "class A:",
-        "    def f():",
-        "        from gains import GAIN",
-    ]
-    text = "\n".join([*lines, "        return GAIN, DEEP, deep.DEEP, inner.deep.DEEP", ""])
-    (other / "parts.py").write_text(text, encoding="utf-8")
+    files = {
+        "gains.py": "GAIN = 3.0\n",
+        "inner/__init__.py": "from .deep import DEEP\n",
+        "inner/deep.py": "import gains\nDEEP = 2 * gains.GAIN\n",
+        "parts.py": "from inner import deep, DEEP\nimport inner.deep\n"
+        "class A:\n    def f():\n        from gains import GAIN\n"
+        "        return GAIN, DEEP, deep.DEEP, inner.deep.DEEP\n",
+    }
+    for name, text in files.items():
+        (other / name).write_text(text, encoding="utf-8")
     first, second = find_class("./parts.py:Noise", folder), find_class("./parts.py:A", other)
     assert (first.generate.__globals__["GAIN"], second.f()) == (2.0, (3.0, 6.0, 6.0, 6.0))
     # The same file with another content is another module, also behind a module that did not change.
