@@ -53,10 +53,10 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
         yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
     if kind == "data" and column and "loop" not in present:
         yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
-    elif kind == "data" and data and not column and "loop" in present:
+    elif kind == "data" and isinstance(raw["data"], Mapping) and not column and "loop" in present:
         yield ("data", "reference"), "is missing; a loop has a reference: name its column"
-    no_relay = loop and "relay" not in _mapping(loop, "controller")
-    if kind == "loop" and "excitation" not in present and no_relay and not reference:
+    needed = kind == "loop" and isinstance(raw["loop"], Mapping) and "relay" not in _mapping(loop, "controller")
+    if needed and not reference and "excitation" not in present:
         yield ("loop", "reference"), "is missing; for example {kind: gaussian, standard_deviation: 1.0}"
     random = _random_section(spec, raw, present)
     if random and "monte_carlo" not in present:
@@ -89,6 +89,6 @@ def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
     if target is None and isinstance(kind, str) and kind in KINDS[part]:
         target = resolve(part, kind)
     without = getattr(target, "deterministic_with", {})
-    if getattr(target, "deterministic", False) is True:
-        return True
-    return any(options.get(name) in without[name] for name in without)
+    return getattr(target, "deterministic", False) is True or any(
+        options.get(name) in without[name] for name in without
+    )

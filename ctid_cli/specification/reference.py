@@ -31,18 +31,14 @@ def reference_text(word: str | None = None) -> str:
     sections: Mapping[str, Node] = schema["properties"]
     if word is None:
         return "\n".join([wrapped(_LEGEND), "", *_keys(schema, schema["$defs"], "")]).rstrip()
-    kinds = {
-        kind: [name for name in sections if kind in _kinds(sections[name], schema["$defs"])]
-        for name in sections
-        for kind in _kinds(sections[name], schema["$defs"])
-    }
-    if word not in sections and word not in kinds:
-        known = f"sections: {', '.join(sections)}"
-        near = did_you_mean(word, [*sections, *kinds])
-        raise UsageError(f"no section or kind of an experiment file is called {word!r}{near or '; ' + known}")
-    names, kind = ([word], None) if word in sections else (kinds[word], word)
+    names = [name for name, node in sections.items() if word in _kinds(node, schema["$defs"])]
+    names = [word] if word in sections else names
+    if not names:
+        kinds = [kind for node in sections.values() for kind in _kinds(node, schema["$defs"])]
+        near = did_you_mean(word, [*sections, *kinds]) or f"; sections: {', '.join(sections)}"
+        raise UsageError(f"no section or kind of an experiment file is called {word!r}{near}")
     part = {"properties": {name: sections[name] for name in names}, "required": schema["required"]}
-    return "\n".join(_keys(part, schema["$defs"], "", kind)).rstrip()
+    return "\n".join(_keys(part, schema["$defs"], "", None if word in sections else word)).rstrip()
 
 
 def _kinds(node: Node, defs: Node) -> list[str]:

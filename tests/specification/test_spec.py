@@ -4,7 +4,6 @@ import copy
 import hashlib
 import json
 import math
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 
 from ctid_cli.canonical import canonical_json, content_hash
 from ctid_cli.errors import DataError, SpecError
-from ctid_cli.kinds import KINDS, classes
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import json_schema, load_spec, spec_from_canonical
 from tests.specification.written import (
@@ -180,13 +178,8 @@ def test_the_shipped_schema_is_current():
     )
 
 
-def test_the_schema_knows_every_option_and_its_unit():
+def test_the_schema_knows_types_and_units():
     schema = json_schema()
-    for name in KINDS:
-        for kind, target in classes(name).items():
-            section = schema["$defs"][target.__name__]
-            assert section["properties"]["kind"]["const"] == kind
-            assert set(section["properties"]) - {"kind"} == {option.name for option in fields(target) if option.init}
     interval = schema["$defs"]["RegularSampling"]["properties"]["interval"]
     assert interval["description"] == "Sampling interval [s]."
     assert interval["oneOf"] == [{"type": "number"}, {"type": "array", "items": {"type": "number"}}]

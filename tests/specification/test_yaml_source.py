@@ -12,39 +12,21 @@ def value(text):
     return parse_yaml(f"key: {text}", "f").tree["key"]
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("1e-3", 0.001),
-        ("1e3", 1000.0),
-        ("-1E+2", -100.0),
-        (".5", 0.5),
-        ("-1.", -1.0),
-        ("7", 7),
-        ("010", 10),
-        ("+3", 3),
-        ("true", True),
-        ("false", False),
-        ("True", "True"),
-        ("no", "no"),
-        ("on", "on"),
-        ("yes", "yes"),
-        ("1:30", "1:30"),
-        ("2026-11-21", "2026-11-21"),
-        ("0x1F", "0x1F"),
-        ("1_000", "1_000"),
-        ("1e", "1e"),
-        ("'1'", "1"),
-        ("!!str 1", "1"),
-        ("!!float 1.5", 1.5),
-        ("-.inf", float("-inf")),
-        ("~", None),
-        ("null", None),
-        ("", None),
-        ("9" * 400, float("inf")),
-        ("[1, {a: b}]", [1, {"a": "b"}]),
-    ],
-)
+NUMBERS = {"1e-3": 0.001, "1e3": 1000.0, "-1E+2": -100.0, ".5": 0.5, "-1.": -1.0, "7": 7, "010": 10, "+3": 3}
+OTHERS = {
+    "true": True,
+    "false": False,
+    "~": None,
+    "null": None,
+    "": None,
+    "-.inf": float("-inf"),
+    "9" * 400: float("inf"),
+}
+TAGGED = {"'1'": "1", "!!str 1": "1", "!!float 1.5": 1.5, "[1, {a: b}]": [1, {"a": "b"}]}
+TEXTS = ["True", "no", "on", "yes", "1:30", "2026-11-21", "0x1F", "1_000", "1e"]
+
+
+@pytest.mark.parametrize(("text", "expected"), [*(NUMBERS | OTHERS | TAGGED).items(), *zip(TEXTS, TEXTS, strict=True)])
 def test_scalars(text, expected):
     assert value(text) == expected
     assert type(value(text)) is type(expected)
