@@ -129,6 +129,7 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
     """Return what is checked of sections in which nothing is swept."""
     given: list[tuple[str, KeyPath, Any]] = [(name, (name,), getattr(spec, name)) for name in ("data", "success")]
     given.append(("monte_carlo", ("monte_carlo",), spec.monte_carlo))
+    given.append(("seed", ("monte_carlo", "seed"), getattr(spec.monte_carlo, "seed", 0)))
     given.append(("until", ("monte_carlo", "until"), getattr(spec.monte_carlo, "until", None)))
     custom_system = spec.system if getattr(spec.system, "custom", False) else None
     given.append(("custom_system", ("system",), custom_system))

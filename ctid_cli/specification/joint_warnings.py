@@ -62,11 +62,11 @@ def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
         yield ("duration",), f"{short}, whose time constant is {slowest:.4g} s; {cure}"
 
 
-def _of_sampled_input(excitation: Any, sampling: Any) -> Iterator[Complaint]:
+def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Complaint]:
     if sampling.input_record != "sampled":
         return
-    times = sampling.times(stream(0, "sampling", 0))
-    applied = excitation.generate(times, stream(0, "input", 0))
+    times = sampling.times(stream(seed, "sampling", 0))
+    applied = excitation.generate(times, stream(seed, "input", 0))
     if applied.hold != "zoh":
         return
     edges = applied.t[1:][np.diff(applied.values) != 0.0]
