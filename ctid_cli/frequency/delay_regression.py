@@ -196,15 +196,16 @@ class Online(ABC):
         self._seen += 1
         return FrequencyTrack(np.array([(self._seen - 1) * self.clock.interval]), omega, flags)
 
-    def rows(self, samples: Array) -> tuple[Array, Array]:
-        """Return the rows ``[phi psi]`` at h and at the second delay; NaN where a sample is missing."""
+    def rows(self, samples: Array) -> Array:
+        """Return the rows ``[phi psi]`` at h and at the second delay, (2, N, n + 1); NaN where a sample is missing."""
         if self.weights.size > 1:
             samples = np.convolve(self._unfiltered.extended(samples), self.weights, "valid")
-        newest_first = np.lib.stride_tricks.sliding_window_view(
-            self._filtered.extended(samples), 2 * self.options.tones * self.clock.lag + 1
-        )[:, ::-1]
-        second = newest_first[:, : 2 * self.options.tones * self.clock.second_lag + 1 : self.clock.second_lag]
-        return newest_first[:, :: self.clock.lag] @ self.table.T, second @ self.table.T
+        past, delays = self._filtered.extended(samples), np.arange(2 * self.options.tones + 1)
+        newest, rows = len(past) - samples.size, np.empty((2, samples.size, len(self.table)))
+        for lag, into in zip((self.clock.lag, self.clock.second_lag), rows, strict=True):
+            delayed = np.stack([past[newest - age : len(past) - age] for age in lag * delays])
+            np.matmul(delayed.T, self.table.T, out=into)
+        return rows
 
 
 class Tail:

@@ -6,7 +6,6 @@ The regression is stacked at n instants, d apart, and multiplied by the adjugate
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -16,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, gradient_steps, judge_rows, slide
+from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, Mixed, Mixing, mixed_estimates
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
-from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
 
 
@@ -115,7 +113,15 @@ class DremGradient(MixingOptions):
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""
-        return OnlineGradient(self, interval)
+        n, clock = self.tones, self.clock(interval)
+        initial = self.initial_frequencies
+        if initial is None:
+            lowest, highest = np.arccos((clock.top, clock.bottom)) / clock.delay
+            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
+        gains = np.full(n, interval) * np.asarray(self.gamma, dtype=float)
+        scale = float(self.epsilon) ** (n if self.power == "literal" else int(self.power))
+        descent = scale, gains, theta_of(initial, clock.delay), self.finite_time
+        return OnlineMixing(self, interval, JUDGED_SPANS * n * clock.lag, descent, past=np.nan if self.gated else 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,106 +250,47 @@ class DremWindow(MixingOptions):
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""
-        return OnlineWindow(self, interval)
+        window = whole_delay("memory", self.memory, interval)
+        self.require_samples(self.memory, window, interval)
+        return OnlineMixing(self, interval, window)
+
+
+#: Factor of Delta and Psi, gamma times the sampling interval, parameters to begin with, and whether in finite time.
+Descent = tuple[float, Array, Array, bool]
+#: Least squares over the window in place of the gradient.
+NO_DESCENT: Descent = (1.0, np.empty(0), np.empty(0), False)
 
 
 class OnlineMixing(Online):
-    """Delays, mixing and verdict of an estimator on the mixed regressions, with a window of rows to judge it by."""
+    """An estimation from mixed regressions, sample by sample."""
 
-    #: Factor ``eps^p`` of Delta and Psi.
-    scale = 1.0
-
-    def __init__(self, options: MixingOptions, interval: float, window: int, *, past: float = np.nan) -> None:
+    def __init__(
+        self,
+        options: MixingOptions,
+        interval: float,
+        window: int,
+        descent: Descent = NO_DESCENT,
+        past: float = np.nan,
+    ) -> None:
         super().__init__(options, interval, past=past)
-        n = options.tones
+        n, filled = options.tones, 2 * options.tones * self.clock.lag
+        self._scale, *own = descent
         self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
-        self._reach = 2 * n * self.clock.lag + int(self._ages[-1]) + 1
-        self._flush = 2 * n * self.clock.lag + window
         self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
-        self._enough = min(options.rows_before_valid(self.clock), window)
-        self._used = 0.0
+        enough = min(options.rows_before_valid(self.clock), window)
+        self._settings = Mixing(filled + int(self._ages[-1]) + 1, filled + window, enough, *own)
         width = n + 3 + 2 * (n + 1) ** 2
-        self._sliding = np.zeros((window, width)), np.zeros(width), np.zeros(1, np.int64)
-        self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50])
-
-    @abstractmethod
-    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta and the number of rows it rests on, of ``[Psi Delta]``, its sums and the rows so far."""
+        counters = np.array([0, 0, 0, 0, 1 << 50, 1 << 50])
+        sums, estimates = np.zeros((window + 2, width)), np.full((3, n), np.nan)
+        self._state = Mixed(sums[2:], *sums[:2], np.zeros((2, n)), *estimates, np.zeros(3), counters)
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
-        n, count = omega.shape[1], samples.size
-        rows, second_rows = self.rows(samples)
-        history = self._mixed_rows.extended(rows)
-        # A regression whose square is too large for a number is not used.
+        rows = self.rows(samples)
+        history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
-            found = np.isfinite(mixed).all(axis=1) & np.isfinite(mixed[:, n] ** 2)
-            mixed[~found] = np.nan
-            parts = (
-                mixed[:, n:] * mixed,
-                found[:, None],
-                np.isfinite(rows[:, :1]),
-                products(rows),
-                products(second_rows),
-            )
-        entries = np.nan_to_num(np.hstack(parts), copy=False)
-        # [Delta Psi, Delta^2, mixed rows, rows, second moments of the rows at h and at the second delay]
-        sums = np.empty(entries.shape)
-        slide(entries, *self._sliding, sums)
-        used = self._used + np.cumsum(found, dtype=float)
-        self._used = used[-1]
-        theta, support = self.estimates(mixed, sums, used)
-        unexcited = ~(sums[:, n] > 0.0)
-        flags[~found & (used > 0)] |= int(Flag.GAP)
-        flags[support < self._enough] |= int(Flag.STARTING)
-        flags[unexcited & (used > 0)] |= int(Flag.UNDETERMINED)
-        interval, judged = self.clock.interval, np.where(unexcited, 0.0, sums[:, n + 2])
-        spans, elapsed = (self._reach + support) * interval, (self._reach + used) * interval
-        grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
-        judging = self.clock, self._flush, *self._judged
-        judge_rows(theta, rows, grams, judged, spans, elapsed, *judging, omega, flags)
-
-
-class OnlineGradient(OnlineMixing):
-    """The gradient or finite-time estimate, sample by sample."""
-
-    def __init__(self, options: DremGradient, interval: float) -> None:
-        n, lag = options.tones, whole_delay("h", options.h, interval)
-        super().__init__(options, interval, JUDGED_SPANS * n * lag, past=np.nan if options.gated else 0.0)
-        self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
-        initial = options.initial_frequencies
-        if initial is None:
-            lowest, highest = np.arccos((self.clock.top, self.clock.bottom)) / self.clock.delay
-            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
-        gains = np.full(n, interval) * np.asarray(options.gamma, dtype=float)
-        self._descent = gains, theta_of(initial, self.clock.delay), options.finite_time, np.zeros((2, n))
-
-    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta by gradient steps, and the mixed rows so far."""
-        theta = np.empty((len(mixed), self.options.tones))
-        gradient_steps(mixed, *self._descent, theta)
-        return theta, used
-
-
-class OnlineWindow(OnlineMixing):
-    """Least squares on the mixed regressions of a sliding window, sample by sample."""
-
-    def __init__(self, options: DremWindow, interval: float) -> None:
-        window = whole_delay("memory", options.memory, interval)
-        options.require_samples(options.memory, window, interval)
-        super().__init__(options, interval, window)
-
-    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta of the window, NaN where Delta vanishes all the time, and the mixed rows in the window."""
-        n = self.options.tones
-        squares = sums[:, n : n + 1]
-        return np.divide(sums[:, :n], squares, out=np.full((len(sums), n), np.nan), where=squares > 0), sums[:, n + 1]
-
-
-def products(rows: Array) -> Array:
-    """Return the products of all pairs of columns, shape (N, m m)."""
-    return (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+            mixed = self._scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
+        mixed_estimates(rows, mixed, self.clock, self._settings, self._state, omega, flags)
 
 
 def mix(rows: Sequence[Array]) -> Array:

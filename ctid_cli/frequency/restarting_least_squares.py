@@ -118,13 +118,12 @@ class OnlineRestarting(Online):
             memory=memory / interval,
             whitener=whitener,
         )
-        older, newer, check = np.zeros((3, n + 1, n + 1))
-        self._fit = Fit(older, newer, check, np.full(n, np.nan), np.full(n, np.nan), np.zeros(4), np.zeros(5, np.int64))
+        moments, estimates = np.zeros((3, n + 1, n + 1)), np.full((2, n), np.nan)
+        self._fit = Fit(moments, *estimates, np.zeros(4), np.zeros(5, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
-        rows, second_rows = self.rows(samples)
-        restarting_fits(rows, second_rows, np.isnan(samples), self.clock, self._settings, self._fit, omega, flags)
+        restarting_fits(self.rows(samples), self.clock, self._settings, self._fit, omega, flags)
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:
