@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, IntArray
 
+Flags = NDArray[np.uint16]
+
 # The first bits of ctid_cli.frequency.flags.Flag; a test compares them.
 STARTING, GAP, CHANGED, UNDETERMINED = 1, 2, 4, 8
 UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = 16, 32, 64, 128
@@ -63,35 +65,27 @@ class Clock(NamedTuple):
 @njit(cache=True, nogil=True)
 def add_row(row: Array, gram: Array) -> None:
     """Add a row to second moments, unless a sample of it is missing."""
-    for i in range(row.size if np.isfinite(row[0]) else 0):
-        for j in range(row.size):
-            gram[i, j] += row[i] * row[j]
+    if np.isfinite(row[0]):
+        gram += np.outer(row, row)
 
 
 @njit(cache=True, nogil=True)
 def residual_of(row: Array, theta: Array) -> float:
     """Residual ``psi - phi' theta`` of a row ``[phi psi]``."""
-    residual = row[theta.size]
-    for i in range(theta.size):
-        residual -= theta[i] * row[i]
-    return float(residual)
+    return float(row[-1] - np.sum(theta * row[:-1]))
 
 
 @njit(cache=True, nogil=True)
 def squared_residual(gram: Array, theta: Array) -> float:
     """Sum of the squared residuals ``psi - phi' theta``; a negative one is rounding."""
-    n = theta.size
-    total = residual_of(gram[n], theta)
-    for i in range(n):
-        total -= theta[i] * residual_of(gram[i], theta)
-    return max(total, 0.0)
+    return max(residual_of(gram[-1] - theta @ gram[:-1], theta), 0.0)
 
 
 @njit(cache=True, nogil=True)
-def size_of(gram: Array, theta: Array) -> float:
-    """Size of the terms that cancel in the residuals, ``|psi| + sum |theta_k| |phi_k|``."""
+def rounding_of(gram: Array, theta: Array) -> float:
+    """Rounding of the sum of the squared residuals: terms of the size ``|psi| + sum |theta_k phi_k|`` cancel in it."""
     sizes = np.sqrt(np.diag(gram))
-    return float(sizes[-1] + np.sum(np.abs(theta) * sizes[:-1]))
+    return float(ROUNDING * (sizes[-1] + np.sum(np.abs(theta) * sizes[:-1])) ** 2)
 
 
 @njit(cache=True, nogil=True)
@@ -104,9 +98,7 @@ def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
         return False, factor, scales
     for i in range(n):
         for j in range(i + 1):
-            total = gram[i, j] / (scales[i] * scales[j])
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
+            total = gram[i, j] / (scales[i] * scales[j]) - np.sum(factor[i, :j] * factor[j, :j])
             if i > j:
                 factor[i, j] = total / factor[j, j]
             elif total + ridge > 4e-16 * n:
@@ -120,16 +112,11 @@ def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
 @njit(cache=True, nogil=True)
 def substitute(factor: Array, scales: Array, values: Array) -> None:
     """Solve ``S L L' S x = b`` in place, with S the scales."""
-    n = values.size
     values /= scales
-    for i in range(n):
-        for k in range(i):
-            values[i] -= factor[i, k] * values[k]
-        values[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            values[i] -= factor[k, i] * values[k]
-        values[i] /= factor[i, i]
+    for i in range(values.size):
+        values[i] = (values[i] - np.sum(factor[i, :i] * values[:i])) / factor[i, i]
+    for i in range(values.size - 1, -1, -1):
+        values[i] = (values[i] - np.sum(factor[i + 1 :, i] * values[i + 1 :])) / factor[i, i]
     values /= scales
 
 
@@ -150,7 +137,7 @@ def least_squares(gram: Array, ridge: float, theta: Array) -> bool:
 # if theta belongs to sinusoids at all. Noise can move a pair of roots off the real axis, or a root out of the interval.
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def real_roots(coefficients: Array, roots: Array) -> bool:
     """Roots of a monic polynomial without its leading coefficient, all at once; False if some are complex.
 
@@ -163,8 +150,7 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
     variance = squares / n - mean * mean
     if not variance >= 0.0:
         return False
-    for i in range(n):
-        roots[i] = mean + np.sqrt(2.0 * variance) * np.cos(np.pi * (i + 0.5) / n)
+    roots[:] = mean + np.sqrt(2.0 * variance) * np.cos(np.pi * (np.arange(n) + 0.5) / n)
     for _ in range(ROOT_STEPS):
         settled = True
         for i in range(n):
@@ -174,11 +160,9 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
                 size = size * abs(roots[i]) + abs(coefficients[k])
                 if k != i:
                     others *= roots[i] - roots[k]
-            # A value below its own rounding is none.
-            settled &= abs(value) <= 4e-16 * n * size
-            if value != 0.0:
-                if others == 0.0:
-                    return False
+            # A value below its own rounding says nothing of where the root is.
+            if not abs(value) <= 2e-16 * n * size:
+                settled = False
                 roots[i] -= value / others
         if settled:
             return True
@@ -215,9 +199,8 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
 def rooms_of(omega: Array) -> Array:
     """Distances of ascending frequencies to their nearest neighbours, or to zero."""
     rooms = omega.copy()
-    for i in range(1, omega.size):
-        rooms[i] -= omega[i - 1]
-        rooms[i - 1] = min(rooms[i - 1], rooms[i])
+    rooms[1:] -= omega[:-1]
+    rooms[:-1] = np.minimum(rooms[:-1], rooms[1:])
     return rooms
 
 
@@ -247,29 +230,23 @@ def flag_uncertain(
     determined, factor, scales = factorise(gram, 0.0)
     if not determined:
         return UNDETERMINED
-    n, size = theta.size, size_of(gram, theta)
-    misfit, rounded = squared_residual(gram, theta), ROUNDING * size * size
+    n, misfit, rounded = theta.size, squared_residual(gram, theta), rounding_of(gram, theta)
     if misfit < DETERMINED * rounded:
         misfit = min(left, max(misfit, rounded))
-    rooms, slopes = rooms_of(omega), np.empty(n)
+    rooms = rooms_of(omega)
     for i in range(n):
         # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
-        slope = clock.delay * np.sqrt(max(1.0 - roots[i] * roots[i], 0.0))
-        for j in range(n):
-            if j != i:
-                slope *= roots[i] - roots[j]
-        if slope == 0.0:
-            return UNCERTAIN
-        for k in range(n):
-            slopes[k] = roots[i] ** (n - 1 - k) / slope
+        others = roots[i] - roots
+        others[i] = clock.delay * np.sqrt(max(1.0 - roots[i] * roots[i], 0.0))
+        slopes = roots[i] ** np.arange(n - 1, -1, -1) / np.prod(others)
         direction = slopes.copy()
         substitute(factor, scales, direction)
         error = np.sqrt(max(np.sum(direction * slopes), 0.0) * misfit)
         periods = rooms[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
         if periods < 1.0:
             error /= max(periods, 1e-30) ** 5
-        # Rounding does not shrink with time, and is not enlarged by the lack of it.
-        rounding = ROUNDING * size * np.sum(np.abs(direction) * scales)
+        # Rounding does not shrink with time, and is not enlarged by the lack of it. Equal roots leave NaN.
+        rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(direction) * scales)
         if not error + rounding <= CERTAIN_FRACTION * rooms[i]:
             return UNCERTAIN
     return 0
@@ -289,8 +266,7 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
     # Coefficients of prod(x - cos(w_i delay)) after the leading one.
     for i in range(n):
         c = np.cos(omega[i] * delay)
-        for k in range(i, 0, -1):
-            theta[k] -= c * theta[k - 1]
+        theta[1:] -= c * theta[:-1]
         theta[0] -= c
     # Far below the regressand nothing is inconsistent, and the best fit need not be found.
     residual = squared_residual(gram, theta)
@@ -299,7 +275,7 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
     return INCONSISTENT if residual > WORSE_THAN_BEST * squared_residual(gram, theta) else 0
 
 
-# --- dynamic regressor extension and mixing (DREM) -----------------------------------------------------------------
+# --- estimates judged by recent rows -------------------------------------------------------------------------------
 
 
 #: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
@@ -307,164 +283,72 @@ MIXED_NEGLIGIBLE = 1e-4
 #: An estimate is judged by the residuals of this multiple of n h.
 JUDGED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
-PLACE, USED, SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(6)
+SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
 
 
-class Mixing(NamedTuple):
-    """Settings of an estimation from mixed regressions."""
+class Judged(NamedTuple):
+    """What is remembered of the estimates so far."""
 
-    #: Samples that a mixed row reaches back, and that a change takes to leave delays and window.
-    reach: int
+    #: Samples after which nothing is left of a change.
     flush: int
-    #: Mixed rows before an estimate can be valid.
-    enough: int
-    #: gamma times the sampling interval, parameters to begin with; both empty for least squares over the window.
-    gains: Array
-    initial: Array
-    finite_time: bool
-
-
-class Mixed(NamedTuple):
-    """State of an estimation from mixed regressions."""
-
-    #: The entries of the sliding window, the sum of the newer ones and of all: ``[Delta Psi, Delta^2]``, the number of
-    #: mixed rows and of rows, second moments of the rows at h and at the second delay.
-    window: Array
-    newer: Array
-    sums: Array
-    #: z and q of the gradient steps.
-    steps: Array
-    #: The present estimate, its roots, and the estimate before.
     theta: Array
-    roots: Array
-    before: Array
-    #: Newest mean squared residual, what it may be, and the squared residuals of the judged rows.
+    #: Newest mean squared residual, what it may be, and the sum of the last squared residuals.
     levels: Array
-    #: Place in the window, mixed rows so far, verdict (flags), samples since the last verdict, doubt and change.
+    #: Samples since the last verdict, the verdict (flags), samples since the last doubt and the last change.
     counters: IntArray
 
 
 @njit(cache=True, nogil=True)
-def slide(entry: Array, window: Array, newer: Array, place: int, sums: Array) -> int:
-    """Sum entries over a sliding window; return the place of the next one.
-
-    A block of old entries is summed backwards once, and the newer ones forwards; nothing is ever subtracted, so no
-    rounding error of an entry outlives it. ``window`` holds plain entries before ``place`` and, from there on, each
-    summed with all that follow it.
-    """
-    window[place] = entry
-    newer += entry
-    sums[:] = newer
-    if place + 1 < len(window):
-        sums += window[place + 1]
-        return place + 1
-    for j in range(len(window) - 2, -1, -1):
-        window[j] += window[j + 1]
-    newer[:] = 0.0
-    return 0
-
-
-@njit(cache=True, nogil=True)
-def gradient_step(mixed: Array, settings: Mixing, steps: Array) -> None:
-    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over an interval, Delta and Psi held.
-
-    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``.
-    """
-    n = settings.gains.size
-    for i in range(n):
-        # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
-        x = settings.gains[i] * mixed[n] * mixed[n]
-        m = -np.expm1(-x)
-        gain = settings.gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
-        steps[0, i] += gain * mixed[n] * mixed[i] - m * steps[0, i]
-        steps[1, i] += m * (1.0 - steps[1, i])
-
-
-@njit(cache=True, nogil=True)
-def mixed_estimates(
-    rows: Array, mixed: Array, clock: Clock, settings: Mixing, state: Mixed, omega: Array, flags: NDArray[np.uint16]
+def judge_rows(
+    theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, judged: Judged, omega: Array, flags: Flags
 ) -> None:
-    """Gradient, finite-time or sliding-window estimates from mixed regressions ``[Psi Delta]``."""
-    sums, steps, theta, counters = state.sums, state.steps, state.theta, state.counters
-    n, descends, entry = theta.size, settings.gains.size > 0, np.empty(sums.size)
-    moments = entry[n + 3 :].reshape((2, n + 1, n + 1))
-    for k in range(len(mixed)):
-        entry[:] = 0.0
-        entry[: n + 1] = mixed[k, n] * mixed[k]
-        # A regression whose square is too large for a number is not used.
-        found = np.isfinite(entry[: n + 1]).all()
-        if found:
-            counters[USED] += 1
-            entry[n + 1] = 1.0
-            if descends:
-                gradient_step(mixed[k], settings, steps)
-        else:
-            entry[: n + 1] = 0.0
-        entry[n + 2] = np.isfinite(rows[0, k, 0])
-        add_row(rows[0, k], moments[0])
-        add_row(rows[1, k], moments[1])
-        counters[PLACE] = slide(entry, state.window, state.newer, counters[PLACE], sums)
-        used, excited = counters[USED], sums[n] > 0.0
-        support = used if descends else sums[n + 1]
-        flag = STARTING if support < settings.enough else 0
-        if used > 0 and not found:
-            flag |= GAP
-        if used > 0 and not excited:
-            flag |= UNDETERMINED
-        for i in range(n):
-            if not descends:
-                theta[i] = sums[i] / sums[n] if excited else np.nan
-            elif settings.finite_time and steps[1, i] > 0.0:
-                theta[i] = steps[0, i] / steps[1, i]
-            else:
-                theta[i] = steps[0, i] + (1.0 - steps[1, i]) * settings.initial[i]
+    """Decode estimates that come with the moments of recent rows at both delays, and say which cannot be trusted.
+
+    ``counts`` holds, for each estimate, its recent rows (an estimate without them is not judged), the samples that it
+    rests on and all samples so far; ``flags`` what is known.
+    """
+    n, before, levels, counters = theta.shape[1], judged.theta, judged.levels, judged.counters
+    roots, interval = np.empty(n), clock.interval
+    smoothing, forgotten = 1.0 / max(1.0, DETECTOR_SPAN * clock.lag), 1.0 / (JUDGED_SPANS * n * clock.lag)
+    for k in range(len(theta)):
         omega[k] = np.nan
-        if descends or excited:
-            flag |= decode(theta, clock, state.roots, omega[k])
-            if excited and sums[n + 2] > 0.0:
-                flag |= judge_mixed(rows[0, k], omega[k], flag, support, clock, settings, state)
-        flags[k] = flag
-
-
-@njit(cache=True, nogil=True)
-def judge_mixed(
-    row: Array, omega: Array, flag: int, support: float, clock: Clock, settings: Mixing, state: Mixed
-) -> int:
-    """Judge an estimate by the rows of the window: flags."""
-    n, theta, levels, counters = omega.size, state.theta, state.levels, state.counters
-    started = flag & STARTING == 0
-    # The residual of what was known before this row.
-    square = residual_of(row, state.before) ** 2
-    state.before[:] = theta
-    if np.isfinite(square):
-        levels[NEWEST] += (square - levels[NEWEST]) / max(1.0, DETECTOR_SPAN * clock.lag)
-        levels[LEFT] += square - levels[LEFT] / (JUDGED_SPANS * n * clock.lag)
-    # One unlike the others is doubted at once; otherwise a verdict is given now and then.
-    contradicted = started and levels[NEWEST] > levels[USUAL]
-    if counters[SINCE_VERDICT] == 0 or contradicted:
-        moments = state.sums[n + 3 :].reshape((2, n + 1, n + 1))
-        gram = moments[0]
-        span = (settings.reach + support) * clock.interval
-        elapsed = (settings.reach + counters[USED]) * clock.interval
-        verdict = flag_uncertain(gram, levels[LEFT], theta, state.roots, omega, clock, span, elapsed)
-        if contradicted or verdict:
-            verdict |= UNCERTAIN
-            levels[NEWEST] = 0.0
-            if started:
-                counters[SINCE_DOUBT] = 0
-            if contradicted:
-                counters[SINCE_CHANGE] = 0
-        # Rows from before a change must first have left the window.
-        elif counters[SINCE_CHANGE] < settings.flush or not lasts_a_period(
-            omega, counters[SINCE_DOUBT] * clock.interval
-        ):
-            verdict = UNCERTAIN
-        counters[VERDICT] = verdict | flag_inconsistent(moments[1], omega, clock.second_delay, MIXED_NEGLIGIBLE)
-        rounded = ROUNDING * size_of(gram, theta) ** 2
-        levels[USUAL] = ALARM_RATIO * max(squared_residual(gram, theta), rounded) / state.sums[n + 2]
-    counters[SINCE_VERDICT] = (counters[SINCE_VERDICT] + 1) % clock.every if started else 0
-    counters[SINCE_DOUBT:] += 1
-    return counters[VERDICT]
+        if np.isnan(theta[k, 0]):
+            continue
+        flags[k] |= decode(theta[k], clock, roots, omega[k])
+        weight, span, elapsed = counts[k, 0], interval * counts[k, 1], interval * counts[k, 2]
+        if weight == 0.0:
+            continue
+        started = flags[k] & STARTING == 0
+        # The residual of what was known before this row.
+        square = residual_of(rows[k], before) ** 2
+        before[:] = theta[k]
+        if np.isfinite(square):
+            levels[NEWEST] += smoothing * (square - levels[NEWEST])
+            levels[LEFT] += square - forgotten * levels[LEFT]
+        # One unlike the others is doubted at once; otherwise a verdict is given now and then.
+        contradicted = started and levels[NEWEST] > levels[USUAL]
+        if counters[SINCE_VERDICT] == 0 or contradicted:
+            gram, check = grams[k, 0].copy(), grams[k, 1].copy()
+            verdict = flag_uncertain(gram, levels[LEFT], theta[k], roots, omega[k], clock, span, elapsed)
+            if contradicted or verdict:
+                verdict |= UNCERTAIN
+                levels[NEWEST] = 0.0
+                if started:
+                    counters[SINCE_DOUBT] = 0
+                if contradicted:
+                    counters[SINCE_CHANGE] = 0
+            # Rows from before a change must first have left the window.
+            elif counters[SINCE_CHANGE] < judged.flush or not lasts_a_period(
+                omega[k], counters[SINCE_DOUBT] * interval
+            ):
+                verdict = UNCERTAIN
+            verdict |= flag_inconsistent(check, omega[k], clock.second_delay, MIXED_NEGLIGIBLE)
+            counters[VERDICT] = verdict
+            misfit = max(squared_residual(gram, theta[k]), rounding_of(gram, theta[k]))
+            levels[USUAL] = ALARM_RATIO * misfit / weight
+        counters[SINCE_VERDICT] = (counters[SINCE_VERDICT] + 1) % clock.every if started else 0
+        counters[SINCE_DOUBT:] += 1
+        flags[k] |= counters[VERDICT]
 
 
 # --- least squares that restart when the signal changes ------------------------------------------------------------
@@ -483,7 +367,7 @@ EXACT = 1e-13
 NEGLIGIBLE = 1e-8
 OLDER, NEWER, CHECK = range(3)
 RESIDUAL, ALARM = 2, 3
-ROWS, NEXT, FLUSH, LAST_VERDICT, JUDGES = range(5)
+ROWS, NEXT, FLUSH, LAST_VERDICT = range(4)
 
 
 class Restarting(NamedTuple):
@@ -510,8 +394,7 @@ class Fit(NamedTuple):
     omega: Array
     #: Rows older and newer than that comparison, less what was forgotten; newest mean squared residual, alarm level.
     levels: Array
-    #: Rows since the restart, rows at the next comparison of halves, samples still to flush, verdict (flags), whether
-    #: the residual may be compared with the alarm level.
+    #: Rows since the restart, rows at the next comparison of halves, samples still to flush, verdict (flags).
     counters: IntArray
 
 
@@ -572,15 +455,14 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
     # Residuals of an exact fit are rounding; the floor keeps them from raising an alarm.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
     verdict, judges = judge(gram, theta, fit.omega, clock, weight, counters[ROWS])
-    counters[JUDGES] = judges
+    if not judges:
+        levels[ALARM] = np.inf
     inconsistent = flag_inconsistent(fit.moments[CHECK], fit.omega, clock.second_delay, NEGLIGIBLE)
     counters[LAST_VERDICT] = verdict | inconsistent
 
 
 @njit(cache=True, nogil=True)
-def restarting_fits(
-    rows: Array, clock: Clock, settings: Restarting, fit: Fit, omega: Array, flags: NDArray[np.uint16]
-) -> None:
+def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, omega: Array, flags: Flags) -> None:
     """Least squares with alarm, flush, restart and comparison with the newer data alone."""
     moments, theta, own_omega, levels, counters = fit
     smoothing = 1.0 / max(1, round(DETECTOR_SPAN * clock.lag))
@@ -617,8 +499,7 @@ def restarting_fits(
             if due and counters[ROWS] >= FIRST_ROWS_PER_TONE * theta.size:
                 refresh(clock, settings.whitener, fit)
             # The alarm comes last: an estimate that has just been refreshed is judged by its own level.
-            alarmed = counters[ROWS] >= settings.armed and counters[JUDGES] and levels[RESIDUAL] > levels[ALARM]
-            if counters[ROWS] >= settings.enough and alarmed:
+            if levels[RESIDUAL] > levels[ALARM]:
                 counters[FLUSH], counters[ROWS] = settings.flush, 0
                 flag = CHANGED
         if counters[ROWS] < settings.enough and flag == 0:

@@ -12,17 +12,27 @@ from itertools import combinations
 from typing import ClassVar, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array
-from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, Mixed, Mixing, mixed_estimates
+from ctid_cli.arrays import Array, IntArray
+from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, Judged, judge_rows
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
 
 
 @dataclass(frozen=True, kw_only=True)
 class MixingOptions(DelayRegression):
-    """Options of an estimator on the mixed regressions."""
+    """Options of all estimators on the mixed regressions.
+
+    Parameters
+    ----------
+    d : float
+        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+    first_row : int, default 1
+        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
+    """
 
     _kept: ClassVar[tuple[str, ...]] = ("d",)
 
@@ -43,14 +53,10 @@ class MixingOptions(DelayRegression):
 class DremGradient(MixingOptions):
     r"""Frequencies by gradient descent on each mixed regression: exponential convergence from the initial frequencies.
 
+    Further options are those of :class:`MixingOptions` and :class:`DelayRegression`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
     epsilon : float, default 1.0
         Normalisation of the mixed regression [-].
     gamma : float or tuple of float, default 1.0
@@ -58,25 +64,10 @@ class DremGradient(MixingOptions):
     initial_frequencies : tuple of float, optional
         Frequencies to begin with [rad/s]; by default spread over the bounds. Above pi/h they alias, which only moves
         the beginning.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 begins one d earlier.
     power : int or "literal", default 1
         Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
     gated : bool, default True
         Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -113,54 +104,19 @@ class DremGradient(MixingOptions):
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""
-        n, clock = self.tones, self.clock(interval)
-        initial = self.initial_frequencies
-        if initial is None:
-            lowest, highest = np.arccos((clock.top, clock.bottom)) / clock.delay
-            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
-        gains = np.full(n, interval) * np.asarray(self.gamma, dtype=float)
-        scale = float(self.epsilon) ** (n if self.power == "literal" else int(self.power))
-        descent = scale, gains, theta_of(initial, clock.delay), self.finite_time
-        return OnlineMixing(self, interval, JUDGED_SPANS * n * clock.lag, descent, past=np.nan if self.gated else 0.0)
+        return OnlineGradient(self, interval)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DremFiniteTime(DremGradient):
     r"""Frequencies in finite time: the gradient estimate of each mixed regression, without its initial value.
 
+    The options are those of :class:`DremGradient`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
-    epsilon : float, default 1.0
-        Normalisation of the mixed regression [-].
-    gamma : float or tuple of float, default 1.0
-        Adaptation gain, one for all parameters or one for each.
     initial_frequencies : tuple of float, optional
         Frequencies shown before there is an estimate [rad/s]; by default spread over the bounds. Above pi/h they alias.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
-    power : int or "literal", default 1
-        Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
-    gated : bool, default True
-        Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -201,31 +157,12 @@ class DremFiniteTime(DremGradient):
 class DremWindow(MixingOptions):
     r"""Frequencies by least squares on each mixed regression over a sliding window.
 
+    Further options are those of :class:`MixingOptions` and :class:`DelayRegression`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
     memory : float
         Length of the window [s]; rounded to whole sampling intervals.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -255,42 +192,126 @@ class DremWindow(MixingOptions):
         return OnlineMixing(self, interval, window)
 
 
-#: Factor of Delta and Psi, gamma times the sampling interval, parameters to begin with, and whether in finite time.
-Descent = tuple[float, Array, Array, bool]
-#: Least squares over the window in place of the gradient.
-NO_DESCENT: Descent = (1.0, np.empty(0), np.empty(0), False)
-
-
 class OnlineMixing(Online):
-    """An estimation from mixed regressions, sample by sample."""
+    """Estimation from mixed regressions with a window of rows to judge it by: by least squares over the window itself.
 
-    def __init__(
-        self,
-        options: MixingOptions,
-        interval: float,
-        window: int,
-        descent: Descent = NO_DESCENT,
-        past: float = np.nan,
-    ) -> None:
+    The window's sums are ``[Delta Psi, Delta^2, mixed rows, rows, second moments at h and at the second delay]``.
+    """
+
+    #: Factor ``eps^p`` of Delta and Psi.
+    scale = 1.0
+
+    def __init__(self, options: MixingOptions, interval: float, window: int, past: float = np.nan) -> None:
         super().__init__(options, interval, past=past)
         n, filled = options.tones, 2 * options.tones * self.clock.lag
-        self._scale, *own = descent
         self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
         self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
-        enough = min(options.rows_before_valid(self.clock), window)
-        self._settings = Mixing(filled + int(self._ages[-1]) + 1, filled + window, enough, *own)
-        width = n + 3 + 2 * (n + 1) ** 2
-        counters = np.array([0, 0, 0, 0, 1 << 50, 1 << 50])
-        sums, estimates = np.zeros((window + 2, width)), np.full((3, n), np.nan)
-        self._state = Mixed(sums[2:], *sums[:2], np.zeros((2, n)), *estimates, np.zeros(3), counters)
+        self._reach = filled + int(self._ages[-1]) + 1
+        self._enough = min(options.rows_before_valid(self.clock), window)
+        self._used = 0.0
+        window_of_sums = np.zeros((window + 1, n + 3 + 2 * (n + 1) ** 2))
+        self._sliding = window_of_sums[1:], window_of_sums[0], np.zeros(1, np.int64)
+        self._judged = Judged(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
+
+    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
+        """Return theta by least squares over the window, NaN where Delta vanishes, and the mixed rows in the window."""
+        n = self.options.tones
+        with np.errstate(invalid="ignore"):
+            return sums[:, :n] / sums[:, n : n + 1], sums[:, n + 1]
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
-        rows = self.rows(samples)
+        rows, n = self.rows(samples), omega.shape[1]
         history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-            mixed = self._scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
-        mixed_estimates(rows, mixed, self.clock, self._settings, self._state, omega, flags)
+            mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
+            squares = mixed[:, n:] * mixed
+        # A regression whose square is too large for a number is not used.
+        found = np.isfinite(squares).all(axis=1)
+        mixed[~found] = squares[~found] = np.nan
+        products = [(own[:, :, None] * own[:, None, :]).reshape(count, -1) for own in rows]
+        entries = np.hstack((squares, found[:, None], np.isfinite(rows[0, :, :1]), *products))
+        sums = np.empty(entries.shape)
+        slide(np.nan_to_num(entries, copy=False), *self._sliding, sums)
+        used = self._used + np.cumsum(found, dtype=float)
+        self._used = used[-1]
+        theta, support = self.estimates(mixed, sums, used)
+        excited = sums[:, n] > 0.0
+        for flag, where in (
+            (Flag.STARTING, support < self._enough),
+            (Flag.GAP, ~found & (used > 0)),
+            (Flag.UNDETERMINED, ~excited & (used > 0)),
+        ):
+            flags[where] |= int(flag)
+        counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
+        grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
+        judge_rows(theta, rows[0], grams, counts, self.clock, self._judged, omega, flags)
+
+
+class OnlineGradient(OnlineMixing):
+    """The gradient or finite-time estimate, sample by sample."""
+
+    def __init__(self, options: DremGradient, interval: float) -> None:
+        n, lag = options.tones, whole_delay("h", options.h, interval)
+        super().__init__(options, interval, JUDGED_SPANS * n * lag, np.nan if options.gated else 0.0)
+        self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
+        initial = options.initial_frequencies
+        if initial is None:
+            lowest, highest = np.arccos((self.clock.top, self.clock.bottom)) / self.clock.delay
+            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
+        gains = np.full(n, interval) * np.asarray(options.gamma, dtype=float)
+        self._descent = gains, theta_of(initial, self.clock.delay), options.finite_time, np.zeros((2, n))
+
+    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
+        """Return theta by gradient steps, and the mixed rows so far."""
+        theta = np.empty((len(mixed), self.options.tones))
+        gradient_steps(mixed, *self._descent, theta)
+        return theta, used
+
+
+@njit(cache=True, nogil=True)
+def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool, steps: Array, theta: Array) -> None:
+    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over each interval, Delta and Psi held.
+
+    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN
+    change nothing.
+    """
+    n, (z, q) = gains.size, steps
+    for k in range(len(mixed)):
+        delta = mixed[k, n]
+        if np.isfinite(delta):
+            # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
+            x = gains * delta * delta
+            m = -np.expm1(-x)
+            z += gains * np.where(x > 1e-8, m / x, 1.0 - 0.5 * x) * delta * mixed[k, :n] - m * z
+            q += m * (1.0 - q)
+        theta[k] = z + (1.0 - q) * initial
+        if finite_time:
+            theta[k] = np.where(q > 0.0, z / q, theta[k])
+
+
+@njit(cache=True, nogil=True)
+def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Array) -> None:
+    """Sum entries over a sliding window.
+
+    A block of old entries is summed backwards once, and the newer ones forwards; nothing is ever subtracted, so no
+    rounding error of an entry outlives it. ``window`` holds plain entries before ``place`` and, from there on, each
+    summed with all that follow it.
+    """
+    last = len(window) - 1
+    for k in range(len(entries)):
+        window[place[0]] = entries[k]
+        newer += entries[k]
+        sums[k] = newer
+        if place[0] < last:
+            # The next place holds the sum of all older entries that are still in the window.
+            sums[k] += window[place[0] + 1]
+            place[0] += 1
+            continue
+        for j in range(last - 1, -1, -1):
+            window[j] += window[j + 1]
+        newer[:] = 0.0
+        place[0] = 0
 
 
 def mix(rows: Sequence[Array]) -> Array:
@@ -300,16 +321,15 @@ def mix(rows: Sequence[Array]) -> Array:
     """
     n = len(rows)
     minors: dict[tuple[int, ...], Array] = {(): np.ones(len(rows[0]))}
-    for size, row in enumerate(rows, start=1):
+    for size, row in enumerate(rows):
         columns = np.ascontiguousarray(row.T)
         minors = {
             chosen: sum(
-                (-1) ** (size - 1 - place) * columns[column] * minors[chosen[:place] + chosen[place + 1 :]]
+                (-1) ** (size - place) * columns[column] * minors[chosen[:place] + chosen[place + 1 :]]
                 for place, column in enumerate(chosen)
             )
-            for chosen in combinations(range(n + 1), size)
+            for chosen in combinations(range(n + 1), size + 1)
         }
-    everything = range(n + 1)
-    # Column psi moves from the last place to place k: n - 1 - k exchanges.
-    mixed = [(-1) ** (n - 1 - k) * minors[tuple(c for c in everything if c != k)] for k in range(n)]
-    return np.column_stack([*mixed, minors[tuple(range(n))]])
+    # Minors without phi_1, ..., phi_n, psi. Column psi moves from the last place to place k by n - 1 - k exchanges.
+    signs = [*((-1.0) ** (n - 1 - k) for k in range(n)), 1.0]
+    return signs * np.column_stack(list(minors.values())[::-1])

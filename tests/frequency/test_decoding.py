@@ -14,9 +14,8 @@ FREQUENCIES = st.lists(st.floats(0.05, 3.0), min_size=1, max_size=8).map(sorted)
 
 
 def roots_of(coefficients):
-    polynomial = np.array(coefficients, float)
-    roots = np.empty(polynomial.size - 1)
-    return real_roots(polynomial, np.empty(polynomial.size), roots), roots
+    roots = np.empty(len(coefficients) - 1)
+    return real_roots(np.array(coefficients[1:], float), roots), np.sort(roots)[::-1]
 
 
 @given(FREQUENCIES, st.floats(0.1, 1.0))
