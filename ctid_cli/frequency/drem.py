@@ -227,7 +227,7 @@ class OnlineMixing(Online):
             mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
             squares = mixed[:, n:] * mixed
         # A regression whose square is too large for a number is not used.
-        found = np.isfinite(squares).all(axis=1)
+        found = np.asarray(np.isfinite(squares).all(axis=1))
         mixed[~found] = squares[~found] = np.nan
         products = [(own[:, :, None] * own[:, None, :]).reshape(count, -1) for own in rows]
         entries = np.hstack((squares, found[:, None], np.isfinite(rows[0, :, :1]), *products))
@@ -237,12 +237,9 @@ class OnlineMixing(Online):
         self._used = used[-1]
         theta, support = self.estimates(mixed, sums, used)
         excited = sums[:, n] > 0.0
-        for flag, where in (
-            (Flag.STARTING, support < self._enough),
-            (Flag.GAP, ~found & (used > 0)),
-            (Flag.UNDETERMINED, ~excited & (used > 0)),
-        ):
-            flags[where] |= int(flag)
+        flags[support < self._enough] |= int(Flag.STARTING)
+        flags[~found & (used > 0)] |= int(Flag.GAP)
+        flags[~excited & (used > 0)] |= int(Flag.UNDETERMINED)
         counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
         grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
         judge_rows(theta, rows[0], grams, counts, self.clock, self._judged, omega, flags)
@@ -332,4 +329,4 @@ def mix(rows: Sequence[Array]) -> Array:
         }
     # Minors without phi_1, ..., phi_n, psi. Column psi moves from the last place to place k by n - 1 - k exchanges.
     signs = [*((-1.0) ** (n - 1 - k) for k in range(n)), 1.0]
-    return signs * np.column_stack(list(minors.values())[::-1])
+    return np.asarray(np.column_stack(list(minors.values())[::-1]) * signs)

@@ -108,8 +108,8 @@ class OnlineRestarting(Online):
             memory=memory / interval,
             whitener=whitener,
         )
-        moments, estimates = np.zeros((3, n + 1, n + 1)), np.full((2, n), np.nan)
-        self._fit = Fit(moments, *estimates, np.zeros(4), np.zeros(4, np.int64))
+        theta, omega = np.full((2, n), np.nan)
+        self._fit = Fit(np.zeros((3, n + 1, n + 1)), theta, omega, np.zeros(4), np.zeros(4, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
