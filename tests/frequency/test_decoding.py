@@ -55,12 +55,6 @@ def test_double_roots_are_real_or_nearly():
         np.testing.assert_allclose(np.cos(omega), 0.3, atol=10 * 1e-16 ** (1 / n))
 
 
-def test_complex_roots_are_flagged_and_their_real_part_is_used():
-    omega, flags = frequencies_of([0.0, 0.25], 1.0)  # c = +-0.5 j
-    assert flags == Flag.COMPLEX_ROOTS
-    np.testing.assert_allclose(omega, np.pi / 2)
-
-
 def test_roots_outside_the_bounds_are_clipped_and_flagged():
     delay = 0.5
     omega, flags = frequencies_of([-(1.5 - 0.2), 1.5 * -0.2], delay)
