@@ -260,8 +260,6 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
     second delay, a whole number of sampling intervals that shares no divisor with the first, they are not.
     """
     n = omega.size
-    if not gram[n, n] > 0.0:
-        return 0
     theta = np.zeros(n)
     # Coefficients of prod(x - cos(w_i delay)) after the leading one.
     for i in range(n):
@@ -415,14 +413,14 @@ def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, ag
 def drop_mixed_rows(clock: Clock, compared: int, fit: Fit) -> bool:
     """Drop the older half of the rows if the newer one fits so much better that the older is of another signal."""
     moments, theta, omega, levels, counters = fit.moments, fit.theta.copy(), fit.omega.copy(), fit.levels, fit.counters
-    n, newer, gram = theta.size, moments[NEWER], moments[OLDER] + moments[NEWER]
+    newer, gram = moments[NEWER], moments[OLDER] + moments[NEWER]
     mixed = False
     if levels[OLDER] > 0.0 and least_squares(newer, 0.0, theta):
         # A fit to so few rows that it says nothing must not condemn the others, unless it is exact.
         alone = squared_residual(newer, theta)
         judges = judge(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
-        if (judges or alone <= EXACT * newer[n, n]) and least_squares(gram, 0.0, theta):
-            together = squared_residual(gram, theta) - 1e-14 * gram[n, n]
+        if (judges or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
+            together = squared_residual(gram, theta) - 1e-14 * gram[-1, -1]
             mixed = together / (levels[OLDER] + levels[NEWER]) > MIXED_RATIO * alone / levels[NEWER]
     if mixed:
         counters[ROWS] = int(levels[NEWER])
@@ -493,9 +491,8 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
             add_row(row, moments[NEWER])
             add_row(rows[1, k], moments[CHECK])
             # A second change while the delays were flushed leaves rows of two signals.
-            due = counters[ROWS] % REFRESH == 0 or counters[ROWS] <= EAGER_ROWS
-            if counters[ROWS] >= counters[NEXT] and drop_mixed_rows(clock, settings.compared, fit):
-                due = True
+            dropped = counters[ROWS] >= counters[NEXT] and drop_mixed_rows(clock, settings.compared, fit)
+            due = dropped or counters[ROWS] % REFRESH == 0 or counters[ROWS] <= EAGER_ROWS
             if due and counters[ROWS] >= FIRST_ROWS_PER_TONE * theta.size:
                 refresh(clock, settings.whitener, fit)
             # The alarm comes last: an estimate that has just been refreshed is judged by its own level.
