@@ -44,7 +44,26 @@ BLOCK = 1 << 15
 
 @dataclass(frozen=True, kw_only=True)
 class DelayRegression(FrequencyEstimator):
-    """Options of an estimator on the delay regression."""
+    """Options of all estimators on the delay regression.
+
+    Parameters
+    ----------
+    h : float
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+    prefilter : float, default 0.0
+        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+    difference : float, default 0.0
+        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+    lowest_frequency : float, default 0.0
+        Lower bound of the frequencies [rad/s].
+    highest_frequency : float, optional
+        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+    """
 
     #: Further options that say for how long samples are kept [s].
     _kept: ClassVar[tuple[str, ...]] = ()
@@ -60,7 +79,6 @@ class DelayRegression(FrequencyEstimator):
         require_positive("h", self.h, "s")
         require_not_negative("prefilter", self.prefilter, "s")
         require_not_negative("difference", self.difference, "s")
-        require_bounds(self.lowest_frequency, self.highest_frequency)
         self._highest(self.h)
 
     @property
@@ -73,27 +91,7 @@ class DelayRegression(FrequencyEstimator):
         """Begin an estimation before its first sample, with the sampling interval [s]."""
 
     def track(self, samples: ArrayLike, interval: float) -> FrequencyTrack:
-        """Estimate the frequencies at every sample of a record.
-
-        Parameters
-        ----------
-        samples : array_like, shape (N,)
-            Signal on a regular clock [signal unit]; NaN where missing.
-        interval : float
-            Sampling interval [s].
-
-        Returns
-        -------
-        FrequencyTrack
-            Frequencies at these instants.
-
-        Raises
-        ------
-        DataError
-            If the samples are not a series of real numbers.
-        ValueError
-            If the options do not fit to the sampling interval.
-        """
+        """Estimate the frequencies at every sample of a record: see :meth:`FrequencyEstimator.track`."""
         online, y = self.start(interval), series_of(samples)
         omega, flags = np.empty((y.size, self.tones)), np.zeros(y.size, np.uint16)
         for first in range(0, y.size, BLOCK):
@@ -196,15 +194,16 @@ class Online(ABC):
         self._seen += 1
         return FrequencyTrack(np.array([(self._seen - 1) * self.clock.interval]), omega, flags)
 
-    def rows(self, samples: Array) -> tuple[Array, Array]:
-        """Return the rows ``[phi psi]`` at h and at the second delay; NaN where a sample is missing."""
+    def rows(self, samples: Array) -> Array:
+        """Return the rows ``[phi psi]`` at h and at the second delay, (2, N, n + 1); NaN where a sample is missing."""
         if self.weights.size > 1:
             samples = np.convolve(self._unfiltered.extended(samples), self.weights, "valid")
-        newest_first = np.lib.stride_tricks.sliding_window_view(
-            self._filtered.extended(samples), 2 * self.options.tones * self.clock.lag + 1
-        )[:, ::-1]
-        second = newest_first[:, : 2 * self.options.tones * self.clock.second_lag + 1 : self.clock.second_lag]
-        return newest_first[:, :: self.clock.lag] @ self.table.T, second @ self.table.T
+        past, delays = self._filtered.extended(samples), np.arange(2 * self.options.tones + 1)
+        newest, rows = len(past) - samples.size, np.empty((2, samples.size, len(self.table)))
+        for lag, into in zip((self.clock.lag, self.clock.second_lag), rows, strict=True):
+            delayed = np.stack([past[newest - age : len(past) - age] for age in lag * delays])
+            np.matmul(delayed.T, self.table.T, out=into)
+        return rows
 
 
 class Tail:
@@ -223,11 +222,10 @@ class Tail:
 def delay_table(tones: int) -> Array:
     """Return the coefficients of ``[phi psi] = table @ [y(t), y(t - h), ... y(t - 2 n h)]``."""
     table = np.zeros((tones + 1, 2 * tones + 1))
-    for k in range(1, tones + 1):
-        for i in range(tones - k + 1):
-            table[k - 1, k + 2 * i] = 2**k * comb(tones - k, i)
-    for i in range(tones + 1):
-        table[tones, 2 * i] = -comb(tones, i)
+    for k in range(tones + 1):
+        # (2 Z)^k (Z^2 + 1)^(n - k); the first one, with the other sign, is psi in the last row.
+        table[k - 1, k : 2 * tones - k + 1 : 2] = [2**k * comb(tones - k, i) for i in range(tones - k + 1)]
+    table[-1] *= -1.0
     return table
 
 

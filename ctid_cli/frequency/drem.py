@@ -6,17 +6,17 @@ The regression is stacked at n instants, d apart, and multiplied by the adjugate
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import ClassVar, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array
-from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, gradient_steps, judge_rows, slide
+from ctid_cli.arrays import Array, IntArray
+from ctid_cli.frequency.delay_kernels import JUDGED_SPANS, Judged, judge_rows
 from ctid_cli.frequency.delay_regression import DelayRegression, Online, Tail, theta_of, whole_delay
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
@@ -24,7 +24,15 @@ from ctid_cli.signals.checks import require_integer, require_positive
 
 @dataclass(frozen=True, kw_only=True)
 class MixingOptions(DelayRegression):
-    """Options of an estimator on the mixed regressions."""
+    """Options of all estimators on the mixed regressions.
+
+    Parameters
+    ----------
+    d : float
+        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+    first_row : int, default 1
+        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
+    """
 
     _kept: ClassVar[tuple[str, ...]] = ("d",)
 
@@ -45,14 +53,10 @@ class MixingOptions(DelayRegression):
 class DremGradient(MixingOptions):
     r"""Frequencies by gradient descent on each mixed regression: exponential convergence from the initial frequencies.
 
+    Further options are those of :class:`MixingOptions` and :class:`DelayRegression`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
     epsilon : float, default 1.0
         Normalisation of the mixed regression [-].
     gamma : float or tuple of float, default 1.0
@@ -60,25 +64,10 @@ class DremGradient(MixingOptions):
     initial_frequencies : tuple of float, optional
         Frequencies to begin with [rad/s]; by default spread over the bounds. Above pi/h they alias, which only moves
         the beginning.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 begins one d earlier.
     power : int or "literal", default 1
         Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
     gated : bool, default True
         Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -122,39 +111,12 @@ class DremGradient(MixingOptions):
 class DremFiniteTime(DremGradient):
     r"""Frequencies in finite time: the gradient estimate of each mixed regression, without its initial value.
 
+    The options are those of :class:`DremGradient`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
-    epsilon : float, default 1.0
-        Normalisation of the mixed regression [-].
-    gamma : float or tuple of float, default 1.0
-        Adaptation gain, one for all parameters or one for each.
     initial_frequencies : tuple of float, optional
         Frequencies shown before there is an estimate [rad/s]; by default spread over the bounds. Above pi/h they alias.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
-    power : int or "literal", default 1
-        Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
-    gated : bool, default True
-        Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -195,31 +157,12 @@ class DremFiniteTime(DremGradient):
 class DremWindow(MixingOptions):
     r"""Frequencies by least squares on each mixed regression over a sliding window.
 
+    Further options are those of :class:`MixingOptions` and :class:`DelayRegression`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
-    h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
-    d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
     memory : float
         Length of the window [s]; rounded to whole sampling intervals.
-    first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
-    prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -244,65 +187,62 @@ class DremWindow(MixingOptions):
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""
-        return OnlineWindow(self, interval)
+        window = whole_delay("memory", self.memory, interval)
+        self.require_samples(self.memory, window, interval)
+        return OnlineMixing(self, interval, window)
 
 
 class OnlineMixing(Online):
-    """Delays, mixing and verdict of an estimator on the mixed regressions, with a window of rows to judge it by."""
+    """Estimation from mixed regressions with a window of rows to judge it by: by least squares over the window itself.
+
+    The window's sums are ``[Delta Psi, Delta^2, mixed rows, rows, second moments at h and at the second delay]``.
+    """
 
     #: Factor ``eps^p`` of Delta and Psi.
     scale = 1.0
 
-    def __init__(self, options: MixingOptions, interval: float, window: int, *, past: float = np.nan) -> None:
+    def __init__(self, options: MixingOptions, interval: float, window: int, past: float = np.nan) -> None:
         super().__init__(options, interval, past=past)
-        n = options.tones
+        n, filled = options.tones, 2 * options.tones * self.clock.lag
         self._ages = (options.first_row + np.arange(n)) * whole_delay("d", options.d, interval)
-        self._reach = 2 * n * self.clock.lag + int(self._ages[-1]) + 1
-        self._flush = 2 * n * self.clock.lag + window
         self._mixed_rows = Tail(np.full((self._ages[-1], n + 1), past))
+        self._reach = filled + int(self._ages[-1]) + 1
         self._enough = min(options.rows_before_valid(self.clock), window)
         self._used = 0.0
-        width = n + 3 + 2 * (n + 1) ** 2
-        self._sliding = np.zeros((window, width)), np.zeros(width), np.zeros(1, np.int64)
-        self._judged = np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50])
+        window_of_sums = np.zeros((window + 1, n + 3 + 2 * (n + 1) ** 2))
+        self._sliding = window_of_sums[1:], window_of_sums[0], np.zeros(1, np.int64)
+        self._judged = Judged(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
 
-    @abstractmethod
     def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta and the number of rows it rests on, of ``[Psi Delta]``, its sums and the rows so far."""
+        """Return theta by least squares over the window, NaN where Delta vanishes, and the mixed rows in the window."""
+        n = self.options.tones
+        with np.errstate(invalid="ignore"):
+            return sums[:, :n] / sums[:, n : n + 1], sums[:, n + 1]
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
-        n, count = omega.shape[1], samples.size
-        rows, second_rows = self.rows(samples)
-        history = self._mixed_rows.extended(rows)
-        # A regression whose square is too large for a number is not used.
+        rows, n = self.rows(samples), omega.shape[1]
+        history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
-            found = np.isfinite(mixed).all(axis=1) & np.isfinite(mixed[:, n] ** 2)
-            mixed[~found] = np.nan
-            parts = (
-                mixed[:, n:] * mixed,
-                found[:, None],
-                np.isfinite(rows[:, :1]),
-                products(rows),
-                products(second_rows),
-            )
-        entries = np.nan_to_num(np.hstack(parts), copy=False)
-        # [Delta Psi, Delta^2, mixed rows, rows, second moments of the rows at h and at the second delay]
+            squares = mixed[:, n:] * mixed
+        # A regression whose square is too large for a number is not used.
+        found = np.asarray(np.isfinite(squares).all(axis=1))
+        mixed[~found] = squares[~found] = np.nan
+        products = [(own[:, :, None] * own[:, None, :]).reshape(count, -1) for own in rows]
+        entries = np.hstack((squares, found[:, None], np.isfinite(rows[0, :, :1]), *products))
         sums = np.empty(entries.shape)
-        slide(entries, *self._sliding, sums)
+        slide(np.nan_to_num(entries, copy=False), *self._sliding, sums)
         used = self._used + np.cumsum(found, dtype=float)
         self._used = used[-1]
         theta, support = self.estimates(mixed, sums, used)
-        unexcited = ~(sums[:, n] > 0.0)
-        flags[~found & (used > 0)] |= int(Flag.GAP)
+        excited = sums[:, n] > 0.0
         flags[support < self._enough] |= int(Flag.STARTING)
-        flags[unexcited & (used > 0)] |= int(Flag.UNDETERMINED)
-        interval, judged = self.clock.interval, np.where(unexcited, 0.0, sums[:, n + 2])
-        spans, elapsed = (self._reach + support) * interval, (self._reach + used) * interval
+        flags[~found & (used > 0)] |= int(Flag.GAP)
+        flags[~excited & (used > 0)] |= int(Flag.UNDETERMINED)
+        counts = np.column_stack((excited * sums[:, n + 2], self._reach + support, self._reach + used))
         grams = sums[:, n + 3 :].reshape(count, 2, n + 1, n + 1)
-        judging = self.clock, self._flush, *self._judged
-        judge_rows(theta, rows, grams, judged, spans, elapsed, *judging, omega, flags)
+        judge_rows(theta, rows[0], grams, counts, self.clock, self._judged, omega, flags)
 
 
 class OnlineGradient(OnlineMixing):
@@ -310,7 +250,7 @@ class OnlineGradient(OnlineMixing):
 
     def __init__(self, options: DremGradient, interval: float) -> None:
         n, lag = options.tones, whole_delay("h", options.h, interval)
-        super().__init__(options, interval, JUDGED_SPANS * n * lag, past=np.nan if options.gated else 0.0)
+        super().__init__(options, interval, JUDGED_SPANS * n * lag, np.nan if options.gated else 0.0)
         self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
         initial = options.initial_frequencies
         if initial is None:
@@ -326,24 +266,49 @@ class OnlineGradient(OnlineMixing):
         return theta, used
 
 
-class OnlineWindow(OnlineMixing):
-    """Least squares on the mixed regressions of a sliding window, sample by sample."""
+@njit(cache=True, nogil=True)
+def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool, steps: Array, theta: Array) -> None:
+    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over each interval, Delta and Psi held.
 
-    def __init__(self, options: DremWindow, interval: float) -> None:
-        window = whole_delay("memory", options.memory, interval)
-        options.require_samples(options.memory, window, interval)
-        super().__init__(options, interval, window)
+    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN
+    change nothing.
+    """
+    n, (z, q) = gains.size, steps
+    for k in range(len(mixed)):
+        delta = mixed[k, n]
+        if np.isfinite(delta):
+            # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
+            x = gains * delta * delta
+            m = -np.expm1(-x)
+            z += gains * np.where(x > 1e-8, m / x, 1.0 - 0.5 * x) * delta * mixed[k, :n] - m * z
+            q += m * (1.0 - q)
+        theta[k] = z + (1.0 - q) * initial
+        if finite_time:
+            theta[k] = np.where(q > 0.0, z / q, theta[k])
 
-    def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta of the window, NaN where Delta vanishes all the time, and the mixed rows in the window."""
-        n = self.options.tones
-        squares = sums[:, n : n + 1]
-        return np.divide(sums[:, :n], squares, out=np.full((len(sums), n), np.nan), where=squares > 0), sums[:, n + 1]
 
+@njit(cache=True, nogil=True)
+def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Array) -> None:
+    """Sum entries over a sliding window.
 
-def products(rows: Array) -> Array:
-    """Return the products of all pairs of columns, shape (N, m m)."""
-    return (rows[:, :, None] * rows[:, None, :]).reshape(len(rows), -1)
+    A block of old entries is summed backwards once, and the newer ones forwards; nothing is ever subtracted, so no
+    rounding error of an entry outlives it. ``window`` holds plain entries before ``place`` and, from there on, each
+    summed with all that follow it.
+    """
+    last = len(window) - 1
+    for k in range(len(entries)):
+        window[place[0]] = entries[k]
+        newer += entries[k]
+        sums[k] = newer
+        if place[0] < last:
+            # The next place holds the sum of all older entries that are still in the window.
+            sums[k] += window[place[0] + 1]
+            place[0] += 1
+            continue
+        for j in range(last - 1, -1, -1):
+            window[j] += window[j + 1]
+        newer[:] = 0.0
+        place[0] = 0
 
 
 def mix(rows: Sequence[Array]) -> Array:
@@ -353,16 +318,15 @@ def mix(rows: Sequence[Array]) -> Array:
     """
     n = len(rows)
     minors: dict[tuple[int, ...], Array] = {(): np.ones(len(rows[0]))}
-    for size, row in enumerate(rows, start=1):
+    for size, row in enumerate(rows):
         columns = np.ascontiguousarray(row.T)
         minors = {
             chosen: sum(
-                (-1) ** (size - 1 - place) * columns[column] * minors[chosen[:place] + chosen[place + 1 :]]
+                (-1) ** (size - place) * columns[column] * minors[chosen[:place] + chosen[place + 1 :]]
                 for place, column in enumerate(chosen)
             )
-            for chosen in combinations(range(n + 1), size)
+            for chosen in combinations(range(n + 1), size + 1)
         }
-    everything = range(n + 1)
-    # Column psi moves from the last place to place k: n - 1 - k exchanges.
-    mixed = [(-1) ** (n - 1 - k) * minors[tuple(c for c in everything if c != k)] for k in range(n)]
-    return np.column_stack([*mixed, minors[tuple(range(n))]])
+    # Minors without phi_1, ..., phi_n, psi. Column psi moves from the last place to place k by n - 1 - k exchanges.
+    signs = [*((-1.0) ** (n - 1 - k) for k in range(n)), 1.0]
+    return np.asarray(np.column_stack(list(minors.values())[::-1]) * signs)

@@ -28,10 +28,10 @@ DEFAULT_MEMORY = 100.0
 class RestartingLeastSquares(DelayRegression):
     r"""Frequencies by least squares over all data since the last change of the signal.
 
+    Further options are those of :class:`DelayRegression`.
+
     Parameters
     ----------
-    tones : int
-        Number of sinusoids n, 1 to 8.
     h : float
         Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals. The best
         one is 0.7 to 0.8 times pi over the highest frequency.
@@ -43,17 +43,6 @@ class RestartingLeastSquares(DelayRegression):
     prefilter : float, default 0.0
         Length of a Hann low-pass in front of the regression [s]; 0 for none. Least squares is biased by noise without
         one; about 1.5 h is a good length.
-    difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
-
-    Raises
-    ------
-    ValueError
-        If an option is out of range.
 
     Notes
     -----
@@ -105,7 +94,8 @@ class OnlineRestarting(Online):
         n, lag, length = options.tones, self.clock.lag, self.weights.size - 1
         memory = DEFAULT_MEMORY * self.clock.delay if options.memory is None else options.memory
         options.require_samples(memory, memory / interval, interval)
-        arming = max(round(ARMING_SPAN * lag), 2 * ROWS_PER_TONE * n)
+        enough = options.rows_before_valid(self.clock)
+        arming = max(round(ARMING_SPAN * lag), 2 * ROWS_PER_TONE * n, enough)
         whitener = np.empty((0, 0))
         if options.solution == "total_least_squares":
             covariance = noise_covariance(self.table, self.weights, lag)
@@ -113,18 +103,17 @@ class OnlineRestarting(Online):
         self._settings = Restarting(
             armed=max(arming, ARMING_PREFILTERS * length),
             compared=max(arming, MIXED_PREFILTERS * length),
-            enough=options.rows_before_valid(self.clock),
+            enough=enough,
             flush=length + 2 * n * lag + 1,
             memory=memory / interval,
             whitener=whitener,
         )
-        older, newer, check = np.zeros((3, n + 1, n + 1))
-        self._fit = Fit(older, newer, check, np.full(n, np.nan), np.full(n, np.nan), np.zeros(4), np.zeros(5, np.int64))
+        theta, omega = np.full((2, n), np.nan)
+        self._fit = Fit(np.zeros((3, n + 1, n + 1)), theta, omega, np.zeros(4), np.zeros(4, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
         """Take samples, and write the frequencies and the flags at their instants."""
-        rows, second_rows = self.rows(samples)
-        restarting_fits(rows, second_rows, np.isnan(samples), self.clock, self._settings, self._fit, omega, flags)
+        restarting_fits(self.rows(samples), self.clock, self._settings, self._fit, omega, flags)
 
 
 def noise_covariance(table: Array, weights: Array, lag: int) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.base import FrequencyTrack
-from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
+from ctid_cli.frequency.drem import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.studies.claim import Claim, near, within
@@ -102,46 +102,11 @@ def drem(kind: type[Any], name: str, **options: Any) -> Any:
     return kind(tones=2, initial_frequencies=INITIAL, **{**TUNING[name], **options})
 
 
-def window(name: str, **options: Any) -> DremWindow:
-    return DremWindow(tones=2, memory=4.0, h=TUNING[name]["h"], d=TUNING[name]["d"], **options)
-
-
 def tracker(prefilter: float = 1.0, h: float = 0.7, **options: Any) -> RestartingLeastSquares:
     return RestartingLeastSquares(tones=2, h=h, prefilter=prefilter, **options)
 
 
 # Items -------------------------------------------------------------------------------------------------
-
-
-def exact(interval: float = 0.001, slack: int = 0) -> Iterator[Claim]:
-    """Finite time without noise; `slack` samples for a coarser clock."""
-    track = drem(DremFiniteTime, "A").track(signal("A", interval, 60.0), interval)
-    first = round(0.66 / interval) + slack
-    yield at_most("A: error from 0.66 s on", np.abs(track.frequencies[first:] - TRUTH).max(), 1e-8)
-    yield at_most("A: valid samples before", track.valid[: round(0.66 / interval)].sum(), 0)
-    for first_row, begin in ((1, 3.6), (0, 3.2)):
-        track = drem(DremFiniteTime, "D", first_row=first_row).track(signal("D", interval, 30.0), interval)
-        first = round(begin / interval)
-        error = np.abs(track.frequencies - stepped(interval, 30.0)[0]).max(axis=1)
-        yield at_most(f"D, first row {first_row}: error from {begin} s on", error[first + slack :].max(), 1e-10)
-        yield within(f"D, first row {first_row}: error just before", error[first - 1], low=0.01)
-        yield at_most(f"D, first row {first_row}: valid samples before", track.valid[:first].sum(), 0)
-
-
-def gradient(interval: float = 0.001) -> Iterator[Claim]:
-    """Settling times of the gradient estimate."""
-    track = drem(DremGradient, "A").track(signal("A", interval, 60.0), interval)
-    for band, target in ((0.05, 10.14), (0.01, 13.66), (1e-3, 19.57)):
-        yield near(f"A within {band:g} [s]", settle(track, TRUTH, band), target, 0.05)
-    track = drem(DremGradient, "A", gated=False).track(signal("A", interval, 60.0), interval)
-    yield near("A within 0.05, zero-filled [s]", settle(track, TRUTH, 0.05), 15.4, 0.3)
-    truth = stepped(interval)[0]
-    track = drem(DremGradient, "D").track(signal("D", interval, 90.0), interval)
-    for band, before, after in ((0.05, 6.34, 6.33), (0.01, 8.26, 9.97), (1e-3, 10.80, 15.55)):
-        yield near(f"D within {band:g} before the step [s]", settle(track, truth, band, 0.0, STEP), before, 0.05)
-        yield near(f"D within {band:g} after the jump [s]", settle(track, truth, band, STEP), after, 0.05)
-    track = drem(DremGradient, "D").track(signal("D", interval, 90.0, jump=False), interval)
-    yield near("D within 0.001 after the step, continuous [s]", settle(track, truth, 1e-3, STEP), 14.1, 0.1)
 
 
 def disturbed(interval: float = 0.001) -> Iterator[Claim]:
@@ -173,19 +138,6 @@ def noisy(seeds: int = 60, tracked: int = 10, interval: float = 0.001) -> Iterat
         track = tracker().track(signal("C", interval, 60.0, seed), interval)
         rms.append(np.sqrt(np.mean((track.frequencies[round(50.0 / interval) :] - TRUTH) ** 2, axis=0)))
     yield at_most("C: tracker with prefilter, median rms error", np.median(rms, axis=0).max(), 2e-4)
-
-
-def steps(interval: float = 0.001, slack: float = 0.0) -> Iterator[Claim]:
-    """Finite time after a step, without noise."""
-    truth = stepped(interval)[0]
-    for jump in (True, False):
-        y, reading = signal("D", interval, 90.0, jump=jump), "jump" if jump else "continuous"
-        track = window("D").track(y, interval)
-        yield at_most(f"window of 4 s, within 1e-6, {reading} [s]", settle(track, truth, 1e-6, STEP), 7.605 + slack)
-        for prefilter, limit in ((0.0, 2.85), (1.0, 3.90)):
-            track = tracker(prefilter).track(y, interval)
-            name = f"tracker, prefilter {prefilter:g} s, within 1e-6, {reading} [s]"
-            yield at_most(name, settle(track, truth, 1e-6, STEP), limit + slack)
 
 
 def tracked_step(seed: int, *, jump: bool, interval: float = 0.001) -> tuple[float, int, int]:
@@ -253,20 +205,10 @@ def efficient(seeds: int = 100, first: int = 2000, interval: float = 0.001, dura
         yield at_most(f"{name}: rms error / bound", ratio.max(), limit)
 
 
-def coarse() -> Iterator[Claim]:
-    """A clock ten times slower: two samples more at most."""
-    yield from exact(0.01, slack=2)
-    yield from steps(0.01, slack=0.02)
-
-
 ITEMS: dict[str, Callable[[], Iterator[Claim]]] = {
-    "exact": exact,
-    "gradient": gradient,
     "disturbed": disturbed,
     "noisy": noisy,
-    "steps": steps,
     "robust": robust,
     "quiet": quiet,
     "efficient": efficient,
-    "coarse": coarse,
 }

@@ -10,7 +10,7 @@ from ctid_cli import DataError, Flag
 from ctid_cli.custom_code import STUDIES, find_class
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.studies.catalogue import find_study
-from tests.frequency.signals import INTERVAL, OMEGA, tones
+from tests.frequency.signals import INTERVAL, NO_TWO_TONES, NOISE, OMEGA, T, tones
 
 STUDY = find_study("finite-time-frequency")
 COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
@@ -23,8 +23,6 @@ Observer, Filter, Esprit, Nonlinear = (
     )
 )
 observer, regression, whole = (sys.modules[each.__module__] for each in (Observer, Filter, Esprit))
-T = INTERVAL * np.arange(4000)
-NOISE = np.random.default_rng(0).standard_normal(T.size)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -137,17 +135,7 @@ def test_step_and_error_are_those_of_the_whole_jacobian():
     np.testing.assert_allclose(error, np.sqrt(np.diag(np.linalg.inv(J.T @ J))[:2] * cost), rtol=1e-8)
 
 
-NO_TWO_TONES = {
-    "zero": 0 * T,
-    "constant": 0 * T + 2.5,
-    "one tone": np.sin(2 * T),
-    "one tone and noise": np.sin(2 * T) + 0.05 * NOISE,
-    "noise": NOISE,
-    "three tones": np.sin(2 * T) + np.cos(3 * T) + np.sin(4 * T),
-}
-
-
-@pytest.mark.parametrize("name", NO_TWO_TONES)
+@pytest.mark.parametrize("name", ["zero", "constant", "one tone", "one tone and noise", "noise", "three tones"])
 @pytest.mark.parametrize(
     "options", [Filter(tones=2, pole=4.0), Esprit(tones=2, averaging=0.05)], ids=["filter", "whole"]
 )

@@ -6,15 +6,11 @@ from ctid_cli.studies.claim import near, within
 from tests.experiments import frequency_acceptance as acceptance
 
 SHORT = {
-    "exact": acceptance.exact,
-    "gradient": acceptance.gradient,
     "disturbed": acceptance.disturbed,
     "noisy": lambda: acceptance.noisy(seeds=20, tracked=3),
-    "steps": acceptance.steps,
     "robust": lambda: acceptance.robust(seeds=3),
     "quiet": lambda: acceptance.quiet(seeds=1),
     "efficient": lambda: acceptance.efficient(seeds=12),
-    "coarse": acceptance.coarse,
 }
 
 

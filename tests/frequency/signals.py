@@ -14,6 +14,28 @@ OMEGA = {n: np.array([1.0, 2.0, 3.0, 4.2, 5.5])[:n] for n in range(1, 6)}
 AMPLITUDES = np.array([1.0, 0.8, 1.3, 0.6, 1.1])
 PHASES = np.array([0.3, 1.1, -0.7, 2.0, -1.5])
 
+T = INTERVAL * np.arange(4000)
+CLEAN = np.sin(2 * T) + np.cos(3 * T)
+NOISE = np.random.default_rng(0).standard_normal(T.size)
+
+#: Two tones are asked for, and there is no right answer.
+NO_TWO_TONES = {
+    "zero": 0 * T,
+    "constant": 0 * T + 2.5,
+    "a ramp": 0.3 * T,
+    "one tone": np.sin(2 * T),
+    "one tone twice": np.sin(2 * T) + 0.7 * np.cos(2 * T + 1),
+    "one tone and noise": np.sin(2 * T) + 0.05 * NOISE,
+    "noise": NOISE,
+    "an alias": np.sin(2 * T) + np.sin(7 * T),
+    "a weak alias": np.sin(2 * T) + 0.2 * np.sin(7 * T + 1),
+    "an alias and noise": np.sin(2 * T) + np.sin(7 * T) + 0.05 * NOISE,
+    "three tones": CLEAN + np.sin(4 * T),
+    "a bias": CLEAN + 0.5,
+    "a large bias": CLEAN + 3.0,
+    "a square wave": np.sign(np.sin(2 * T)),
+}
+
 
 def tones(n, count, interval=INTERVAL, omega=None):
     """The n sinusoids of a signal one by one, shape (count, n)."""

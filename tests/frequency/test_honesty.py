@@ -6,30 +6,9 @@ import pytest
 from ctid_cli.frequency.drem import DremFiniteTime, DremGradient, DremWindow
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
+from tests.frequency.signals import CLEAN, INTERVAL, NO_TWO_TONES, NOISE, T
 
-INTERVAL = 0.01
-T = INTERVAL * np.arange(4000)
 TRUTH = np.array([2.0, 3.0])
-CLEAN = np.sin(2 * T) + np.cos(3 * T)
-NOISE = np.random.default_rng(0).standard_normal(T.size)
-
-#: Two tones are asked for, and there is no right answer.
-NO_TWO_TONES = {
-    "zero": 0 * T,
-    "constant": 0 * T + 2.5,
-    "a ramp": 0.3 * T,
-    "one tone": np.sin(2 * T),
-    "one tone twice": np.sin(2 * T) + 0.7 * np.cos(2 * T + 1),
-    "one tone and noise": np.sin(2 * T) + 0.05 * NOISE,
-    "noise": NOISE,
-    "an alias": np.sin(2 * T) + np.sin(7 * T),
-    "a weak alias": np.sin(2 * T) + 0.2 * np.sin(7 * T + 1),
-    "an alias and noise": np.sin(2 * T) + np.sin(7 * T) + 0.05 * NOISE,
-    "three tones": CLEAN + np.sin(4 * T),
-    "a bias": CLEAN + 0.5,
-    "a large bias": CLEAN + 3.0,
-    "a square wave": np.sign(np.sin(2 * T)),
-}
 ONLINE = [
     DremGradient(tones=2, h=0.7, d=0.4, epsilon=0.3),
     DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.3),
@@ -100,14 +79,6 @@ def test_an_estimate_that_converges_stays_valid(options):
     assert track.valid[-500:].all()
     assert track.valid[np.argmax(track.valid) :].all()
     assert np.abs(track.frequencies[track.valid] - TRUTH).max() < 1e-3
-
-
-@pytest.mark.parametrize("omega", [3.2, 4.0, 6.0, 7.0, 8.5, 11.0, 20.0, 60.0])
-def test_every_alias_of_one_tone_is_noticed(omega):
-    # pi/h is 3.14 rad/s here; all of these are seen as something below it.
-    track = RestartingLeastSquares(tones=1, h=1.0).track(np.sin(omega * T + 0.3), INTERVAL)
-    assert (track.frequencies[-1] < np.pi).all()
-    assert not track.valid.any()
 
 
 def test_tones_that_look_alike_at_the_delay_are_one():

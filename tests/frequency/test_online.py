@@ -7,7 +7,7 @@ import pytest
 
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency import delay_regression
-from ctid_cli.frequency.drem import DremFiniteTime
+from ctid_cli.frequency.drem import DremFiniteTime, DremWindow
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
 from ctid_cli.kinds import KINDS, classes
@@ -104,16 +104,24 @@ def test_the_table_of_estimators_names_all_kinds():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("kind", "options", "interval", "message"),
     [
-        ({"prefilter": 0.004}, r"prefilter = 0\.004 s is shorter than half a sampling interval"),
-        ({"h": 1e300}, r"h = 1e\+300 s is more than 10,000,000 sampling intervals"),
-        ({"h": 1e6}, r"h = 1e\+06 s is more than 10,000,000 sampling intervals"),
+        (RestartingLeastSquares, {"prefilter": 0.004}, 0.01, r"prefilter = 0\.004 s is shorter than half a sampling"),
+        (RestartingLeastSquares, {"h": 1e6}, 0.01, r"h = 1e\+06 s is more than 10,000,000 sampling intervals"),
+        (
+            RestartingLeastSquares,
+            {"memory": 0.05},
+            0.01,
+            r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8",
+        ),
+        (DremWindow, {"d": 0.3, "memory": 0.05}, 0.01, r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8"),
+        (DremFiniteTime, {"d": 0.1}, 0.5, r"d = 0.1 s is shorter than half a sampling interval of 0.5 s"),
+        (DremFiniteTime, {"h": 0.44, "d": 0.5, "highest_frequency": 7.0}, 0.5, "above pi/h = 6.28319 .* is 7 rad/s"),
     ],
 )
-def test_delays_that_a_clock_cannot_have_are_refused(options, message):
+def test_options_that_a_clock_cannot_have_are_refused(kind, options, interval, message):
     with pytest.raises(ValueError, match=message):
-        RestartingLeastSquares(**{"tones": 1, "h": 0.4, **options}).start(INTERVAL)
+        kind(**{"tones": 2, "h": 0.4, **options}).start(interval)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import pytest
 from scipy import linalg
 
 from ctid_cli.frequency.delay_regression import delay_table
-from ctid_cli.frequency.drem import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares, noise_covariance
 from tests.frequency.signals import INTERVAL, OMEGA, frequencies_of, regression_rows, tones
@@ -136,15 +135,6 @@ def test_a_second_change_during_the_flush_is_found_by_comparing_halves():
     assert not track.valid[mixed][error[mixed] > 0.02].any()
 
 
-def test_a_slow_drift_is_followed_within_the_memory():
-    t = INTERVAL * np.arange(9000)
-    rate = 2.0 + 0.002 * t
-    y = np.sin(2.0 * t + 0.001 * t**2) + np.sin(3.5 * t)
-    lags = [rate[-1] - tracker(memory=memory).track(y, INTERVAL).frequencies[-1, 0] for memory in (20.0, 10.0, 5.0)]
-    # A lag of about the memory, in the frequency that it had then.
-    np.testing.assert_allclose(np.array(lags) / 0.002, [22.0, 12.0, 7.0], atol=2.5)
-
-
 @pytest.mark.parametrize("memory", [2.0, 3.5])
 def test_older_rows_are_forgotten_exponentially(memory):
     y = noisy(2, 1560)
@@ -231,10 +221,11 @@ def test_a_tone_that_stops_is_a_change():
     assert track.flags[-1] & Flag.UNDETERMINED
 
 
-def test_agrees_with_the_mixed_estimates_without_noise():
-    y = tones(2, 1500).sum(axis=1)
-    mixed = DremFiniteTime(tones=2, h=H, d=0.3).track(y, INTERVAL)
-    np.testing.assert_allclose(tracker().track(y, INTERVAL).frequencies[-1], mixed.frequencies[-1], atol=1e-10)
+def test_a_sample_that_is_missing_during_the_flush_is_a_gap_too():
+    y = np.concatenate((tones(2, 1500).sum(axis=1), tones(2, 500, omega=[1.3, 2.5]).sum(axis=1)))
+    y[1520] = np.nan
+    track = tracker().track(y, INTERVAL)
+    assert Flag(int(track.flags[1520])) & (Flag.GAP | Flag.CHANGED) == Flag.GAP | Flag.CHANGED
 
 
 @pytest.mark.parametrize(
@@ -242,37 +233,8 @@ def test_agrees_with_the_mixed_estimates_without_noise():
     [
         ({"memory": 0.0}, "memory must be a positive number"),
         ({"solution": "best"}, "solution must be 'least_squares' or 'total_least_squares', not 'best'"),
-        ({"difference": -1.0}, "difference must be zero or a positive number"),
-        ({"h": 2.0, "highest_frequency": 3.0}, "use an h below 1.0472 s"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        RestartingLeastSquares(**{"tones": 2, "h": H, **options})
-
-
-def test_options_that_the_clock_cannot_meet_are_refused():
-    with pytest.raises(ValueError, match=r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8"):
-        tracker(memory=0.05).start(INTERVAL)
-    with pytest.raises(ValueError, match=r"difference = 0.001 s is shorter than half a sampling interval"):
-        tracker(difference=0.001).start(INTERVAL)
-
-
-def test_a_second_change_during_the_flush_is_found_behind_a_prefilter_too():
-    # Both frequencies step, three seconds apart, and one of them back nine seconds later.
-    t = INTERVAL * np.arange(9000)
-    first = np.where(t < 33.0, 1.8, 1.2)
-    second = np.select([t < 30.0, t < 42.0], [3.0, 4.0], 3.0)
-    y = np.sin(np.cumsum(first) * INTERVAL) + np.cos(np.cumsum(second) * INTERVAL)
-    track = tracker(h=0.7, prefilter=1.0).track(y, INTERVAL)
-    error = np.abs(track.frequencies - np.column_stack([first, second])).max(axis=1)
-    assert error[4800:].max() < 1e-9
-    assert track.valid[-2000:].all()
-    assert (track.valid & (error > 0.1)).sum() <= 40  # three steps, each noticed within 0.15 s
-
-
-def test_a_sample_that_is_missing_during_the_flush_is_a_gap_too():
-    y = np.concatenate((tones(2, 1500).sum(axis=1), tones(2, 500, omega=[1.3, 2.5]).sum(axis=1)))
-    y[1520] = np.nan
-    track = tracker().track(y, INTERVAL)
-    assert Flag(int(track.flags[1520])) & (Flag.GAP | Flag.CHANGED) == Flag.GAP | Flag.CHANGED
+        tracker(**options)
