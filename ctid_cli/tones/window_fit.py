@@ -26,6 +26,11 @@ class WindowTones(NamedTuple):
     growth: Array
     rate: Array
     rate_error: Array
+    #: Standard error of the growth, and covariances of the frequency with its rate of change, and of the logarithm of
+    #: the amplitude with the growth.
+    growth_error: Array
+    omega_with_rate: Array
+    height_with_growth: Array
     #: Error of omega that a curved frequency makes, estimated from what is left, and its standard error [rad/sample].
     bend: Array
     bend_error: Array
@@ -46,7 +51,7 @@ class _Fits(NamedTuple):
     first: IndexArray
     used: IndexArray
     parameters: Array
-    variances: Array
+    covariances: Array
     converged: BoolArray
 
 
@@ -68,12 +73,15 @@ def fit_tones(
     size = max(1, c.BLOCK_SAMPLES // length)
     parts = [first[k : k + size] for k in range(0, first.size, size)]
     blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
-    return WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+    tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+    # An empty column is kept where there is one: windows without have no room left.
+    kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
+    return WindowTones(*(each[:, :kept] if each.ndim == 2 else each for each in tones))
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
     rows, shape = first.size, (first.size, most, PARAMETERS)
-    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros(shape), np.zeros(rows, np.bool_))
+    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_))
     if shorter is not None:
         _start(fits, length, shorter)
     residuals = np.empty((rows, length))
@@ -158,7 +166,12 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
     amplitude = np.hypot(cosine, sine)
     with np.errstate(invalid="ignore", divide="ignore"):
-        errors = np.sqrt(noise[:, :, None] * fits.variances)
+        covariances = noise[:, :, None, None] * fits.covariances
+        errors = np.sqrt(np.diagonal(covariances, axis1=2, axis2=3))
+        # How the logarithm of the amplitude depends on both amplitudes.
+        weights = np.stack((cosine, sine), axis=2) / amplitude[:, :, None] ** 2
+        height_with = np.einsum("rna,rnab->rnb", weights, covariances[:, :, :2])
+        height_error = np.sqrt((height_with[:, :, :2] * weights).sum(axis=2))
         # A phase c P3(u), P3 = (5 u^3 - 3 u)/2, takes 3/2 c from the slope of the phase at u = 0; its mean square is
         # c^2/7, and the residual is turned back by a tone of unit amplitude, whose mean square is 1/2.
         per_unit = 1.5 * np.sqrt(noise) / amplitude / half
@@ -169,11 +182,14 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
         omega=turn / half,
         omega_error=errors[:, :, 3] / half,
         amplitude=amplitude,
-        amplitude_error=np.sqrt(0.5 * (errors[:, :, 0] ** 2 + errors[:, :, 1] ** 2)),
+        amplitude_error=amplitude * height_error,
         phase=np.arctan2(-sine, cosine),
         growth=growth / half,
         rate=2.0 * bend / half**2,
         rate_error=2.0 * errors[:, :, 4] / half**2,
+        growth_error=errors[:, :, 2] / half,
+        omega_with_rate=2.0 * covariances[:, :, 3, 4] / half**3,
+        height_with_growth=height_with[:, :, 2] / half,
         bend=bent,
         bend_error=uncertain,
         change_chance=chances,
