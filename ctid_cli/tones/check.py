@@ -124,6 +124,13 @@ def _sound(tones: WindowTones, length: int) -> BoolArray:
     return np.asarray(sound)
 
 
+def explained(tones: WindowTones, length: int) -> bool:
+    """Return whether nothing is left of any window that a shorter one could explain."""
+    resolved = _distance(tones) * length / (2.0 * np.pi) >= c.RESOLVED
+    clean = _sound(tones, length) & resolved & (tones.change_chance >= c.DOUBTFUL)
+    return bool((clean | np.isnan(tones.omega)).all())
+
+
 def _distance(tones: WindowTones) -> Array:
     """Return the distance of each tone from the nearest other one of its window [rad/sample], shape (R, n)."""
     order = np.argsort(tones.omega, axis=1)

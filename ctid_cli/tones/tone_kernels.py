@@ -232,13 +232,14 @@ def fit_windows(
     length: int,
     first: IndexArray,
     chosen: IndexArray,
+    most_steps: int,
     used: IndexArray,
     parameters: Array,
     covariances: Array,
     converged: BoolArray,
     residuals: Array,
 ) -> None:
-    """Fit the tones of some windows by Levenberg-Marquardt steps, starting from the parameters that they have.
+    """Fit the tones of some windows by Levenberg-Marquardt steps, at most so many of a stage, starting from the parameters that they have.
 
     ``parameters`` are of shape (R, n, 5), and their ``covariances``, in units of the noise variance, (R, n, 5, 5); what is
     left goes to ``residuals``, shape (R, L).
@@ -269,7 +270,7 @@ def fit_windows(
         trial = np.empty_like(tones)
         for free, steps in STAGES:
             damping, taken, done = DAMPING, 0, False
-            while taken < steps and not done:
+            while taken < min(steps, most_steps) and not done:
                 if damping > MOST_DAMPING:
                     done = True
                 elif _factorise(gram, free, damping, factor, scales[:size]):

@@ -79,7 +79,39 @@ def fit_tones(
     return WindowTones(*(each[:, :kept] if each.ndim == 2 else each for each in tones))
 
 
+def fit_steady(samples: Array) -> WindowTones | None:
+    """Fit few tones to a record at once; None where windows of any length may show more than they are and noise.
+
+    One that does not converge soon is left to shorter windows.
+    """
+    length = samples.size
+    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), c.STEADY, None)
+    unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
+    if unexplained.any() or not fits.used.any():
+        return None
+    shorter = length // c.STEADY_STEP
+    while shorter >= c.SHORTEST:
+        parts = residuals[0, : length // shorter * shorter].reshape(-1, shorter)
+        together = max(1, c.BLOCK_SAMPLES // shorter)
+        for begin in range(0, len(parts), together):
+            some = parts[begin : begin + together]
+            left = whiten(some, np.zeros(len(some), np.int64))
+            if (strongest_lines(left).chance < c.LEVEL / len(parts)).any():
+                return None
+        shorter //= c.STEADY_STEP
+    return _tones(fits, tests, length)
+
+
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
+    fits, tests, _ = _fitted(samples, length, first, c.Limits(most, most, c.MOST_STEPS), shorter)
+    return _tones(fits, tests, length)
+
+
+def _fitted(
+    samples: Array, length: int, first: IndexArray, limits: c.Limits, shorter: WindowTones | None
+) -> tuple[_Fits, _Tests, Array]:
+    """Return fits, what is left of them, and that itself, shape (R, L)."""
+    most = limits.lines
     rows, shape = first.size, (first.size, most, PARAMETERS)
     fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_))
     if shorter is not None:
@@ -87,11 +119,11 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: W
     residuals = np.empty((rows, length))
     tests: _Tests | None = None
     todo = np.arange(rows)
-    for round_ in range(most + 1):
-        fit_windows(samples, length, first, todo, *fits[1:], residuals)
+    for round_ in range(limits.rounds + 1):
+        fit_windows(samples, length, first, todo, limits.steps, *fits[1:], residuals)
         new = _tested(residuals[todo], fits, todo)
         tests = new if tests is None else _replaced(tests, todo, new)
-        if round_ == most:
+        if round_ == limits.rounds:
             break
         # What a change explains better is no line.
         changed = np.nan_to_num(new.change).max(axis=1)
@@ -106,7 +138,7 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: W
         for each in turns.T[1:]:
             _join(fits, todo, each)
     assert tests is not None
-    return _tones(fits, tests, length)
+    return fits, tests, residuals
 
 
 def nearest(middles: Array, places: Array) -> IndexArray:
