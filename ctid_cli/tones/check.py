@@ -9,9 +9,6 @@ from ctid_cli.tones import constants as c
 from ctid_cli.tones.tone_kernels import refute
 from ctid_cli.tones.window_fit import WindowTones
 
-#: Standard error of the growth over half a window, in relative errors of the amplitude: the mean square of u is 1/3.
-GROWTH_ERROR = 3.0**0.5
-
 
 class Readings(NamedTuple):
     """One entry for each instant and tone that some window shows there."""
@@ -62,14 +59,15 @@ def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
         return np.asarray(values[window, tone])
 
     x = places[row] - tones.middle[window]
-    u = x / half
     growth, rate = of(tones.growth), of(tones.rate)
     omega, error = _frequency(tones, length, window, tone, x)
     # The amplitude at the end of a window depends on its growth; where it has vanished, an exponential that is none
     # would seem surer than the noise allows.
     grown = np.exp(np.clip(growth * x, -20.0, 20.0))
     amplitude = of(tones.amplitude) * grown
-    amplitude_error = of(tones.amplitude_error) * np.hypot(1.0, GROWTH_ERROR * u) * np.maximum(1.0, grown)
+    relative = of(tones.amplitude_error) / of(tones.amplitude)
+    relative = _error_at(x, relative, of(tones.height_with_growth), of(tones.growth_error))
+    amplitude_error = of(tones.amplitude) * relative * np.maximum(1.0, grown)
     significant = (amplitude > c.SIGNIFICANT * amplitude_error) & (of(tones.omega) * length > c.PERIODS * 2.0 * np.pi)
     phase = of(tones.phase) + of(tones.omega) * x + 0.5 * rate * x**2
     resolved = of(_distance(tones) * length / (2.0 * np.pi)) >= c.RESOLVED
@@ -90,7 +88,7 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
     half = 0.5 * length
     omega_error, rate, growth, bend = of(tones.omega_error), of(tones.rate), of(tones.growth), of(tones.bend)
     omega = of(tones.omega) + rate * x
-    error = np.hypot(omega_error, of(tones.rate_error) * x)
+    error = _error_at(x, omega_error, of(tones.omega_with_rate), of(tones.rate_error))
     # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is that at the middle.
     share, curved = 1.0 - 5.0 * (x / half) ** 2, np.abs(bend) / of(tones.bend_error)
     error = np.where(curved > c.QUIET, np.hypot(error, 0.5 * share * bend), error)
@@ -100,9 +98,13 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
     hidden = np.minimum(c.KINK * np.abs(rate) * length, c.HIDDEN_KINK * omega_error) / c.COVERED
     error = np.where(np.abs(rate) > c.MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
     error = np.where(of(tones.change_chance) < c.DOUBTFUL, c.DOUBT * error, error)
-    growing, relative = np.abs(growth) * half, of(tones.amplitude_error) / of(tones.amplitude)
-    blended = (growing > c.GROWS * GROWTH_ERROR * relative) & (growing < c.BLENDED_GROWTH)
+    blended = (np.abs(growth) > c.GROWS * of(tones.growth_error)) & (np.abs(growth) * half < c.BLENDED_GROWTH)
     return omega, np.where(blended, np.hypot(error, np.abs(growth) / c.COVERED), error)
+
+
+def _error_at(x: Array, error: Array, covariance: Array, slope_error: Array) -> Array:
+    """Return the standard error of a value at a distance from where it and its slope are estimated together."""
+    return np.asarray(np.sqrt(np.maximum(error**2 + 2.0 * covariance * x + (slope_error * x) ** 2, 0.0)))
 
 
 def _sound(tones: WindowTones, length: int) -> BoolArray:
@@ -122,12 +124,21 @@ def _sound(tones: WindowTones, length: int) -> BoolArray:
     return np.asarray(sound)
 
 
+def explained(tones: WindowTones, length: int) -> bool:
+    """Return whether nothing is left of any window that a shorter one could explain."""
+    resolved = _distance(tones) * length / (2.0 * np.pi) >= c.RESOLVED
+    clean = _sound(tones, length) & resolved & (tones.change_chance >= c.DOUBTFUL)
+    return bool((clean | np.isnan(tones.omega)).all())
+
+
 def _distance(tones: WindowTones) -> Array:
     """Return the distance of each tone from the nearest other one of its window [rad/sample], shape (R, n)."""
-    apart = np.abs(tones.omega[:, :, None] - tones.omega[:, None, :])
-    n = np.arange(apart.shape[1])
-    apart[:, n, n] = np.inf
-    return np.asarray(np.where(np.isnan(apart), np.inf, apart).min(axis=2))
+    order = np.argsort(tones.omega, axis=1)
+    steps = np.diff(np.take_along_axis(tones.omega, order, axis=1), axis=1, prepend=-np.inf, append=np.inf)
+    steps = np.where(np.isnan(steps), np.inf, steps)
+    nearest = np.empty_like(tones.omega)
+    np.put_along_axis(nearest, order, np.minimum(steps[:, 1:], steps[:, :-1]), axis=1)
+    return nearest
 
 
 def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:

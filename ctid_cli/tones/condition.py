@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import next_fast_len, rfft
-from scipy.signal import firwin, freqz, kaiserord, upfirdn
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
@@ -30,7 +29,8 @@ class Conditioned(NamedTuple):
         """Return the factor by which the filter changes amplitudes at some phases from sample to sample [rad]."""
         if self.weights.size == 1:
             return np.ones_like(turn)
-        return np.asarray(np.abs(freqz(self.weights, worN=turn.ravel() / self.factor)[1]).reshape(turn.shape))
+        response = np.abs(rfft(self.weights, 2 * c.RESPONSE_PADDING * self.weights.size))
+        return np.interp(turn / self.factor, np.linspace(0.0, np.pi, response.size), response)
 
 
 def condition(samples: Array, interval: float) -> Conditioned:
@@ -50,18 +50,37 @@ def condition(samples: Array, interval: float) -> Conditioned:
     factor = min(most, int(np.pi * c.TONE_BAND / top))
     if factor <= 1:
         return Conditioned(samples, interval, 0.0, scale, np.ones(1), 1, tuple(reasons))
-    # Edges as shares of the Nyquist frequency; what would fold into the kept band is stopped.
-    taps, beta = kaiserord(c.STOP_BAND, 2.0 * (1.0 - c.KEPT_BAND) / factor)
-    weights = firwin(taps | 1, 1.0 / factor, window=("kaiser", beta))
+    weights = low_pass(factor)
     bridged = bridge_gaps(samples, int(c.BRIDGED * 2.0 * np.pi / top))
-    inner = slice(-(-(weights.size - 1) // factor), (samples.size - 1) // factor + 1)
-    thinned = upfirdn(weights, bridged, 1, factor)[inner]
+    thinned = thinned_by(bridged, weights, factor)
     thin = factor * interval
     kept = f"One of {factor} samples is kept, every {thin:.4g} s"
     edge = 0.5 * c.KEPT_BAND / thin
     reasons.append(f"{kept}, after a low-pass that keeps what is below {edge:.4g} Hz.")
-    begins = (inner.start * factor - 0.5 * (weights.size - 1)) * interval
-    return Conditioned(np.asarray(thinned), thin, begins, scale, weights, factor, tuple(reasons))
+    begins = 0.5 * (weights.size - 1) * interval
+    return Conditioned(thinned, thin, begins, scale, weights, factor, tuple(reasons))
+
+
+def low_pass(factor: int) -> Array:
+    """Return the impulse response of the filter before one of so many samples is kept, by Kaiser's formulas."""
+    # What would fold into the kept band is stopped; width of the transition [rad].
+    width = 2.0 * np.pi * (1.0 - c.KEPT_BAND) / factor
+    taps = int(np.ceil((c.STOP_BAND - 7.95) / (2.285 * width) + 1.0)) | 1
+    beta = 0.1102 * (c.STOP_BAND - 8.7)
+    weights = np.sinc((np.arange(taps) - 0.5 * (taps - 1)) / factor) * np.kaiser(taps, beta)
+    return np.asarray(weights / weights.sum())
+
+
+def thinned_by(samples: Array, weights: Array, factor: int) -> Array:
+    """Return every so many-th sample of a filtered record, where the filter does not reach beyond it."""
+    parts = -(-weights.size // factor)
+    pieces = np.append(weights[::-1], np.zeros(parts * factor - weights.size)).reshape(parts, factor)
+    count = (samples.size - weights.size) // factor + 1
+    samples = np.append(samples, np.zeros(factor))
+    thinned = np.zeros(count)
+    for k, piece in enumerate(pieces):
+        thinned += samples[k * factor : (k + count) * factor].reshape(count, factor) @ piece
+    return thinned
 
 
 def refuse_unusable(samples: Array) -> None:
@@ -79,18 +98,22 @@ def refuse_unusable(samples: Array) -> None:
 
 def find_spikes(samples: Array) -> BoolArray:
     """Return where a record, which may have missing samples, has values no sum of a few tones can have."""
-    from scipy.ndimage import maximum_filter1d
-
     there = np.isfinite(samples)
     if not there.any():
         return there
     size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
-    # The largest of the samples on each side, those next to the spike left out.
-    begin = c.SPIKE_AROUND // 2
-    largest = maximum_filter1d(np.pad(size, c.SPIKE_WIDTH + c.SPIKE_AROUND), c.SPIKE_AROUND)
-    largest = largest[begin : begin + size.size + 2 * c.SPIKE_WIDTH + c.SPIKE_AROUND + 1]
-    around = np.maximum(largest[: size.size], largest[-size.size :])
-    spikes: BoolArray = (around > 0.0) & (size > c.SPIKE_TIMES * around)
+    # The largest of some blocks; of those on one side of a spike, the next one or the one after lies within its reach.
+    half, reach = c.SPIKE_AROUND // 2, c.SPIKE_WIDTH + c.SPIKE_AROUND
+    blocks = np.pad(size, (0, -size.size % half)).reshape(-1, half).max(axis=1)
+    around = np.pad(blocks, 2)
+    before, after = np.minimum(around[:-4], around[1:-3]), np.minimum(around[3:-1], around[4:])
+    least = c.SPIKE_TIMES * np.repeat(np.maximum(before, after), half)[: size.size]
+    spikes = np.zeros(size.size, np.bool_)
+    padded = np.pad(size, reach)
+    for place in np.flatnonzero(size > least):
+        left = padded[place : place + c.SPIKE_AROUND].max()
+        right = padded[place + reach + c.SPIKE_WIDTH + 1 :][: c.SPIKE_AROUND].max()
+        spikes[place] = 0.0 < c.SPIKE_TIMES * max(left, right) < size[place]
     return spikes if spikes.mean() <= c.MOST_SPIKES else np.zeros_like(spikes)
 
 

@@ -5,21 +5,34 @@ tracker. What has neither that mark nor a source is a choice; the benchmark test
 compiled fit are in :mod:`ctid_cli.tones.tone_kernels`.
 """
 
+from typing import NamedTuple
+
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
 #: Name of the method in files.
 METHOD = "tone_windows"
 #: A row is accurate if its standard error is at most this share of the frequency, unless another limit is given.
 USUAL_ACCURACY = 0.001
-#: Most tones that can be asked for, and lines that are fitted in one window: 81 equations.
-MOST_ASKED = 20
-MOST_LINES = 16
+#: Most tones that can be asked for, and lines that are fitted in one window: 321 equations. The lowest string of a guitar
+#: shows 45 at once. Measured.
+MOST_ASKED = 64
+MOST_LINES = 64
 #: Rows of a track if nobody says how many: what a figure shows.
 USUAL_ROWS = 1000
 #: Most lines that are named as missing.
 MOST_MISSING = 5
 #: Share of the Nyquist frequency above which a tone may be the image of one that the sampling has folded.
 SUSPICIOUS = 0.9
+
+
+class Limits(NamedTuple):
+    """What the fit of a window may take."""
+
+    #: Lines, rounds in which lines join, and steps of one stage of one round.
+    lines: int
+    rounds: int
+    steps: int
+
 
 # --- record ---------------------------------------------------------------------------------------------------------
 
@@ -45,6 +58,8 @@ FEWEST_KEPT = 2**15
 KEPT_BAND = 0.9
 TONE_BAND = 0.8
 STOP_BAND = 60.0
+#: Points of the response of the low-pass for each of its samples; lines between them are off by 1.3e-5.
+RESPONSE_PADDING = 32
 #: Gaps shorter than this share of the shortest period are bridged before a filter: a line is off by 1 % there.
 BRIDGED = 0.05
 #: Shortest segment in which the highest line is looked for; noise shows one in so many records.
@@ -96,6 +111,11 @@ SAMPLES_PER_PARAMETER = 3
 APART = 1.5
 #: Tones of shorter windows are the start in longer ones if their amplitude is so many standard errors.
 SURE = 6.0
+#: Most steps of a fit. A record of few tones that hold throughout is fitted at once, with fewer: that takes a tenth of
+#: the time of windows of all lengths. Lines of what is left are looked for in windows shorter by this factor each.
+MOST_STEPS = 30
+STEADY = Limits(8, 2, 8)
+STEADY_STEP = 4
 #: Samples of the windows that are computed together: what stays in the cache. No result depends on it.
 BLOCK_SAMPLES = 2**17
 

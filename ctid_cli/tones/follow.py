@@ -8,16 +8,20 @@ from scipy.optimize import linear_sum_assignment
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.check import Readings, moving, readings_of
+from ctid_cli.tones.check import Readings, explained, moving, readings_of
 from ctid_cli.tones.find import floor_bins
 from ctid_cli.tones.tone_kernels import PARAMETERS, keep_readings
-from ctid_cli.tones.window_fit import WindowTones, fit_tones, nearest
+from ctid_cli.tones.window_fit import WindowTones, fit_steady, fit_tones, nearest
 
 
 def readings_at(
     samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
 ) -> Readings:
     """Return the tones of a signal at some places [samples], ascending: of each that of its longest sound window."""
+    if longest == samples.size and (steady := fit_steady(samples)) is not None:
+        found = readings_of(steady, longest, places)
+        if explained(steady, longest) and not (found.gap > 0.0).any():
+            return found.at(np.lexsort((found.omega, found.row)))
     parts: list[Readings] = []
     tones: WindowTones | None = None
     lengths = [c.SHORTEST * 2**k for k in range(64) if c.SHORTEST * 2**k < longest] + [longest]

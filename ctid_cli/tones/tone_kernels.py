@@ -202,20 +202,28 @@ def _solve(factor: Array, scales: Array, right: Array, free: int, step: Array) -
 
 
 @njit(cache=True, nogil=True)
-def _variances(gram: Array, factor: Array, scales: Array, variances: Array) -> None:
-    """Compute the diagonal of the inverse of the equations, from the columns of the inverse of their factor."""
+def _covariances(gram: Array, factor: Array, scales: Array, covariances: Array) -> None:
+    """Compute the blocks of the inverse of the equations that belong to one tone each, shape (n, 5, 5)."""
     size = scales.size
-    known = _factorise(gram, PARAMETERS, RIDGE, factor, scales)
-    column = np.zeros(size)
-    for a in range(size - 1):
-        total = 0.0
-        for i in range(a, size if known else a):
-            value = 1.0 if i == a else 0.0
-            for k in range(a, i):
-                value -= factor[i, k] * column[k]
-            column[i] = value / factor[i, i]
-            total += column[i] * column[i]
-        variances[a // PARAMETERS, a % PARAMETERS] = total / scales[a] ** 2 if known else np.nan
+    if not _factorise(gram, PARAMETERS, RIDGE, factor, scales):
+        covariances[:] = np.nan
+        return
+    # Columns of the inverse of the factor; they are zero above the diagonal.
+    columns = np.empty((PARAMETERS, size))
+    for k in range(size // PARAMETERS):
+        begin = PARAMETERS * k
+        for a in range(PARAMETERS):
+            for i in range(begin, size):
+                value = 1.0 if i == begin + a else 0.0
+                for j in range(begin, i):
+                    value -= factor[i, j] * columns[a, j]
+                columns[a, i] = value / factor[i, i]
+            for b in range(a + 1):
+                total = 0.0
+                for i in range(begin, size):
+                    total += columns[a, i] * columns[b, i]
+                total /= scales[begin + a] * scales[begin + b]
+                covariances[k, a, b] = covariances[k, b, a] = total
 
 
 @njit(cache=True, nogil=True)
@@ -224,16 +232,17 @@ def fit_windows(
     length: int,
     first: IndexArray,
     chosen: IndexArray,
+    most_steps: int,
     used: IndexArray,
     parameters: Array,
-    variances: Array,
+    covariances: Array,
     converged: BoolArray,
     residuals: Array,
 ) -> None:
-    """Fit the tones of some windows by Levenberg-Marquardt steps, starting from the parameters that they have.
+    """Fit the tones of some windows by Levenberg-Marquardt steps, at most so many of a stage, starting from the parameters that they have.
 
-    ``parameters`` and ``variances``, these in units of the noise variance, are of shape (R, n, 5); what is left goes to
-    ``residuals``, shape (R, L).
+    ``parameters`` are of shape (R, n, 5), and their ``covariances``, in units of the noise variance, (R, n, 5, 5); what is
+    left goes to ``residuals``, shape (R, L).
     """
     most = PARAMETERS * parameters.shape[1] + 1
     gram, trial_gram = np.zeros((2, most, most))
@@ -261,7 +270,7 @@ def fit_windows(
         trial = np.empty_like(tones)
         for free, steps in STAGES:
             damping, taken, done = DAMPING, 0, False
-            while taken < steps and not done:
+            while taken < min(steps, most_steps) and not done:
                 if damping > MOST_DAMPING:
                     done = True
                 elif _factorise(gram, free, damping, factor, scales[:size]):
@@ -298,7 +307,7 @@ def fit_windows(
             converged[row] = done
         for j in range(length):
             residuals[row, j] = left[j] if there[j] else np.nan
-        _variances(gram, factor, scales[:size], variances[row])
+        _covariances(gram, factor, scales[:size], covariances[row])
 
 
 @njit(cache=True, nogil=True)

@@ -199,7 +199,7 @@ def track(
     record : Sampled
         Signal on a regular clock: ``samples``, shape (N,), NaN where missing, and ``interval`` [s].
     tones : int, optional
-        Number of tones, at most 20; by default all that are found.
+        Number of tones, at most 64; by default all that are found.
     accuracy : float, optional
         Rows with a larger standard error are not valid [Hz]; by default .001 of the tone's frequency.
     every : float, optional

@@ -26,6 +26,11 @@ class WindowTones(NamedTuple):
     growth: Array
     rate: Array
     rate_error: Array
+    #: Standard error of the growth, and covariances of the frequency with its rate of change, and of the logarithm of
+    #: the amplitude with the growth.
+    growth_error: Array
+    omega_with_rate: Array
+    height_with_growth: Array
     #: Error of omega that a curved frequency makes, estimated from what is left, and its standard error [rad/sample].
     bend: Array
     bend_error: Array
@@ -46,7 +51,7 @@ class _Fits(NamedTuple):
     first: IndexArray
     used: IndexArray
     parameters: Array
-    variances: Array
+    covariances: Array
     converged: BoolArray
 
 
@@ -68,22 +73,57 @@ def fit_tones(
     size = max(1, c.BLOCK_SAMPLES // length)
     parts = [first[k : k + size] for k in range(0, first.size, size)]
     blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
-    return WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+    tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+    # An empty column is kept where there is one: windows without have no room left.
+    kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
+    return WindowTones(*(each[:, :kept] if each.ndim == 2 else each for each in tones))
+
+
+def fit_steady(samples: Array) -> WindowTones | None:
+    """Fit few tones to a record at once; None where windows of any length may show more than they are and noise.
+
+    One that does not converge soon is left to shorter windows.
+    """
+    length = samples.size
+    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), c.STEADY, None)
+    unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
+    if unexplained.any() or not fits.used.any():
+        return None
+    shorter = length // c.STEADY_STEP
+    while shorter >= c.SHORTEST:
+        parts = residuals[0, : length // shorter * shorter].reshape(-1, shorter)
+        together = max(1, c.BLOCK_SAMPLES // shorter)
+        for begin in range(0, len(parts), together):
+            some = parts[begin : begin + together]
+            left = whiten(some, np.zeros(len(some), np.int64))
+            if (strongest_lines(left).chance < c.LEVEL / len(parts)).any():
+                return None
+        shorter //= c.STEADY_STEP
+    return _tones(fits, tests, length)
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
+    fits, tests, _ = _fitted(samples, length, first, c.Limits(most, most, c.MOST_STEPS), shorter)
+    return _tones(fits, tests, length)
+
+
+def _fitted(
+    samples: Array, length: int, first: IndexArray, limits: c.Limits, shorter: WindowTones | None
+) -> tuple[_Fits, _Tests, Array]:
+    """Return fits, what is left of them, and that itself, shape (R, L)."""
+    most = limits.lines
     rows, shape = first.size, (first.size, most, PARAMETERS)
-    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros(shape), np.zeros(rows, np.bool_))
+    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_))
     if shorter is not None:
         _start(fits, length, shorter)
     residuals = np.empty((rows, length))
     tests: _Tests | None = None
     todo = np.arange(rows)
-    for round_ in range(most + 1):
-        fit_windows(samples, length, first, todo, *fits[1:], residuals)
+    for round_ in range(limits.rounds + 1):
+        fit_windows(samples, length, first, todo, limits.steps, *fits[1:], residuals)
         new = _tested(residuals[todo], fits, todo)
         tests = new if tests is None else _replaced(tests, todo, new)
-        if round_ == most:
+        if round_ == limits.rounds:
             break
         # What a change explains better is no line.
         changed = np.nan_to_num(new.change).max(axis=1)
@@ -98,7 +138,7 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: W
         for each in turns.T[1:]:
             _join(fits, todo, each)
     assert tests is not None
-    return _tones(fits, tests, length)
+    return fits, tests, residuals
 
 
 def nearest(middles: Array, places: Array) -> IndexArray:
@@ -158,7 +198,12 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
     noise = np.where(empty, np.nan, tests.left.noise(np.where(empty, 0.0, turn / half)))
     amplitude = np.hypot(cosine, sine)
     with np.errstate(invalid="ignore", divide="ignore"):
-        errors = np.sqrt(noise[:, :, None] * fits.variances)
+        covariances = noise[:, :, None, None] * fits.covariances
+        errors = np.sqrt(np.diagonal(covariances, axis1=2, axis2=3))
+        # How the logarithm of the amplitude depends on both amplitudes.
+        weights = np.stack((cosine, sine), axis=2) / amplitude[:, :, None] ** 2
+        height_with = np.einsum("rna,rnab->rnb", weights, covariances[:, :, :2])
+        height_error = np.sqrt((height_with[:, :, :2] * weights).sum(axis=2))
         # A phase c P3(u), P3 = (5 u^3 - 3 u)/2, takes 3/2 c from the slope of the phase at u = 0; its mean square is
         # c^2/7, and the residual is turned back by a tone of unit amplitude, whose mean square is 1/2.
         per_unit = 1.5 * np.sqrt(noise) / amplitude / half
@@ -169,11 +214,14 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
         omega=turn / half,
         omega_error=errors[:, :, 3] / half,
         amplitude=amplitude,
-        amplitude_error=np.sqrt(0.5 * (errors[:, :, 0] ** 2 + errors[:, :, 1] ** 2)),
+        amplitude_error=amplitude * height_error,
         phase=np.arctan2(-sine, cosine),
         growth=growth / half,
         rate=2.0 * bend / half**2,
         rate_error=2.0 * errors[:, :, 4] / half**2,
+        growth_error=errors[:, :, 2] / half,
+        omega_with_rate=2.0 * covariances[:, :, 3, 4] / half**3,
+        height_with_growth=height_with[:, :, 2] / half,
         bend=bent,
         bend_error=uncertain,
         change_chance=chances,
