@@ -15,7 +15,7 @@ import math
 import sqlite3
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
@@ -189,24 +189,31 @@ class JournalReader:
         self.require_count()
         yield from self._selected("")
 
-    def require_count(self) -> None:
-        """Refuse a file that lacks estimates which were written, or which a killed run has reported."""
+    def require_count(self) -> int:
+        """Return how many estimates are stored; fewer than were written, or than a killed run reported, are refused."""
         written, there = int(self._meta(_COUNT) or 0), self.count()
         # What a run reports while this is read can be more than there was when reading began.
         written = written if self.live else max(written, reported(self.path.parent))
         if written != there:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
+        return there
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
         """Yield the stored estimates that a plan asks for, in its order."""
         for estimator, cell, replicates in planned_parts(manifest):
-            order = {start: number for number, start in enumerate(estimator["starts"])}
-            wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
-            found = self._selected("WHERE data_hash = ? AND estimator_hash = ?", cell["hash"], estimator["hash"])
-            for replicate, rows in groupby(found, key=lambda row: row.replicate):
-                if replicate in wanted:
-                    for row in sorted((row for row in rows if row.start in order), key=lambda row: order[row.start]):
-                        yield Slot(row.key, cell, estimator), row
+            for row in self.rows_of(estimator, cell, replicates):
+                yield Slot(row.key, cell, estimator), row
+
+    def rows_of(
+        self, estimator: Mapping[str, Any], cell: Mapping[str, Any], replicates: Sequence[int]
+    ) -> Iterator[Row]:
+        """Yield the stored estimates of a planned estimator on some data sets of a data cell, in their order."""
+        order = {start: number for number, start in enumerate(estimator["starts"])}
+        wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
+        found = self._selected("WHERE data_hash = ? AND estimator_hash = ?", cell["hash"], estimator["hash"])
+        for replicate, rows in groupby(found, key=lambda row: row.replicate):
+            if replicate in wanted:
+                yield from sorted((row for row in rows if row.start in order), key=lambda row: order[row.start])
 
     def row(self, key: Key) -> Row | None:
         """Return a stored estimate."""

@@ -8,7 +8,7 @@ alone, so that it has the bytes of a single run's.
 import re
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from math import inf
@@ -19,7 +19,7 @@ from ctid_cli.storage import folder as place
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, origin_differences
 from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, open_journal, read_journal
-from ctid_cli.storage.manifest import Key, Manifest, Planned, Shard, owner, shard_of, slots, whole
+from ctid_cli.storage.manifest import Key, Manifest, Shard, owner, shard_of, slots, whole
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 
 #: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
@@ -87,7 +87,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
             _require_same_experiment(target, plan)
             log = open_journal(target / FILE_NAME)
         with closing(log):
-            taken = _Taken(target, log, plan, allow_mixed=allow_mixed)
+            taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
             with log.transaction():
                 for folder in others:
                     with _reading(folder) as other:
@@ -163,8 +163,10 @@ def _require_same_experiment(target: Path, plan: Manifest) -> None:
 class _Taken:
     """What has been taken over from several folders into a journal, in one transaction."""
 
-    def __init__(self, target: Path, log: Journal, plan: Manifest, *, allow_mixed: bool) -> None:
-        self._log, self._planned, self._allow_mixed = log, Planned(plan), allow_mixed
+    def __init__(
+        self, target: Path, log: Journal, plan: Manifest, planned: Container[Key], *, allow_mixed: bool
+    ) -> None:
+        self._log, self._planned, self._allow_mixed = log, planned, allow_mixed
         #: Where the runs of the journal come from, by their ids.
         self._places = {session.id: (target, session) for session in log.sessions()}
         cells = {cell["hash"] for cell in plan["data_cells"]}
