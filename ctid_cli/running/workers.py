@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -221,41 +222,79 @@ def _read(record: Path) -> list[Any]:
     return entries
 
 
-def in_parallel(
-    jobs: Iterator[Job],
-    submit: Callable[[Job, Task], Future[Ending]],
-    at_once: Callable[[], int],
-    died: Callable[[Job, Exception], Ending],
-) -> Results:
-    """Keep a number of jobs in work, and yield each with what came of it; None where nothing has ended for a while."""
-    in_work: dict[Future[Ending], Job] = {}
-    while True:
-        while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
-            task = task_of(job)
-            if isinstance(task, Ending):
-                yield job, task
-            else:
-                in_work[submit(job, task)] = job
-        if not in_work:
-            return
-        done, _ = wait(in_work, TICK, FIRST_COMPLETED)
-        for future in done:
-            job = in_work.pop(future)
-            try:
-                ending = future.result()
-            except Exception as error:
-                ending = died(job, error)
-            yield job, ending
-        if not done:
-            yield None
+class Workers(ABC):
+    """Processes that compute jobs, on this machine or on others."""
 
+    #: How many jobs they compute at the same time.
+    count: int
 
-def task_of(job: Job) -> Task | Ending:
-    """Return what is sent of a job, or what comes of it where it cannot be sent."""
-    try:
-        return Task(job.keys, packed(job))
-    except Exception as error:
-        return Ending(list(ended(job.keys, error, Limits())))
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        #: Why the last workers ended before all was done.
+        self.trouble = ""
+        self._at_work: dict[Job, Future[Ending]] = {}
+
+    @abstractmethod
+    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
+        """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
+
+    @abstractmethod
+    def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
+        """Compute jobs each in a process of its own, some at the same time."""
+
+    @abstractmethod
+    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
+        """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of what is kept for jobs."""
+
+    @abstractmethod
+    def _died(self, job: Job, error: Exception) -> Ending:
+        """Return what is known of a job whose worker died."""
+
+    @abstractmethod
+    def _watch(self) -> None:
+        """Look after what is in work, now and then."""
+
+    def _abandon(self) -> None:
+        """Forget what is in work."""
+        self._at_work.clear()
+
+    def _computed(
+        self, jobs: Iterator[Job], start: Callable[[Job, Task], Future[Ending]], at_once: Callable[[], int]
+    ) -> Results:
+        """Keep a number of jobs in work, and yield each with what came of it."""
+        try:
+            yield from self._kept_in_work(jobs, start, at_once)
+        finally:
+            self._abandon()
+
+    def _kept_in_work(
+        self, jobs: Iterator[Job], start: Callable[[Job, Task], Future[Ending]], at_once: Callable[[], int]
+    ) -> Results:
+        while True:
+            while len(self._at_work) < at_once() and (job := next(jobs, None)) is not None:
+                try:
+                    task = Task(job.keys, packed(job))
+                except Exception as error:
+                    yield job, Ending(list(ended(job.keys, error, Limits())))
+                else:
+                    self._at_work[job] = start(job, task)
+            if not self._at_work:
+                return
+            done = wait(self._at_work.values(), TICK, FIRST_COMPLETED).done
+            for job in [job for job, future in self._at_work.items() if future in done]:
+                try:
+                    ending = self._at_work[job].result()
+                except Exception as error:
+                    ending = self._died(job, error)
+                del self._at_work[job]
+                yield job, ending
+            if not done:
+                self._watch()
+                yield None
 
 
 @cache
@@ -267,17 +306,17 @@ def _starting_thread(process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(1, "workers", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
 
 
-class LocalWorkers:
+class LocalWorkers(Workers):
     """Worker processes on this machine; loky keeps them for the next run."""
 
     def __init__(self, count: int, limits: Limits) -> None:
-        self.count, self._limits = count, limits
-        #: Why the last workers ended before all was done.
-        self.trouble = ""
+        super().__init__(limits)
+        self.count = count
         self._folder = TemporaryFolder()
+        self._stop = self._folder.path / _STOP
+        #: A folder of each job, with the record of what its process has begun and finished.
+        self._places: dict[Job, Path] = {}
         self._numbers = itertools.count()
-        #: What is in work, with the folder of each job.
-        self._at_work: dict[Job, tuple[Path, Future[Ending]]] = {}
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
@@ -287,27 +326,20 @@ class LocalWorkers:
         """
         from joblib.externals.loky import get_reusable_executor
 
-        stop, thread = self._folder.path / _STOP, _starting_thread(os.getpid())
-        stop.unlink(missing_ok=True)
+        thread, executor = _starting_thread(os.getpid()), None
+        self._stop.unlink(missing_ok=True)
         self.trouble = ""
         settings = {"timeout": IDLE, "initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
 
-        def begin_nothing_more() -> None:
-            # Without it workers begin what waits for them, which is slower and no worse.
-            with suppress(OSError):
-                stop.touch()
-
-        executor: Any = None
-
-        def submitted(task: Task, folder: Path) -> Future[Ending]:
+        def submitted(task: Task, place: Path) -> Future[Ending]:
             nonlocal executor
             executor = get_reusable_executor(self.count, **settings)
-            future: Future[Ending] = executor.submit(_compute_unless_stopped, task, self._limits, folder)
+            future: Future[Ending] = executor.submit(_compute_unless_stopped, task, self._limits, place)
             return future
 
-        def start(task: Task, folder: Path) -> Future[Ending]:
+        def start(job: Job, task: Task) -> Future[Ending]:
             try:
-                return thread.submit(submitted, task, folder).result()
+                return thread.submit(submitted, task, self._new_place(job)).result()
             except (BrokenExecutor, OSError, MemoryError) as error:
                 # What has been started keeps files open.
                 if executor is not None:
@@ -318,74 +350,60 @@ class LocalWorkers:
 
         def at_once() -> int:
             if stopping():
-                begin_nothing_more()
+                self._begin_nothing_more()
             return 0 if self.trouble else 2 * self.count + 1
 
-        try:
-            yield from self._computed(jobs, start, at_once)
-        finally:
-            begin_nothing_more()
-            self._abandon()
+        return self._computed(jobs, start, at_once)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
         threads = ThreadPoolExecutor(at_once)
 
-        def start(task: Task, folder: Path) -> Future[Ending]:
-            return threads.submit(compute_alone, task, self._limits, folder)
+        def start(job: Job, task: Task) -> Future[Ending]:
+            return threads.submit(compute_alone, task, self._limits, self._new_place(job))
 
         try:
             yield from self._computed(jobs, start, lambda: at_once)
         finally:
-            self._abandon()
             threads.shutdown()
 
-    def _computed(
-        self, jobs: Iterator[Job], start: Callable[[Task, Path], Future[Ending]], at_once: Callable[[], int]
-    ) -> Results:
-        """Compute jobs, each with a folder of its own."""
-
-        def submit(job: Job, task: Task) -> Future[Ending]:
-            folder = self._folder.path / str(next(self._numbers))
-            folder.mkdir()
-            future = start(task, folder)
-            self._at_work[job] = folder, future
-            return future
-
-        for over in in_parallel(jobs, submit, at_once, self._died):
-            if over is None:
-                self._watch()
-            elif over[0] in self._at_work:
-                shutil.rmtree(self._at_work.pop(over[0])[0], ignore_errors=True)
-            yield over
+    def _new_place(self, job: Job) -> Path:
+        """Return a new folder for a job, in place of that of one which is over."""
+        for over in self._places.keys() - self._at_work.keys():
+            shutil.rmtree(self._places.pop(over), ignore_errors=True)
+        self._places[job] = place = self._folder.path / str(next(self._numbers))
+        place.mkdir()
+        return place
 
     def _died(self, job: Job, error: Exception) -> Ending:
         """Return what is known of a job whose worker died."""
         if not isinstance(error, BrokenExecutor | OSError | MemoryError):
             raise error
-        return _remains(self._at_work[job][0] / _RECORD, self._note(error))
+        return _remains(self._places[job] / _RECORD, self._note(error))
 
     def _note(self, error: BaseException) -> str:
         """Note why the workers ended, and return it."""
         self.trouble = str(error).strip().partition("\n")[0] or type(error).__name__
         return self.trouble
 
-    def _records(self) -> Iterator[tuple[Job, Path]]:
-        """Yield the jobs in work, with the record of each."""
-        for job, (folder, _) in self._at_work.items():
-            yield job, folder / _RECORD
-
     def _abandon(self) -> None:
         """Kill what is in work, which would be waited for otherwise, until all has ended."""
-        while not all(future.done() for _, future in self._at_work.values()):
-            for _, record in self._records():
-                _kill(record)
+        self._begin_nothing_more()
+        while not all(future.done() for future in self._at_work.values()):
+            for job in self._at_work:
+                _kill(self._places[job] / _RECORD)
             time.sleep(TICK)
-        self._at_work.clear()
+        super()._abandon()
+
+    def _begin_nothing_more(self) -> None:
+        # Without the file workers begin what waits for them, which is slower and no worse.
+        with suppress(OSError):
+            self._stop.touch()
 
     def _seconds(self) -> Iterator[tuple[Job, Path, float]]:
         """Yield each job in work, its record, and for how long its estimate has been in work [s]."""
-        for job, record in self._records():
+        for job in self._at_work:
+            record = self._places[job] / _RECORD
             with suppress(OSError):
                 yield job, record, time.time() - record.stat().st_mtime
 
