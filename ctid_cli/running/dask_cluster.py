@@ -159,7 +159,5 @@ def _require_same(expected: bytes) -> None:
     who = f"worker {worker.address} on {platform.node()}"
     if worker.state.nthreads != 1:
         raise RefusedError(f"{who} has {worker.state.nthreads} threads; start it with --nthreads 1")
-    pairs = origin_differences(ours, origin_of(*parts))
-    if pairs:
-        differences = "; ".join(f"{name} {here} here, {there} there" for name, here, there in pairs)
+    if differences := origin_differences(ours, origin_of(*parts), "here", "there"):
         raise RefusedError(f"{who} is of other code or arithmetic ({differences})")

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctid_cli.arrays import BoolArray
-from ctid_cli.errors import MachineError, RefusedError, StorageError
+from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
@@ -184,7 +184,7 @@ def run_experiment(
         stack.callback(workers.close)
         stack.enter_context(stopping)
         moved = place.move_aside(folder) if fresh else None
-        with _writing(folder):
+        with place.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
         # Another run may have come between.
@@ -226,7 +226,7 @@ class _Run:
     def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
         """Note the beginning of the run, and say what it has to do."""
         spec = self.plan.spec
-        with _writing(self.folder):
+        with place.writing(self.folder):
             self.log.write_beside(place.SPEC, spec.text.encode())
             self.log.write_beside(place.CANONICAL, canonical_text(spec.canonical()).encode())
         info = session_info(spec.text, spec.folder) | circumstances
@@ -384,12 +384,3 @@ def _found(plan: Plan, log: JournalReader | None, retry: Collection[str], limits
         at_most=plan.monte_carlo.get("at_most"),
     )
     return _Found(plan, states, missing, work, None if log is None else log.state())
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise StorageError(f"{folder} cannot be written ({reason}); stored estimates are untouched") from error

@@ -125,7 +125,7 @@ def check_free(
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
-    differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in origin_differences(other, origin))
+    differences = origin_differences(other, origin, "then", "now")
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
 
@@ -159,6 +159,16 @@ def _opened(folder: Path, stack: ExitStack) -> tuple[JournalReader | None] | Non
             return None
         stack.push(tried.pop_all())
         return (log,)
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Say of what cannot be written in a folder that nothing is lost."""
+    try:
+        yield
+    except OSError as error:
+        what = f"{error.filename or folder} cannot be written ({error.strerror or error})"
+        raise StorageError(f"{what}; stored estimates are untouched, and the same command goes on") from error
 
 
 @contextmanager
