@@ -96,13 +96,8 @@ def _wait(folder: Path, deadline: float) -> None:
     time.sleep(0.05)
 
 
-def check_free(
-    folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool, known: str | None = None
-) -> None:
-    """Refuse a folder, whose lock this process holds, if this run must not add to its results.
-
-    A journal in the state that is known was checked before.
-    """
+def check_free(folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool) -> None:
+    """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
     experiment = manifest["experiment"]
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
@@ -111,8 +106,6 @@ def check_free(
                 raise RefusedError(
                     f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
                 )
-            return
-        if known is not None and log.state() == known:
             return
         log.check()
         if log.experiment() != experiment:

@@ -137,11 +137,6 @@ class JournalReader:
         """Return SHA-256 of ``runs.h5``; None if estimates or another plan came after it."""
         return self._meta(_EXPORTED)
 
-    def state(self) -> str | None:
-        """Return what changes with every run that writes; None before the first one."""
-        rows = self._rows("SELECT id, stopped FROM sessions ORDER BY rowid DESC LIMIT 1")
-        return str(rows[0]) if rows else None
-
     def sessions(self) -> list[Session]:
         """Return every run that has written here, the oldest first."""
         return self._sessions("ORDER BY rowid")
