@@ -30,10 +30,11 @@ from ctid_cli.storage.sqlite_file import (
     APPLICATION,
     ERRORS,
     FORMAT,
-    Places,
+    places_of,
     readable,
     refuse,
     require_journal,
+    require_places,
     require_whole,
     set_up,
 )
@@ -265,8 +266,8 @@ class Journal(JournalReader):
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         super().__init__(connection, path)
-        #: None until its tables are there.
-        self.places: Places | None = None
+        #: Its folder and files as they were when it was opened; empty until its tables are there.
+        self.places: dict[Path, tuple[int, int] | None] = {}
 
     def write_beside(self, name: str, data: bytes) -> None:
         """Write a file beside the journal, if it is not there already."""
@@ -325,15 +326,12 @@ class Journal(JournalReader):
 
     def require_in_place(self) -> None:
         """Refuse to go on in a file that its path does not lead to any more."""
-        if self.places is not None:
-            self.places.require()
+        require_places(self.places)
 
     def close(self) -> None:
         """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
         with suppress(sqlite3.Error):
             self._connection.close()
-        if self.places is not None:
-            self.places.close()
 
     def _insert(self, table: str, *row: Any) -> None:
         """Store a row and its checksum, in place of one with the same key."""
@@ -367,7 +365,7 @@ def open_journal(path: Path) -> Journal:
                 with log.transaction():
                     for statement in _SCHEMA:
                         connection.execute(statement)
-            log.places = Places(path)
+            log.places = places_of(path)
         except (OSError, *ERRORS) as error:
             refuse(path, error, writing=True)
         stack.pop_all()
