@@ -26,7 +26,7 @@ from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.job import MEASURE, with_measures
+from ctid_cli.running.job import measured
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
 from ctid_cli.running.workers import call_alone
@@ -268,17 +268,15 @@ def _fit(
     path: KeyPath = ("estimators", candidate.name, "kind")
     terms = structure(setting.source, estimators)
 
-    def fit() -> dict[str, Any]:
+    def fit() -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
         start = candidate.start.draw(getattr(setting.source, "seed", 0), 0, data.true_model)
         fitted = candidate.estimator.prepare(data.record).fit(start)
-        row = plain(data.result_of(fitted, start, terms))
-        return with_measures(row, setting.measures, fitted, data, Limits())
+        return plain(data.result_of(fitted, start, terms)), *measured(setting.measures, fitted, data, Limits())
 
     try:
-        first, second = _twice(fit)
-        one, other = (row.pop("custom_measures") or {} for row in (first, second))
+        (first, values, reasons), (second, others, _) = _twice(fit)
         text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
-        found.wrong.extend((("measures", name), text) for name in one if one[name] != other[name])
+        found.wrong.extend((("measures", name), text) for name in values if values[name] != others[name])
         if canonical_json(first) != canonical_json(second):
             raise ComponentError(text)
     except ComponentError as error:
@@ -290,18 +288,11 @@ def _fit(
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
         found.odd.append((path, text))
     else:
-        found.odd.extend(_without_measures(candidate.name, first["message"]))
+        for name, why in reasons.items():
+            text = f"fails on the first data set, with the estimator {candidate.name!r}: {why}"
+            found.odd.append((("measures", name), f"{text}; such estimates are stored without it"))
         if first["status"] not in FAILURES and candidate.is_custom:
             found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
-
-
-def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
-    """Say which custom measures raised an exception, which the message of the estimate tells."""
-    for line in message.splitlines():
-        name, colon, why = line.removeprefix(MEASURE).partition(": ")
-        if line.startswith(MEASURE) and colon:
-            text = f"fails on the first data set, with the estimator {estimator!r}: {why}"
-            yield ("measures", name), f"{text}; such estimates are stored without it"
 
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:
