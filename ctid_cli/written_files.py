@@ -4,10 +4,9 @@ import itertools
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import TypeVar
 
 #: What else lies in the folder of an experiment; experiments lie in folders too, and must not be called like this.
 TAKEN = (
@@ -20,36 +19,22 @@ EXPERIMENT = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9]
 _DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECASE)
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 _TEMPORARY = ".tmp"
-Answer = TypeVar("Answer")
 _numbers = itertools.count(1)
 
 
-def write_file(path: Path, data: bytes | Iterable[bytes]) -> None:
+def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
     """Replace a file in one go: readers, and a crash or a full disk at any moment, find the old or the new content."""
-    replace_file(path, lambda temporary: _write(temporary, data))
-
-
-def _write(path: Path, data: bytes | Iterable[bytes]) -> None:
-    with path.open("wb") as file:
-        for part in [data] if isinstance(data, bytes) else data:
-            file.write(part)
-        file.flush()
-        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            os.fsync(file.fileno())
-
-
-def replace_file(path: Path, write: Callable[[Path], Answer]) -> Answer:
-    """The same with what a function writes to a path, and synchronises; returns what it returns."""
     # A link stays one, and what is no file, such as /dev/stdout, is written to.
     path = Path(os.path.realpath(path))
     before = path.stat().st_mode if path.exists() else None
     if before is not None and not stat.S_ISREG(before):
-        return write(path)
+        _write(path, data)
+        return
     temporary = path.with_name(f".{path.name[:40]}-{os.getpid()}-{next(_numbers)}{_TEMPORARY}")
     try:
         # Nobody else's file is written to.
         temporary.touch(exist_ok=False)
-        answer = write(temporary)
+        _write(temporary, data)
         if before is not None:
             temporary.chmod(stat.S_IMODE(before))
         temporary.replace(path)
@@ -63,7 +48,15 @@ def replace_file(path: Path, write: Callable[[Path], Answer]) -> Answer:
     finally:
         with suppress(OSError):
             os.close(descriptor)
-    return answer
+
+
+def _write(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
+    with path.open("wb") as file:
+        for part in [data] if isinstance(data, bytes | memoryview) else data:
+            file.write(part)
+        file.flush()
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            os.fsync(file.fileno())
 
 
 def is_leftover(name: str) -> bool:

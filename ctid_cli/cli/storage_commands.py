@@ -32,7 +32,7 @@ def merge(
         lines = [f"{text} ({merged.new} new, from {merged.sources} folders)"]
         if merged.mixed:
             lines.append("  they mix code versions or processors, which tables will say")
-        lines += [f"  {sentence}" for sentence in merged.missing]
+        lines += [f"  {merged.missing}"] if merged.missing else []
         lines.append(f"  next: ctid table {merged.experiment}{out_option(out)}")
         typer.echo("\n".join(lines))
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctid_cli.arrays import BoolArray
-from ctid_cli.errors import MachineError, RefusedError, StorageError
+from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
@@ -25,7 +25,7 @@ from ctid_cli.running.precision import as_needed, stored_precisions
 from ctid_cli.running.states import States
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopRequest
 from ctid_cli.running.suspects import NAMED, Course
-from ctid_cli.running.workers import LocalWorkers
+from ctid_cli.running.workers import LocalWorkers, Workers
 from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
@@ -169,12 +169,8 @@ def run_experiment(
     stopping = stop or StopRequest()
     origin, limits = current_origin(plan), Limits.of(plan.spec.canonical())
     limits.require_support()
-    found = _look(plan, folder, origin, retry, limits, fresh=fresh, allow_mixed=allow_mixed)
-    if found.work.estimates:
-        # Until workers are at work, a signal ends the process as it ends any other.
-        warm(plan)
     with ExitStack() as stack:
-        workers: Any
+        workers: Workers
         if dask is None:
             workers = LocalWorkers(jobs or usable_processors(), limits)
         else:
@@ -182,13 +178,11 @@ def run_experiment(
 
             workers = DaskWorkers(dask, plan, origin, limits)
         stack.callback(workers.close)
-        stack.enter_context(stopping)
         moved = place.move_aside(folder) if fresh else None
-        with _writing(folder):
+        with place.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
-        # Another run may have come between.
-        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed, known=found.state)
+        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
         place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
@@ -196,8 +190,11 @@ def run_experiment(
         kept = ""
         if moved is not None and keep_readable:
             kept = f"{keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)}"
-        if found.state is None or log.state() != found.state:
-            found = _found(plan, log, retry, limits)
+        found = _found(plan, log, retry, limits)
+        if found.work.estimates:
+            # Until workers are at work, a signal ends the process as it ends any other.
+            warm(plan)
+        stack.enter_context(stopping)
         run = _Run(found, folder, log, progress)
         stack.callback(announcement.retract, folder)
         run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
@@ -211,7 +208,7 @@ class _Run:
     """One run, from the first entry in the journal to ``runs.h5``."""
 
     def __init__(self, found: _Found, folder: Path, log: Journal, progress: Callable[[Progress], object]) -> None:
-        self.plan, self.states, self.missing, self.work, _ = found
+        self.plan, self.states, self.missing, self.work = found
         self.folder, self.log, self.progress = folder, log, progress
         self.computed = self.done = self.failures = 0
         self.total = self.work.data_sets
@@ -226,7 +223,7 @@ class _Run:
     def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
         """Note the beginning of the run, and say what it has to do."""
         spec = self.plan.spec
-        with _writing(self.folder):
+        with place.writing(self.folder):
             self.log.write_beside(place.SPEC, spec.text.encode())
             self.log.write_beside(place.CANONICAL, canonical_text(spec.canonical()).encode())
         info = session_info(spec.text, spec.folder) | circumstances
@@ -248,7 +245,7 @@ class _Run:
         self._tell(precision=self.precision)
         return True
 
-    def compute(self, workers: Any, limits: Limits, stopping: StopRequest) -> None:
+    def compute(self, workers: Workers, limits: Limits, stopping: StopRequest) -> None:
         """Compute what is missing: store it and tell of it, in whichever order it comes."""
         batch: list[Outcome] = []
         since = time.monotonic()
@@ -336,7 +333,12 @@ def preview(
 ) -> Workload:
     """Return what a run would do, without doing or writing anything."""
     limits = Limits.of(plan.spec.canonical())
-    return _look(plan, folder, current_origin(plan), retry, limits, fresh=fresh, allow_mixed=allow_mixed).work
+    if fresh or not folder.exists():
+        return _found(plan, None, retry, limits).work
+    with place.lock(folder, shared=True):
+        place.check_free(folder, plan.manifest(), current_origin(plan), allow_mixed=allow_mixed)
+        with place.reading_journal(folder) as log:
+            return _found(plan, log, retry, limits).work
 
 
 class _Found(NamedTuple):
@@ -347,27 +349,6 @@ class _Found(NamedTuple):
     #: Of each data cell which replicates are to be computed.
     missing: list[BoolArray]
     work: Workload
-    #: State of the journal that tells it.
-    state: str | None = None
-
-
-def _look(
-    plan: Plan,
-    folder: Path,
-    origin: Origin,
-    retry: Collection[str],
-    limits: Limits,
-    *,
-    fresh: bool,
-    allow_mixed: bool,
-) -> _Found:
-    """Read what there is in a folder that a plan may be run into."""
-    if fresh or not folder.exists():
-        return _found(plan, None, retry, limits)
-    with place.lock(folder, shared=True):
-        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
-        with place.reading_journal(folder) as log:
-            return _found(plan, log, retry, limits)
 
 
 def _found(plan: Plan, log: JournalReader | None, retry: Collection[str], limits: Limits) -> _Found:
@@ -383,13 +364,4 @@ def _found(plan: Plan, log: JournalReader | None, retry: Collection[str], limits
         left_aside=states.stored - counts.reused - counts.again,
         at_most=plan.monte_carlo.get("at_most"),
     )
-    return _Found(plan, states, missing, work, None if log is None else log.state())
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or error
-        raise StorageError(f"{folder} cannot be written ({reason}); stored estimates are untouched") from error
+    return _Found(plan, states, missing, work)

@@ -10,7 +10,7 @@ import os
 import re
 import time
 import traceback
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 #: Frames of a traceback that are kept, the innermost ones, and characters of a message.
 TRACEBACK_FRAMES = 6
 MESSAGE_LENGTH = 2000
-#: Begins the line of a message that says why a custom measure has no value.
-MEASURE = "Measure "
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,9 @@ def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Lim
             fit = prepared.fit(drawn)
             clocks = (preparing + _clocks() - begun).tolist()
             result = no_result() | plain(data.result_of(fit, drawn, job.terms))
-            result = with_measures(result, job.cell.measures, fit, data, limits)
+            values, reasons = measured(job.cell.measures, fit, data, limits)
+            lines = [result["message"], *(f"Measure {name}: {why}" for name, why in reasons.items())]
+            result |= {"custom_measures": values or None, "message": "\n".join(lines)}
             # What cannot be stored is not a result.
             canonical_json(result).encode()
         except BaseException as error:
@@ -156,14 +156,14 @@ def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Lim
             yield Outcome(key, result, *clocks)
 
 
-def with_measures(
-    result: Mapping[str, Any], measures: Iterable[tuple[str, Measure]], fit: Any, data: Any, limits: Limits
-) -> dict[str, Any]:
-    """Return a result with the values of custom measures; why one has none is added to the message."""
+def measured(
+    measures: Iterable[tuple[str, Measure]], fit: Any, data: Any, limits: Limits
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return values of custom measures, and why some have none, by their names."""
     from ctid_cli.simulation.components import value_of
 
     values: dict[str, Any] = {}
-    reasons = []
+    reasons: dict[str, str] = {}
     for name, measure in measures:
         try:
             values[name] = plain(value_of(measure, fit, data))
@@ -172,8 +172,8 @@ def with_measures(
             if lacking is not None and not (isinstance(lacking, MemoryError) and limits.memory_mb is not None):
                 raise
             values[name] = None
-            reasons.append(f"{MEASURE}{name}: {_repeatable(_readable(reason(error)))}")
-    return {**result, "custom_measures": values or None, "message": "\n".join([result["message"], *reasons])}
+            reasons[name] = _repeatable(_readable(reason(error)))
+    return values, reasons
 
 
 def ended(keys: Collection[Key], error: BaseException, limits: Limits) -> Iterator[Outcome | Short]:

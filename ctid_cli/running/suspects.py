@@ -14,18 +14,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from typing import TYPE_CHECKING
 
 from ctid_cli.running.job import Job, Short
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.workers import Ending
+from ctid_cli.running.workers import Ending, Workers
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.text import count
-
-if TYPE_CHECKING:
-    from ctid_cli.running.dask_cluster import DaskWorkers
-    from ctid_cli.running.workers import LocalWorkers
 
 #: After this number of rounds without a finished estimate the run ends; before each next round it waits in proportion
 #: to their number [s]. A round ends early when the machine was short of something this often.
@@ -47,7 +42,7 @@ class Course:
     def __init__(
         self,
         jobs: Iterator[Job],
-        workers: LocalWorkers | DaskWorkers,
+        workers: Workers,
         limits: Limits,
         stopping: Callable[[], bool],
         tell: Callable[[str], object],

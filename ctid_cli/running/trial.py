@@ -12,6 +12,7 @@ import itertools
 import random
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -25,7 +26,7 @@ from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.job import MEASURE, with_measures
+from ctid_cli.running.job import measured
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
 from ctid_cli.running.workers import call_alone
@@ -49,6 +50,8 @@ MAX_TRIAL_SAMPLES = 20_000_000
 MAX_SECONDS = 30.0
 #: Wall time that the process of custom components may take where there is no limit [s].
 PATIENCE = 600.0
+#: The data sets among what is tried; no estimator has an empty name.
+_DATA = ""
 #: Errors of a program, which no other data set would mend.
 MISTAKES = (NameError, AttributeError, TypeError, ImportError)
 #: What depends on the state of the global generators is another thing each time that it is computed.
@@ -103,21 +106,16 @@ class Found:
 def try_out(spec: Spec) -> Found:
     """Try the settings and estimators of a specification; sections that have mistakes are not in it."""
     settings, candidates = _settings(spec), list(_candidates(spec))
-    if not settings:
-        return Found()
-    custom = [candidate for candidate in candidates if candidate.is_custom]
-    own = [candidate for candidate in candidates if candidate not in custom]
-    all_apart = bool(spec.custom_measures) or any(_custom_parts(setting.source) for setting in settings)
     success = {} if spec.success is None else spec.success.model_dump()
-    found = Found() if all_apart else _try_all(settings, own, success)
-    if all_apart or custom:
-        limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
-        given = (settings, candidates) if all_apart else (settings[:1], custom)
-        # What ends its process, or cannot be sent to one, is left to the run.
-        with TemporaryFolder() as folder, suppress(Exception):
-            more = call_alone(folder, _try_under_limits, limits, folder / "late", *given, success)[0]
-            found = found if more is None else Found(found.wrong + more.wrong, found.odd + more.odd)
-    return found
+    custom_data = any(_custom_parts(setting.source) for setting in settings)
+    if not (custom_data or spec.custom_measures or any(candidate.is_custom for candidate in candidates)):
+        return _try_all(settings, candidates, success)
+    limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
+    found = None
+    # What ends its process, or cannot be sent to one, is left to the run.
+    with TemporaryFolder() as folder, suppress(Exception):
+        found = call_alone(folder, _try_under_limits, limits, folder / "late", settings, candidates, success)[0]
+    return found or Found()
 
 
 def _settings(spec: Spec) -> list[Setting]:
@@ -177,29 +175,28 @@ def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
 def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
     """Make the first data set of each setting, and prepare every estimator on it."""
     found, end = Found(), time.monotonic() + MAX_SECONDS
-    failures: list[Failure] = []
-    tried: list[Mapping[KeyPath, Any]] = []
-    of_estimators: dict[str, tuple[list[Failure], list[Mapping[KeyPath, Any]]]] = {}
+    #: What is wrong with the data, and with each estimator by its name, and the swept values that were tried.
+    failures: dict[str, list[Failure]] = defaultdict(list)
+    tried: dict[str, list[Mapping[KeyPath, Any]]] = defaultdict(list)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         for setting in settings:
             if tried and time.monotonic() > end:
                 break
+            first = not tried
             data, complaints = _first_data(setting.source)
-            failures += [(path, text, setting.swept) for path, text in complaints]
+            tried[_DATA].append(setting.swept)
+            failures[_DATA] += [(path, text, setting.swept) for path, text in complaints]
             for candidate in candidates if data is not None else ():
-                custom, complaints = candidate.is_custom, []
-                if not custom:
-                    its_failures, its_tried = of_estimators.setdefault(candidate.name, ([], []))
-                    its_tried.append({**setting.swept, **candidate.swept})
-                    complaints = list(_prepared(candidate, data))
-                    its_failures += [(path, text, its_tried[-1]) for path, text in complaints]
-                if (custom or setting.measures) and not (tried or failures or complaints):
+                name, swept, unusable = candidate.name, {**setting.swept, **candidate.swept}, ""
+                if not candidate.is_custom:
+                    unusable = _unusable(candidate.estimator, data)
+                    tried[name].append(swept)
+                    failures[name] += [(("estimators", name), unusable, swept)] if unusable else []
+                if first and not unusable and (candidate.is_custom or setting.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
-            tried.append(setting.swept)
-    found.wrong.extend(grouped(failures, tried))
-    for its_failures, its_tried in of_estimators.values():
-        found.wrong.extend(grouped(its_failures, its_tried))
+    for subject, some in failures.items():
+        found.wrong.extend(grouped(some, tried[subject]))
     return found
 
 
@@ -248,13 +245,15 @@ def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
     return results[0], results[-1]
 
 
-def _prepared(candidate: Candidate, data: Any) -> Iterator[Complaint]:
-    """Say why an estimator cannot use a record at all."""
-    with suppress(Exception):  # of which a run says more: it is stored with every estimate
-        try:
-            candidate.estimator.prepare(data.record)
-        except DataError as error:
-            yield ("estimators", candidate.name), str(error)
+def _unusable(estimator: Any, data: Any) -> str:
+    """Say why an estimator cannot use a record at all; empty where it can."""
+    try:
+        estimator.prepare(data.record)
+    except DataError as error:
+        return str(error)
+    except Exception:  # of which a run says more: it is stored with every estimate
+        return ""
+    return ""
 
 
 def _fit(
@@ -269,17 +268,15 @@ def _fit(
     path: KeyPath = ("estimators", candidate.name, "kind")
     terms = structure(setting.source, estimators)
 
-    def fit() -> dict[str, Any]:
+    def fit() -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
         start = candidate.start.draw(getattr(setting.source, "seed", 0), 0, data.true_model)
         fitted = candidate.estimator.prepare(data.record).fit(start)
-        row = plain(data.result_of(fitted, start, terms))
-        return with_measures(row, setting.measures, fitted, data, Limits())
+        return plain(data.result_of(fitted, start, terms)), *measured(setting.measures, fitted, data, Limits())
 
     try:
-        first, second = _twice(fit)
-        one, other = (row.pop("custom_measures") or {} for row in (first, second))
+        (first, values, reasons), (second, others, _) = _twice(fit)
         text = f"{GLOBAL} numpy.random.default_rng(seed), with seed among its options"
-        found.wrong.extend((("measures", name), text) for name in one if one[name] != other[name])
+        found.wrong.extend((("measures", name), text) for name in values if values[name] != others[name])
         if canonical_json(first) != canonical_json(second):
             raise ComponentError(text)
     except ComponentError as error:
@@ -291,18 +288,11 @@ def _fit(
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
         found.odd.append((path, text))
     else:
-        found.odd.extend(_without_measures(candidate.name, first["message"]))
+        for name, why in reasons.items():
+            text = f"fails on the first data set, with the estimator {candidate.name!r}: {why}"
+            found.odd.append((("measures", name), f"{text}; such estimates are stored without it"))
         if first["status"] not in FAILURES and candidate.is_custom:
             found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
-
-
-def _without_measures(estimator: str, message: str) -> Iterator[Complaint]:
-    """Say which custom measures raised an exception, which the message of the estimate tells."""
-    for line in message.splitlines():
-        name, colon, why = line.removeprefix(MEASURE).partition(": ")
-        if line.startswith(MEASURE) and colon:
-            text = f"fails on the first data set, with the estimator {estimator!r}: {why}"
-            yield ("measures", name), f"{text}; such estimates are stored without it"
 
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:

@@ -1,15 +1,13 @@
 """``runs.h5``: every estimate that a plan asks for, in columns, with all that is needed to redo them.
 
 The bytes of the file depend on the results alone: rows are in the order of the specification, and times, hosts and runs
-are not in it. It is written from the journal, some rows at a time, synchronised and renamed; the journal keeps its
+are not in it. It is made from the journal in memory, some rows at a time, and written in one go; the journal keeps its
 SHA-256. Where there is no journal, HDF5's own checksums tell whether it is whole.
 """
 
-import errno
 import hashlib
 import io
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import islice
@@ -49,7 +47,7 @@ from ctid_cli.storage.manifest import (
     swept_names,
 )
 from ctid_cli.storage.sqlite_file import EXPORT, require_format
-from ctid_cli.written_files import replace_file
+from ctid_cli.written_files import write_file
 
 KIND, FORMAT = "ctid runs", 2
 #: A file format whose metadata have checksums too.
@@ -71,74 +69,42 @@ def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
     path, noted = folder / EXPORT, log.exported()
     if noted is not None and sha256_of(path) == noted:
         return open_export(path).count, noted
-    manifest = log.manifest()
+    count, image = _exported(log)
     try:
-        count = replace_file(path, lambda temporary: _write_file(temporary, manifest, log))
-        sha256 = sha256_of(path)
+        write_file(path, image.getbuffer())
     except OSError as error:
         log.require_in_place()
         reason = f"{path} could not be written ({error.strerror or error})"
         safe = f"all {log.count()} estimates are safe in {log.path}"
         raise StorageError(f"{reason}; {safe}. Make room and run the same command again") from error
-    assert sha256 is not None
+    sha256 = hashlib.sha256(image.getbuffer()).hexdigest()
     log.note_export(sha256)
     return count, sha256
 
 
-def _write_file(path: Path, manifest: Manifest, log: JournalReader) -> int:
-    with _Recorder(path, "w+") as file:
-        count = write_export(file, manifest, *_of_journal(log, manifest))
-        if file.error is not None:
-            raise file.error
-        os.fsync(file.fileno())
-    return count
-
-
 def export_in_memory(log: JournalReader) -> "Export":
     """Return what would be exported of a journal's plan now."""
-    manifest, image = log.manifest(), io.BytesIO()
-    write_export(image, manifest, *_of_journal(log, manifest))
-    return Export(h5py.File(image, "r"), log.path)
+    return Export(h5py.File(_exported(log)[1], "r"), log.path)
 
 
-def _of_journal(log: JournalReader, manifest: Manifest) -> tuple[Callable[[], Sequence[Origin]], Results]:
-    """Yield where the estimates of a plan come from, to ask when all of them were read, and these."""
-    sessions: set[str] = set()
+def _exported(log: JournalReader) -> tuple[int, io.BytesIO]:
+    """Return the number of the estimates of a journal's plan, and the bytes of ``runs.h5``.
+
+    HDF5 reports a full disk in many ways, or not at all; so it writes to memory, about 100 bytes for each estimate.
+    """
+    manifest, image, sessions = log.manifest(), io.BytesIO(), set[str]()
 
     def results() -> Iterator[tuple[Slot, Mapping[str, Any]]]:
         for slot, row in log.planned_rows(manifest):
             sessions.add(row.session)
             yield slot, from_json(row.result)
 
-    return lambda: log.origins_of(sessions), results
+    return write_export(image, manifest, lambda: log.origins_of(sessions), results), image
 
 
-class _Recorder(io.FileIO):
-    """A file for HDF5, to which all writing seems to succeed: HDF5 reports a full disk in many ways, or not at all."""
-
-    error: OSError | None = None
-
-    def write(self, data: Any) -> int:
-        """Write, unless writing has failed before."""
-        left = memoryview(data).cast("B")
-        try:
-            while left and self.error is None:
-                left = left[super().write(left) :]
-        except OSError as error:
-            self.error = error
-        return len(data)
-
-    def truncate(self, size: int | None = None) -> int:
-        """Cut the file, unless writing has failed before."""
-        try:
-            if self.error is None:
-                super().truncate(size)
-        except OSError as error:
-            self.error = error
-        return size or 0
-
-
-def write_export(target: Any, manifest: Manifest, origins: Callable[[], Sequence[Origin]], results: Results) -> int:
+def write_export(
+    image: io.BytesIO, manifest: Manifest, origins: Callable[[], Sequence[Origin]], results: Results
+) -> int:
     """Write the file of some estimates; returns their number."""
     stored = _stored_columns(manifest)
     writers, count = [ColumnWriter(column) for column in stored], 0
@@ -147,19 +113,14 @@ def write_export(target: Any, manifest: Manifest, origins: Callable[[], Sequence
         count += len(rows)
         for writer in measured:
             writer.include(rows)
-    try:
-        with h5py.File(target, "w", libver=_VERSION) as file:
-            _write_plan(file, manifest, origins())
-            group = file.create_group("estimates")
+    with h5py.File(image, "w", libver=_VERSION) as file:
+        _write_plan(file, manifest, origins())
+        group = file.create_group("estimates")
+        for writer in writers:
+            writer.create(group, count)
+        for number, rows in enumerate(_rows(results(), manifest, stored, ROWS)):
             for writer in writers:
-                writer.create(group, count)
-            for number, rows in enumerate(_rows(results(), manifest, stored, ROWS)):
-                for writer in writers:
-                    writer.write(number * ROWS, rows)
-    except (OSError, RuntimeError) as error:
-        if isinstance(target, _Recorder) and target.error is not None:
-            raise target.error from error
-        raise OSError(errno.EIO, str(error)) from error
+                writer.write(number * ROWS, rows)
     return count
 
 

@@ -96,13 +96,8 @@ def _wait(folder: Path, deadline: float) -> None:
     time.sleep(0.05)
 
 
-def check_free(
-    folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool, known: str | None = None
-) -> None:
-    """Refuse a folder, whose lock this process holds, if this run must not add to its results.
-
-    A journal in the state that is known was checked before.
-    """
+def check_free(folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool) -> None:
+    """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
     experiment = manifest["experiment"]
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
@@ -111,8 +106,6 @@ def check_free(
                 raise RefusedError(
                     f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
                 )
-            return
-        if known is not None and log.state() == known:
             return
         log.check()
         if log.experiment() != experiment:
@@ -125,7 +118,7 @@ def check_free(
 
 
 def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
-    differences = "; ".join(f"{name} {old} then, {new} now" for name, old, new in origin_differences(other, origin))
+    differences = origin_differences(other, origin, "then", "now")
     ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
     return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
 
@@ -159,6 +152,16 @@ def _opened(folder: Path, stack: ExitStack) -> tuple[JournalReader | None] | Non
             return None
         stack.push(tried.pop_all())
         return (log,)
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Say of what cannot be written in a folder that nothing is lost."""
+    try:
+        yield
+    except OSError as error:
+        what = f"{error.filename or folder} cannot be written ({error.strerror or error})"
+        raise StorageError(f"{what}; stored estimates are untouched, and the same command goes on") from error
 
 
 @contextmanager

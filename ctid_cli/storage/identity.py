@@ -66,13 +66,13 @@ def origin_of(*options: Any) -> Origin:
     return Origin(code_version(set().union(*map(modules_of, options))), numeric_platform(), packages)
 
 
-def origin_differences(one: Origin, other: Origin) -> list[tuple[str, str | None, str | None]]:
-    """Return what of two origins differs: its name, and what it is of each."""
+def origin_differences(one: Origin, other: Origin, of_one: str, of_other: str) -> str:
+    """Return in words what of two origins differs; empty where they are the same."""
     left, right = dict(one.packages), dict(other.packages)
     pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
     pairs += [(name, left.get(name), right.get(name)) for name in left | right]
     pairs += [("numeric platform", repr(one.platform), repr(other.platform))]
-    return [pair for pair in pairs if pair[1] != pair[2]]
+    return "; ".join(f"{name} {mine} {of_one}, {its} {of_other}" for name, mine, its in pairs if mine != its)
 
 
 def code_version(modules: Iterable[str] = (), root: Path = ROOT) -> str:

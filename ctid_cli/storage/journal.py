@@ -15,7 +15,7 @@ import math
 import sqlite3
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
@@ -30,10 +30,11 @@ from ctid_cli.storage.sqlite_file import (
     APPLICATION,
     ERRORS,
     FORMAT,
-    Places,
+    places_of,
     readable,
     refuse,
     require_journal,
+    require_places,
     require_whole,
     set_up,
 )
@@ -137,11 +138,6 @@ class JournalReader:
         """Return SHA-256 of ``runs.h5``; None if estimates or another plan came after it."""
         return self._meta(_EXPORTED)
 
-    def state(self) -> str | None:
-        """Return what changes with every run that writes; None before the first one."""
-        rows = self._rows("SELECT id, stopped FROM sessions ORDER BY rowid DESC LIMIT 1")
-        return str(rows[0]) if rows else None
-
     def sessions(self) -> list[Session]:
         """Return every run that has written here, the oldest first."""
         return self._sessions("ORDER BY rowid")
@@ -189,24 +185,31 @@ class JournalReader:
         self.require_count()
         yield from self._selected("")
 
-    def require_count(self) -> None:
-        """Refuse a file that lacks estimates which were written, or which a killed run has reported."""
+    def require_count(self) -> int:
+        """Return how many estimates are stored; fewer than were written, or than a killed run reported, are refused."""
         written, there = int(self._meta(_COUNT) or 0), self.count()
         # What a run reports while this is read can be more than there was when reading began.
         written = written if self.live else max(written, reported(self.path.parent))
         if written != there:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
+        return there
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
         """Yield the stored estimates that a plan asks for, in its order."""
         for estimator, cell, replicates in planned_parts(manifest):
-            order = {start: number for number, start in enumerate(estimator["starts"])}
-            wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
-            found = self._selected("WHERE data_hash = ? AND estimator_hash = ?", cell["hash"], estimator["hash"])
-            for replicate, rows in groupby(found, key=lambda row: row.replicate):
-                if replicate in wanted:
-                    for row in sorted((row for row in rows if row.start in order), key=lambda row: order[row.start]):
-                        yield Slot(row.key, cell, estimator), row
+            for row in self.rows_of(estimator, cell, replicates):
+                yield Slot(row.key, cell, estimator), row
+
+    def rows_of(
+        self, estimator: Mapping[str, Any], cell: Mapping[str, Any], replicates: Sequence[int]
+    ) -> Iterator[Row]:
+        """Yield the stored estimates of a planned estimator on some data sets of a data cell, in their order."""
+        order = {start: number for number, start in enumerate(estimator["starts"])}
+        wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
+        found = self._selected("WHERE data_hash = ? AND estimator_hash = ?", cell["hash"], estimator["hash"])
+        for replicate, rows in groupby(found, key=lambda row: row.replicate):
+            if replicate in wanted:
+                yield from sorted((row for row in rows if row.start in order), key=lambda row: order[row.start])
 
     def row(self, key: Key) -> Row | None:
         """Return a stored estimate."""
@@ -263,8 +266,8 @@ class Journal(JournalReader):
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         super().__init__(connection, path)
-        #: None until its tables are there.
-        self.places: Places | None = None
+        #: Its folder and files as they were when it was opened; empty until its tables are there.
+        self.places: dict[Path, tuple[int, int] | None] = {}
 
     def write_beside(self, name: str, data: bytes) -> None:
         """Write a file beside the journal, if it is not there already."""
@@ -323,15 +326,12 @@ class Journal(JournalReader):
 
     def require_in_place(self) -> None:
         """Refuse to go on in a file that its path does not lead to any more."""
-        if self.places is not None:
-            self.places.require()
+        require_places(self.places)
 
     def close(self) -> None:
         """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
         with suppress(sqlite3.Error):
             self._connection.close()
-        if self.places is not None:
-            self.places.close()
 
     def _insert(self, table: str, *row: Any) -> None:
         """Store a row and its checksum, in place of one with the same key."""
@@ -365,7 +365,7 @@ def open_journal(path: Path) -> Journal:
                 with log.transaction():
                     for statement in _SCHEMA:
                         connection.execute(statement)
-            log.places = Places(path)
+            log.places = places_of(path)
         except (OSError, *ERRORS) as error:
             refuse(path, error, writing=True)
         stack.pop_all()

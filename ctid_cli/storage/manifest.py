@@ -8,7 +8,7 @@ place in the plan and the number of shards alone, and what is dealt stays where 
 import hashlib
 import json
 import re
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import lcm
@@ -200,20 +200,6 @@ def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mappi
         for cell, replicates in zip(cells, asked, strict=True):
             if replicates:
                 yield estimator, cell, replicates
-
-
-class Planned:
-    """The estimates that a plan asks for, to ask whether a key is among them."""
-
-    def __init__(self, manifest: Manifest) -> None:
-        self._parts: dict[tuple[str, str], list[tuple[Container[int], Sequence[str]]]] = {}
-        for estimator, cell, replicates in planned_parts(manifest):
-            asked = replicates if isinstance(replicates, range) else frozenset(replicates)
-            self._parts.setdefault((cell["hash"], estimator["hash"]), []).append((asked, estimator["starts"]))
-
-    def __contains__(self, key: Key) -> bool:
-        parts = self._parts.get((key.data_hash, key.estimator_hash), ())
-        return any(key.replicate in replicates and key.start in starts for replicates, starts in parts)
 
 
 def planned_count(manifest: Manifest) -> int:

@@ -7,19 +7,19 @@ alone, so that it has the bytes of a single run's.
 
 import re
 import shutil
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
-from ctid_cli.errors import RefusedError, StorageError, UsageError
+from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.identity import Origin, origin_differences
 from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, open_journal, read_journal
-from ctid_cli.storage.manifest import Key, Manifest, Planned, Shard, owner, shard_of, slots, whole
+from ctid_cli.storage.manifest import Key, Manifest, Shard, owner, shard_of, slots, whole
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 
 #: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
@@ -43,8 +43,8 @@ class Merged:
     new: int
     mixed: bool
     checksum: str
-    #: What is not there, in words.
-    missing: tuple[str, ...]
+    #: What is not there, in words; empty for nothing.
+    missing: str
 
 
 def find_sources(paths: Iterable[Path]) -> list[Path]:
@@ -87,7 +87,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
             _require_same_experiment(target, plan)
             log = open_journal(target / FILE_NAME)
         with closing(log):
-            taken = _Taken(target, log, plan, allow_mixed=allow_mixed)
+            taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
             with log.transaction():
                 for folder in others:
                     with _reading(folder) as other:
@@ -96,11 +96,11 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
                 taken.require_no_conflict()
                 there = {row.key for row in log.rows()}
                 lacking = [key for key in keys if key not in there]
-                missing = tuple(_missing(plan, [shard_of(plans[folder]) for folder in others], lacking))
+                missing = _missing(plan, [shard_of(plans[folder]) for folder in others], lacking)
                 if missing and not partial:
-                    raise RefusedError(f"{plan['experiment']}: {'; '.join(missing)}. --partial merges what there is")
+                    raise RefusedError(f"{plan['experiment']}: {missing}. --partial merges what there is")
                 log.note_plan(plan)
-            with _writing(target):
+            with place.writing(target):
                 for name in (place.SPEC, place.CANONICAL):
                     log.write_beside(name, (others[0] / name).read_bytes())
             count, checksum = write_runs(target, log)
@@ -143,7 +143,7 @@ def _new_folder(target: Path) -> Iterator[None]:
     """Return a folder that is removed again if it was made here and what follows fails."""
     made = not target.exists()
     try:
-        with _writing(target):
+        with place.writing(target):
             target.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
@@ -163,8 +163,10 @@ def _require_same_experiment(target: Path, plan: Manifest) -> None:
 class _Taken:
     """What has been taken over from several folders into a journal, in one transaction."""
 
-    def __init__(self, target: Path, log: Journal, plan: Manifest, *, allow_mixed: bool) -> None:
-        self._log, self._planned, self._allow_mixed = log, Planned(plan), allow_mixed
+    def __init__(
+        self, target: Path, log: Journal, plan: Manifest, planned: Container[Key], *, allow_mixed: bool
+    ) -> None:
+        self._log, self._planned, self._allow_mixed = log, planned, allow_mixed
         #: Where the runs of the journal come from, by their ids.
         self._places = {session.id: (target, session) for session in log.sessions()}
         cells = {cell["hash"] for cell in plan["data_cells"]}
@@ -193,10 +195,9 @@ class _Taken:
             self._origins.setdefault(origin, folder)
             return
         other, where = next(iter(self._origins.items()))
-        pairs = origin_differences(other, origin)
-        differences = "; ".join(f"{name} {left} and {right}" for name, left, right in pairs)
+        differences = origin_differences(other, origin, "there", "here")
         raise RefusedError(
-            f"{folder} and {where} were computed by other code or arithmetic ({differences}); run one of "
+            f"{where} and {folder} were computed by other code or arithmetic ({differences}); run one of "
             "them with --fresh where the other was run, or merge with --allow-mixed, which tables will say"
         )
 
@@ -230,27 +231,17 @@ def _rank(row: Row, session: Session) -> tuple[bool, list[float], str]:
     return row.status not in LIMITED, allowed, row.result
 
 
-def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]) -> Iterator[str]:
-    """Yield what is not there, by shard where all folders are of the same dealing."""
-    known = [shard for shard in shards if shard is not None]
-    if not keys:
-        return
-    if len({shard.of for shard in known}) != 1 or len(known) < len(shards):
-        yield f"{len(keys)} estimates are missing"
-        return
-    of = known[0].of
+def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]) -> str:
+    """Return what is not there, by shard where all folders are of the same dealing; empty for nothing."""
+    dealings = {0 if shard is None else shard.of for shard in shards}
+    if not keys or len(dealings) > 1 or 0 in dealings:
+        return f"{len(keys)} estimates are missing" if keys else ""
+    (of,) = dealings
     cells = [cell["hash"] for cell in plan["data_cells"]]
     places = {cell: number for number, cell in enumerate(cells)}
-    lacking = Counter(owner(places[key.data_hash], key.replicate, len(cells), of) for key in keys)
-    given = {shard.number for shard in known}
-    if absent := lacking.keys() - given:
-        number = sum(lacking[shard] for shard in absent)
-        what = "is not among the folders" if len(absent) == 1 else "are not among the folders"
-        yield f"{shards_text(absent, of)} {what} ({number} estimates)"
-    if unfinished := lacking.keys() & given:
-        number, one = sum(lacking[shard] for shard in unfinished), len(unfinished) == 1
-        again = f"{'lacks' if one else 'lack'} {number} estimates, which the same 'ctid run' again computes"
-        yield f"{shards_text(unfinished, of)} {again}"
+    lacking = {owner(places[key.data_hash], key.replicate, len(cells), of) for key in keys}
+    again = "give their folders too, or the same 'ctid run' of them again"
+    return f"{len(keys)} estimates of {shards_text(lacking, of)} are missing: {again}"
 
 
 def shards_text(numbers: Iterable[int], of: int) -> str:
@@ -263,13 +254,3 @@ def shards_text(numbers: Iterable[int], of: int) -> str:
             runs.append([number])
     text = ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
-
-
-@contextmanager
-def _writing(target: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(
-            f"{error.filename or target}: {error.strerror or error}; the same merge again goes on"
-        ) from error

@@ -3,7 +3,7 @@
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
@@ -95,37 +95,19 @@ def require_format(path: Path, written: int, known: int) -> None:
         )
 
 
-class Places:
-    """An open journal's folder and files as they were when it was opened."""
+def places_of(path: Path) -> dict[Path, tuple[int, int] | None]:
+    """Return the folder and files of a journal, each with what tells it from another one of its name."""
+    # While it is open no other file can get the numbers of its files.
+    places = (path.parent, path, path.with_name(f"{path.name}-wal"))
+    return {place: _identity_of(place) for place in places if place.exists()}
 
-    def __init__(self, path: Path) -> None:
-        self._folder: int | None = os.open(path.parent, os.O_RDONLY)
-        places = (path.parent, path, path.with_name(f"{path.name}-wal"))
-        self._found = {place: _identity_of(place) for place in places if place.exists()}
 
-    def require(self) -> None:
-        """Refuse to go on in a file that its path does not lead to any more."""
-        for place, found in self._found.items():
-            if _identity_of(place) != found:
-                advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"
-                raise StorageError(f"{self._what_became_of(place)}. {advice}")
-
-    def _what_became_of(self, place: Path) -> str:
-        now = None
-        with suppress(OSError):
-            # Linux knows the present name of an open folder.
-            now = os.readlink(f"/proc/self/fd/{self._folder}")
-        moved = now is not None and now != str(place.resolve()) and not now.endswith(" (deleted)")
-        if moved and place == next(iter(self._found)):
-            return f"{place} was renamed while a run wrote to it; it is {now} now"
-        return f"{place} was deleted or replaced while a run wrote to it"
-
-    def close(self) -> None:
-        """Let go of the folder."""
-        if self._folder is not None:
-            with suppress(OSError):
-                os.close(self._folder)
-            self._folder = None
+def require_places(known: Mapping[Path, tuple[int, int] | None]) -> None:
+    """Refuse to go on in a file that its path does not lead to any more."""
+    for place, identity in known.items():
+        if _identity_of(place) != identity:
+            advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"
+            raise StorageError(f"{place} was renamed, deleted or replaced while a run wrote to it. {advice}")
 
 
 def _identity_of(path: Path) -> tuple[int, int] | None:

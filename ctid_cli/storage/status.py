@@ -19,10 +19,12 @@ from ctid_cli.storage.estimates import Estimates, read_stored, stored_in
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.storage.identity import as_text
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import Slot, planned_parts, shard_of
+from ctid_cli.storage.manifest import Manifest, Slot, planned_parts, shard_of
 
 #: A data cell and an estimator by their hashes.
 Part = tuple[str, str]
+#: A plan, how many of its estimates are stored and failed, and whether they are of several origins.
+Counted = tuple[Manifest, dict[Part, tuple[int, int]], bool]
 #: What may be published of a run: nothing that names a machine, a user or a folder.
 PUBLIC = ("jobs", "processors", "numeric_platform", "packages")
 
@@ -134,9 +136,8 @@ def experiment_status(folder: Path) -> ExperimentStatus:
     """Count what is done and what is missing."""
     try:
         with place.reading_journal(folder) as log:
-            stored = stored_in(folder, log)
             running = _running(folder) if log is not None and log.live else None
-            return _status(folder, stored, log, running)
+            return _status(folder, log, running)
     except InUseError:
         # A run that is just beginning has nothing to read yet.
         running = _running(folder)
@@ -160,15 +161,10 @@ def _running(folder: Path) -> dict[str, Any]:
     return running | about
 
 
-def _status(
-    folder: Path, stored: Estimates, log: JournalReader | None, running: dict[str, Any] | None
-) -> ExperimentStatus:
-    manifest, failures, counted = stored.manifest, stored.failures, dict[Part, tuple[int, int]]()
-    for block in stored.blocks:
-        # Two names may share estimates, which are stored once in a journal.
-        failed = int(failures[block.first : block.last].sum())
-        counted[block.cell["hash"], block.hash] = (block.last - block.first, failed)
-    left_aside = None if log is None else log.count() - sum(done for done, _ in counted.values())
+def _status(folder: Path, log: JournalReader | None, running: dict[str, Any] | None) -> ExperimentStatus:
+    manifest, counted, mixed = _in_export(folder) if log is None else _in_journal(log)
+    # Two names may share estimates, which are stored once in a journal.
+    left_aside = None if log is None else log.require_count() - sum(done for done, _ in counted.values())
     groups = []
     for estimator, cell, replicates in planned_parts(manifest):
         planned = len(replicates) * len(estimator["starts"])
@@ -178,4 +174,27 @@ def _status(
     planned, done, failed = (sum(getattr(group, name) for group in groups) for name in ("planned", "done", "failed"))
     name, found_groups, dealt = manifest["experiment"], tuple(groups), shard_of(manifest)
     shard = None if dealt is None else (dealt.number, dealt.of)
-    return ExperimentStatus(planned, done, failed, name, folder, left_aside, stored.mixed, running, found_groups, shard)
+    return ExperimentStatus(planned, done, failed, name, folder, left_aside, mixed, running, found_groups, shard)
+
+
+def _in_journal(log: JournalReader) -> Counted:
+    """Count the estimates that a journal holds of its plan."""
+    manifest, counted, sessions = log.manifest(), dict[Part, tuple[int, int]](), set[str]()
+    for estimator, cell, replicates in planned_parts(manifest):
+        done = failed = 0
+        for row in log.rows_of(estimator, cell, replicates):
+            sessions.add(row.session)
+            done += 1
+            failed += row.status in columns.FAILURES
+        counted[cell["hash"], estimator["hash"]] = (done, failed)
+    return manifest, counted, len(log.origins_of(sessions)) > 1
+
+
+def _in_export(folder: Path) -> Counted:
+    """Count the estimates that ``runs.h5`` holds."""
+    stored = stored_in(folder, None)
+    failures, counted = stored.failures, dict[Part, tuple[int, int]]()
+    for block in stored.blocks:
+        failed = int(failures[block.first : block.last].sum())
+        counted[block.cell["hash"], block.hash] = (block.last - block.first, failed)
+    return stored.manifest, counted, stored.mixed

@@ -11,7 +11,7 @@ from ctid_cli.storage import folder as place
 from ctid_cli.storage.announcement import RUNNING
 from ctid_cli.storage.export import open_export, sha256_of
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import Planned, slots
+from ctid_cli.storage.manifest import slots
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
 from ctid_cli.written_files import is_leftover
 
@@ -66,10 +66,10 @@ def verify(folder: Path) -> Verification:
 def _journal(log: JournalReader) -> Finding:
     log.check(fully=True)
     manifest, sessions = log.manifest(), log.sessions()
-    planned = Planned(manifest)
+    planned = {slot.key for slot in slots(manifest)}
     # Reading compares each row with its checksum.
     there = Counter(row.key in planned for row in log.rows())
-    message = f"{there[True]} of {len({slot.key for slot in slots(manifest)})} estimates"
+    message = f"{there[True]} of {len(planned)} estimates"
     message += f", {there[False]} set aside" if there[False] else ""
     message += f", {len(sessions)} run{'s' if len(sessions) != 1 else ''}"
     return Finding(FILE_NAME, "intact", message + (", one is going on" if log.live else ""))

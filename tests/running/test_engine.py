@@ -425,27 +425,6 @@ def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed
     assert exported(place) == undisturbed
 
 
-def test_a_folder_that_is_gone_ends_the_run_before_anything_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Each data set in a commit of its own, however slow the machine is.
-    monkeypatch.setattr(engine, "COMMIT_SECONDS", 0.0)
-    place, elsewhere = tmp_path / "toys", tmp_path / "elsewhere"
-    reported: list[str] = []
-
-    def replace_it(progress: Progress) -> None:
-        reported.extend(key.id for key in progress.stored)
-        if reported and not elsewhere.exists():
-            place.rename(elsewhere)
-            run(toy_plan(runs=1), place)
-
-    with pytest.raises(StorageError, match="while a run wrote to it"):
-        run(toy_plan(Toy(seconds=0.02), runs=20), place, progress=replace_it)
-    assert len(reported) == 2
-    assert set(reported) <= stored_ids(elsewhere)
-    assert len(read_estimates(place)) == 6
-
-
 def test_preview_counts_without_writing(tmp_path: Path) -> None:
     place = tmp_path / "toys"
     first = preview(toy_plan(), place)

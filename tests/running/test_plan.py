@@ -1,17 +1,12 @@
-"""From specifications to data sets and estimates: expansion, identity, random streams."""
+"""From a specification to a plan: what is expanded, and what the identity of an estimate is made of."""
 
 import hashlib
-import pickle
 
-import numpy as np
 import pytest
 
 from ctid_cli.canonical import content_hash
-from ctid_cli.errors import DataError, UsageError
+from ctid_cli.errors import UsageError
 from ctid_cli.running.plan import build_plan
-from ctid_cli.signals.measurement import read_record
-from ctid_cli.signals.noise import stream
-from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.load import load_spec, spec_from_canonical
 
 SPEC = """\
@@ -183,124 +178,3 @@ def test_what_a_data_cell_is_made_of(plan_of):
     assert plan.data_cells[0].hash == "b3133309744adf43"
     assert plan.estimators[1].content["kind"] == "srivc"
     assert plan.estimators[1].hash == content_hash(plan.estimators[1].content)
-
-
-# -- data sets --------------------------------------------------------------------------------------------------------
-
-
-def test_levels_share_input_instants_and_noise_shape(plan_of):
-    low, high = (cell.dataset(1) for cell in plan_of().data_cells)
-    np.testing.assert_array_equal(low.record.t, high.record.t)
-    np.testing.assert_array_equal(low.record.input.values, high.record.input.values)
-    np.testing.assert_array_equal(low.record.noise_free, high.record.noise_free)
-    noise_low, noise_high = (data.record.y - data.record.noise_free for data in (low, high))
-    np.testing.assert_allclose(noise_low, noise_high * 10**0.5, rtol=1e-9, atol=1e-12)
-    # Longer records begin with the shorter ones.
-    longer = plan_of("sampling.samples=300").data_cells[0].dataset(1)
-    np.testing.assert_array_equal(longer.record.t[:200], low.record.t)
-    np.testing.assert_allclose(longer.record.noise_free[:200], low.record.noise_free, atol=1e-12)
-
-
-def test_replicates_differ_and_repeat(plan_of):
-    cell = plan_of().data_cells[0]
-    first, second, again = cell.dataset(0).record, cell.dataset(1).record, cell.dataset(0).record
-    assert not np.array_equal(first.t, second.t)
-    assert not np.array_equal(first.input.values, second.input.values)
-    np.testing.assert_array_equal(first.y, again.y)
-    sent = pickle.loads(pickle.dumps(cell))
-    np.testing.assert_array_equal(sent.dataset(0).record.y, first.y)
-    assert sent.dataset(0).true_model.delay == 1.0
-
-
-def test_what_the_estimator_is_told_of_the_input(plan_of):
-    sampled = plan_of().data_cells[0].dataset(0).record
-    exact = plan_of("sampling.input_record=exact").data_cells[0].dataset(0).record
-    np.testing.assert_array_equal(sampled.noise_free, exact.noise_free)
-    np.testing.assert_array_equal(sampled.input.t, sampled.t)
-    np.testing.assert_array_equal(exact.input.t, 0.5 * np.arange(exact.input.t.size))
-    np.testing.assert_array_equal(sampled.input.values, exact.input.at(sampled.t))
-
-
-def test_without_noise_the_output_is_noise_free(plan_of):
-    plan = plan_of(text=SPEC.replace("noise: {kind: white, snr_db: [5, 15]}\n", ""))
-    (cell,) = plan.data_cells
-    record = cell.dataset(0).record
-    np.testing.assert_array_equal(record.y, record.noise_free)
-
-
-def test_random_starts(plan_of):
-    plan = plan_of()
-    random = plan.starts[1]
-    drawn = [random.draw(11, replicate).delay for replicate in range(50)]
-    assert drawn[3] == 9 * stream(11, "start", 3).random()
-    assert all(0 <= delay <= 9 for delay in drawn)
-    assert len(set(drawn)) == 50
-    # Nor does a start depend on which others there are.
-    more = plan_of("starts.initial_delay=[{uniform: [0, 5]},{uniform: [0, 9]}]")
-    assert more.starts[1].draw(11, 3) == random.draw(11, 3)
-    assert StartPoint("3", "delay", 3.0).draw(None, 0).delay == 3.0
-    with pytest.raises(ValueError, match="seed"):
-        random.draw(None, 0)
-
-
-MEASURED = """\
-experiment: measured
-data: {file: record.csv, offset: remove, estimation_samples: 60}
-estimators: {one: {kind: srivc, poles: 1, zeros: 0}}
-"""
-
-
-@pytest.fixture
-def record_file(tmp_path):
-    rng = np.random.default_rng(5)
-    rows = [f"{k / 10},{3 + rng.integers(2)},{5 + rng.standard_normal() if k != 7 else ''}" for k in range(100)]
-    file = tmp_path / "record.csv"
-    file.write_text("t,u,y\n" + "\n".join(rows) + "\n")
-    return file
-
-
-def test_a_measured_record_is_split_and_its_means_are_those_of_the_first_part(plan_of, record_file):
-    plan = plan_of(text=MEASURED, runs=20)
-    assert plan.runs == 1
-    assert plan.data_sets == 1
-    data = plan.data_cells[0].dataset(0)
-    whole = read_record(record_file)
-    assert data.true_model is None
-    assert data.record.n_samples == 60
-    assert np.isnan(data.record.y[7])
-    np.testing.assert_allclose(data.record.y, whole.y[:60] - np.nanmean(whole.y[:60]))
-    np.testing.assert_allclose(data.record.input.values, whole.input.values[:60] - whole.input.values[:60].mean())
-    assert not data.validation.valid[:60].any()
-    np.testing.assert_allclose(data.validation.y[60:], whole.y[60:] - np.nanmean(whole.y[:60]))
-    np.testing.assert_array_equal(data.validation.input.values[:60], data.record.input.values)
-    raw = plan_of("data.offset=none", text=MEASURED).data_cells[0].dataset(0)
-    np.testing.assert_array_equal(raw.record.y, whole.y[:60])
-    everything = plan_of("data.estimation_samples=null", text=MEASURED).data_cells[0].dataset(0)
-    assert everything.validation is None
-    assert everything.record.n_samples == 100
-    with pytest.raises(ValueError, match="replicate 0 only"):
-        plan.data_cells[0].dataset(1)
-
-
-def test_a_record_that_changed_since_is_refused(plan_of, record_file):
-    plan = plan_of(text=MEASURED)
-    record_file.write_text(record_file.read_text() + "10.0,3,5\n")
-    with pytest.raises(DataError, match="not that which the experiment was planned with"):
-        plan.data_cells[0].dataset(0)
-    # Its results can be read all the same.
-    assert build_plan(spec_from_canonical(plan.spec.canonical())).data_cells[0].hash == plan.data_cells[0].hash
-    assert plan_of(text=MEASURED).data_cells[0].hash != plan.data_cells[0].hash
-
-
-def test_an_input_from_a_file(plan_of, record_file):
-    overrides = [
-        "excitation={kind: file, file: record.csv, hold: foh}",
-        "sampling={kind: regular, interval: 0.1, samples: 99}",
-    ]
-    (cell, _) = plan_of(*overrides, "system.delay=0.5").data_cells
-    record = cell.dataset(0).record
-    np.testing.assert_allclose(record.input.values, read_record(record_file).input.values[:99])
-    assert record.input.hold == "foh", "samples of straight lines are joined by straight lines"
-    record_file.write_text(record_file.read_text().replace("t,u,y\n", "t,u,y\n-1,3,1\n"))
-    with pytest.raises(DataError, match="not that which"):
-        cell.dataset(0)

@@ -10,8 +10,9 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.columns import failed, no_result
 from ctid_cli.storage.estimates import Estimates
-from ctid_cli.storage.export import Export, write_export
+from ctid_cli.storage.export import Export, write_export, write_runs
 from ctid_cli.storage.identity import Origin
+from ctid_cli.storage.journal import open_journal
 from ctid_cli.storage.manifest import Outcome, slots
 
 ORIGIN = Origin("c", "p", ())
@@ -50,6 +51,20 @@ def outcome(key, delay=0.35):
 def outcomes_of(manifest):
     """Made-up estimates of all that a plan asks for."""
     return [outcome(key) for key in dict.fromkeys(slot.key for slot in slots(manifest))]
+
+
+def run_folder(manifest, place, outcomes=None, origin=ORIGIN, **info):
+    """A folder as a run leaves it that has computed some estimates, or all that its plan asks for."""
+    place.mkdir(parents=True)
+    log = open_journal(place / "journal.sqlite")
+    for name in ("spec.yaml", "spec.canonical.json"):
+        log.write_beside(name, b"# toys\n")
+    session = log.begin(manifest, origin, f"began {place.name}", info)
+    log.add(outcomes_of(manifest) if outcomes is None else outcomes, session)
+    write_runs(place, log)
+    log.end(session, "ended", "finished")
+    log.close()
+    return place
 
 
 class MadeResults(Estimates):

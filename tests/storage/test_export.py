@@ -3,6 +3,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import resource
+import signal
 import subprocess
 import sys
 import textwrap
@@ -27,10 +29,8 @@ RESULTS = {one.key: one.result for one in outcomes_of(MANIFEST)}
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
-    file = tmp_path / "runs.h5"
-    file.write_bytes(export_image(MANIFEST, [ORIGIN], RESULTS))
-    return file
+def path(place: Path) -> Path:
+    return place / "runs.h5"
 
 
 def read(path: Path) -> dict[Any, Any]:
@@ -107,13 +107,6 @@ def test_every_flipped_bit_of_data_is_found_without_a_journal(path: Path) -> Non
         read(path)
 
 
-def test_another_format_is_refused(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 3
-    with pytest.raises(RefusedError, match="format 3; this ctid reads format 2"):
-        open_export(path)
-
-
 def _plan(change: Callable[[dict[str, Any]], Any]) -> Callable[[h5py.File], None]:
     def within(file: h5py.File) -> None:
         plan = json.loads(bytes(file["manifest"][()]))
@@ -163,50 +156,38 @@ def test_content_that_no_run_has_written_is_refused(case: str, path: Path) -> No
         open_export(path)
 
 
-def test_it_is_written_once_and_again_when_it_is_not_what_was_written(tmp_path: Path) -> None:
-    log = open_journal(tmp_path / "journal.sqlite")
-    log.add(outcomes_of(MANIFEST), log.begin(MANIFEST, ORIGIN, "now", {}))
-    count, sha256 = write_runs(tmp_path, log)
-    path = tmp_path / "runs.h5"
-    assert (count, sha256, log.exported()) == (30, sha256_of(path), sha256)
-    intact, before = path.read_bytes(), path.stat().st_mtime_ns
+def test_another_format_is_refused(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = 3
+    with pytest.raises(RefusedError, match="format 3; this ctid reads format 2"):
+        open_export(path)
+
+
+def test_it_is_written_once_and_again_when_it_is_not_what_was_written(path: Path) -> None:
+    log, intact, before = open_journal(path.with_name("journal.sqlite")), path.read_bytes(), path.stat().st_mtime_ns
     assert intact == export_image(MANIFEST, [ORIGIN], RESULTS)
-    assert write_runs(tmp_path, log) == (30, sha256)
-    assert path.stat().st_mtime_ns == before
+    assert write_runs(path.parent, log) == (30, sha256_of(path))
+    assert (log.exported(), path.stat().st_mtime_ns) == (sha256_of(path), before)
     for damage in (intact[:-9], b""):
         path.write_bytes(damage)
-        assert write_runs(tmp_path, log) == (30, sha256)
+        assert write_runs(path.parent, log) == (30, log.exported())
         assert path.read_bytes() == intact
     log.close()
 
 
-#: Exports in processes that may write files of some sizes only.
-FULL_DISK = """
-import os, resource, signal, sys
-from pathlib import Path
-from ctid_cli.storage import export, journal
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-folder = Path(sys.argv[1])
-log = journal.open_journal(folder / "journal.sqlite")
-for size in range(0, int(sys.argv[2]), 4001):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+def test_a_full_disk_is_said_in_one_sentence_and_leaves_nothing_behind(path: Path) -> None:
+    log, most = open_journal(path.with_name("journal.sqlite")), resource.getrlimit(resource.RLIMIT_FSIZE)
+    path.unlink()
+    before = {file.name for file in path.parent.iterdir()}
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, most[1]))
     try:
-        export.write_runs(folder, log)
-        print("written")
-    except Exception as error:
-        print(error)
-"""
-
-
-def test_a_full_disk_is_said_in_one_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    log = open_journal(tmp_path / "journal.sqlite")
-    log.add(outcomes_of(MANIFEST), log.begin(MANIFEST, ORIGIN, "now", {}))
+        with pytest.raises(
+            StorageError, match=rf"^{path} could not be written \(File too large\); all 30 .* are safe in "
+        ):
+            write_runs(path.parent, log)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, most)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert {file.name for file in path.parent.iterdir()} == before
     log.close()
-    size = len(export_image(MANIFEST, [ORIGIN], RESULTS))
-    command = [sys.executable, "-c", FULL_DISK, str(tmp_path), str(size)]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
-    assert done.stderr == ""
-    sentence = rf"{tmp_path}/runs.h5 could not be written \(File too large\); all 30 estimates are safe in .*"
-    assert all(re.fullmatch(sentence, line) for line in done.stdout.splitlines())
-    assert len(done.stdout.splitlines()) > 5
-    assert {path.name for path in tmp_path.iterdir()} == {"journal.sqlite"}
