@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
 from ctid_cli.running.job import Begun, Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan, computing_parts
-from ctid_cli.running.workers import Ending, Results, Task, Workers, compute, compute_alone, packed
+from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
 from ctid_cli.storage.manifest import Key
@@ -32,7 +32,7 @@ PATIENCE = 120.0
 LOOK = 1.0
 
 
-class DaskWorkers(Workers):
+class DaskWorkers:
     """Workers of a dask scheduler."""
 
     _client: Any
@@ -42,8 +42,7 @@ class DaskWorkers(Workers):
             from distributed import Client
         except ImportError:
             raise UsageError("--dask needs dask.distributed; install it with: pip install 'ctid[dask]'") from None
-        super().__init__(limits)
-        self._address = address
+        self._address, self._limits = address, limits
         contents = _contents(plan)
         try:
             self._client = Client(address, timeout=10, set_as_default=False)  # type: ignore[no-untyped-call]
@@ -54,9 +53,9 @@ class DaskWorkers(Workers):
         # A task, because what is scattered to workers is lost with them.
         self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
-        #: Since when each job has been in work [s].
-        self._since: dict[Job, float] = {}
-        self.count = 1
+        #: What is in work, and since when [s].
+        self._at_work: dict[Job, float] = {}
+        self.count, self.trouble = 1, ""
         self._looked, self._present = float("-inf"), time.monotonic()
         self._look()
 
@@ -77,37 +76,46 @@ class DaskWorkers(Workers):
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
-        return self._computed(jobs, partial(self._submit, compute_there), self._look)
+        return self._computed(jobs, compute_there, self._look)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
-        return self._computed(jobs, partial(self._submit, compute_alone), lambda: min(at_once, self._look()))
+        return self._computed(jobs, compute_alone, lambda: min(at_once, self._look()))
 
-    def _submit(self, function: Callable[..., Ending], job: Job, task: Task) -> Future[Ending]:
-        self._since[job] = time.monotonic()
-        given = function, task, self._limits, self._expected, self._files
-        future: Future[Ending] = self._executor.submit(on_worker, *given)
-        return future
+    def _computed(self, jobs: Iterator[Job], function: Callable[..., Ending], at_once: Callable[[], int]) -> Results:
+        def submit(job: Job, task: Task) -> Future[Ending]:
+            self._at_work[job] = time.monotonic()
+            future: Future[Ending] = self._executor.submit(
+                on_worker, function, task, self._limits, self._expected, self._files
+            )
+            return future
 
-    def _watch(self) -> None:
-        self._look()
-
-    def _died(self, job: Job, error: Exception) -> Ending:
-        """Return what came of a job whose workers died: all is suspect, what a worker knows is lost with it."""
-        if isinstance(error, RefusedError):
-            raise error
-        return Ending([Begun(job.keys)], f"{type(error).__name__}: the workers that had it died or were lost")
+        try:
+            for over in in_parallel(jobs, submit, at_once, _died):
+                if over is None:
+                    self._look()
+                else:
+                    self._at_work.pop(over[0], None)
+                yield over
+        finally:
+            self._at_work.clear()
 
     def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
         """Yield the jobs that a worker has had for longer than this, their estimates, and for how long [s]."""
-        self._since = {job: since for job, since in self._since.items() if job in self._at_work}
-        times = [(job, job.keys, time.monotonic() - since) for job, since in self._since.items()]
+        times = [(job, job.keys, time.monotonic() - since) for job, since in self._at_work.items()]
         yield from (one for one in times if one[2] > least)
 
     def close(self) -> None:
         """Leave the scheduler, which forgets what was in work."""
         with suppress(Exception):
             self._client.close()
+
+
+def _died(job: Job, error: Exception) -> Ending:
+    """Return what came of a job whose workers died: all of it is suspect, what a worker knows is lost with it."""
+    if isinstance(error, RefusedError):
+        raise error
+    return Ending([Begun(job.keys)], f"{type(error).__name__}: the workers that had it died or were lost")
 
 
 def _contents(plan: Plan) -> dict[str, bytes]:

@@ -25,7 +25,7 @@ from ctid_cli.running.precision import as_needed, stored_precisions
 from ctid_cli.running.states import States
 from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopRequest
 from ctid_cli.running.suspects import NAMED, Course
-from ctid_cli.running.workers import LocalWorkers, Workers
+from ctid_cli.running.workers import LocalWorkers
 from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
@@ -170,7 +170,7 @@ def run_experiment(
     origin, limits = current_origin(plan), Limits.of(plan.spec.canonical())
     limits.require_support()
     with ExitStack() as stack:
-        workers: Workers
+        workers: Any
         if dask is None:
             workers = LocalWorkers(jobs or usable_processors(), limits)
         else:
@@ -245,7 +245,7 @@ class _Run:
         self._tell(precision=self.precision)
         return True
 
-    def compute(self, workers: Workers, limits: Limits, stopping: StopRequest) -> None:
+    def compute(self, workers: Any, limits: Limits, stopping: StopRequest) -> None:
         """Compute what is missing: store it and tell of it, in whichever order it comes."""
         batch: list[Outcome] = []
         since = time.monotonic()

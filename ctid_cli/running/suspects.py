@@ -14,13 +14,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from typing import TYPE_CHECKING
 
 from ctid_cli.running.job import Job, Short
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.workers import Ending, Workers
+from ctid_cli.running.workers import Ending
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.text import count
+
+if TYPE_CHECKING:
+    from ctid_cli.running.dask_cluster import DaskWorkers
+    from ctid_cli.running.workers import LocalWorkers
 
 #: After this number of rounds without a finished estimate the run ends; before each next round it waits in proportion
 #: to their number [s]. A round ends early when the machine was short of something this often.
@@ -42,7 +47,7 @@ class Course:
     def __init__(
         self,
         jobs: Iterator[Job],
-        workers: Workers,
+        workers: LocalWorkers | DaskWorkers,
         limits: Limits,
         stopping: Callable[[], bool],
         tell: Callable[[str], object],
@@ -70,7 +75,7 @@ class Course:
         while not self._stopping() and not (self._exhausted and not self._again):
             self._vain += 1
             yield from self._round()
-            if self._vain >= PATIENCE and not self._exhausted:
+            if self._vain >= PATIENCE and (self._again or not self._exhausted):
                 self.hopeless = True
                 self.hindrance = self._reason or self._workers.trouble
                 return

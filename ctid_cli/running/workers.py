@@ -1,6 +1,6 @@
-"""Worker processes: jobs go through loky, and what a process died of is computed again, alone in a process.
+"""Worker processes: jobs go through joblib, and what a process died of is computed again, alone in a process.
 
-loky gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
+joblib gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
 which estimates it has begun and finished, so that nothing is lost with it and the suspects are known: one for each
 worker. Every suspect is computed again in a process of its own, whose exit code decides.
 """
@@ -12,14 +12,13 @@ import faulthandler
 import itertools
 import os
 import pickle
-import shutil
+import queue
 import signal
 import subprocess
 import sys
 import threading
 import time
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -38,12 +37,8 @@ from ctid_cli.temporary import TemporaryFolder
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: How long an idle worker waits for the next run [s].
-IDLE = 300.0
-#: A file that tells workers to begin nothing more.
-_STOP = "stop"
-#: In the folder of a job, the record of what its process has begun and finished.
-_RECORD = "record"
+#: Files beside the records: one tells workers to begin nothing more, the other is there while anything is to be done.
+_STOP, _GOING = "stop", "going"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
@@ -135,10 +130,15 @@ def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
     return found
 
 
-def _compute_unless_stopped(task: Task, limits: Limits, folder: Path) -> Ending:
-    """Compute a job unless the run is to stop."""
-    stopped = (folder.parent / _STOP).exists()
-    return Ending([] if stopped else compute(task, folder / _RECORD, limits))
+def _compute_named(record: Path, task: Task, limits: Limits) -> tuple[Path, list[Entry]]:
+    """Compute a job unless the run is to stop, and say of which record it is."""
+    return record, [] if record.with_name(_STOP).exists() else compute(task, record, limits)
+
+
+def _wait(going: Path) -> None:
+    """Keep a worker from taking jobs until nothing is left to be done."""
+    while going.exists():
+        time.sleep(TICK)
 
 
 def main() -> None:
@@ -193,7 +193,7 @@ def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple
 
 def compute_alone(task: Task, limits: Limits, folder: Path) -> Ending:
     """Compute a job in a process of its own, which is told how it ended."""
-    record = folder / _RECORD
+    record = folder / "record"
     try:
         found, how, used = call_alone(folder, compute, task, record, limits)
     except OSError as error:
@@ -222,203 +222,208 @@ def _read(record: Path) -> list[Any]:
     return entries
 
 
-class Workers(ABC):
-    """Processes that compute jobs, on this machine or on others."""
+def in_parallel(
+    jobs: Iterator[Job],
+    submit: Callable[[Job, Task], Future[Ending]],
+    at_once: Callable[[], int],
+    died: Callable[[Job, Exception], Ending],
+) -> Results:
+    """Keep a number of jobs in work, and yield each with what came of it; None where nothing has ended for a while."""
+    in_work: dict[Future[Ending], Job] = {}
+    while True:
+        while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
+            task = task_of(job)
+            if isinstance(task, Ending):
+                yield job, task
+            else:
+                in_work[submit(job, task)] = job
+        if not in_work:
+            return
+        done, _ = wait(in_work, TICK, FIRST_COMPLETED)
+        for future in done:
+            job = in_work.pop(future)
+            try:
+                ending = future.result()
+            except Exception as error:
+                ending = died(job, error)
+            yield job, ending
+        if not done:
+            yield None
 
-    #: How many jobs they compute at the same time.
-    count: int
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        #: Why the last workers ended before all was done.
-        self.trouble = ""
-        self._at_work: dict[Job, Future[Ending]] = {}
-
-    @abstractmethod
-    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
-        """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
-
-    @abstractmethod
-    def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
-        """Compute jobs each in a process of its own, some at the same time."""
-
-    @abstractmethod
-    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
-        """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Let go of what is kept for jobs."""
-
-    @abstractmethod
-    def _died(self, job: Job, error: Exception) -> Ending:
-        """Return what is known of a job whose worker died."""
-
-    @abstractmethod
-    def _watch(self) -> None:
-        """Look after what is in work, now and then."""
-
-    def _abandon(self) -> None:
-        """Forget what is in work."""
-        self._at_work.clear()
-
-    def _computed(
-        self, jobs: Iterator[Job], start: Callable[[Job, Task], Future[Ending]], at_once: Callable[[], int]
-    ) -> Results:
-        """Keep a number of jobs in work, and yield each with what came of it."""
-        try:
-            yield from self._kept_in_work(jobs, start, at_once)
-        finally:
-            self._abandon()
-
-    def _kept_in_work(
-        self, jobs: Iterator[Job], start: Callable[[Job, Task], Future[Ending]], at_once: Callable[[], int]
-    ) -> Results:
-        while True:
-            while len(self._at_work) < at_once() and (job := next(jobs, None)) is not None:
-                try:
-                    task = Task(job.keys, packed(job))
-                except Exception as error:
-                    yield job, Ending(list(ended(job.keys, error, Limits())))
-                else:
-                    self._at_work[job] = start(job, task)
-            if not self._at_work:
-                return
-            done = wait(self._at_work.values(), TICK, FIRST_COMPLETED).done
-            for job in [job for job, future in self._at_work.items() if future in done]:
-                try:
-                    ending = self._at_work[job].result()
-                except Exception as error:
-                    ending = self._died(job, error)
-                del self._at_work[job]
-                yield job, ending
-            if not done:
-                self._watch()
-                yield None
+def task_of(job: Job) -> Task | Ending:
+    """Return what is sent of a job, or what comes of it where it cannot be sent."""
+    try:
+        return Task(job.keys, packed(job))
+    except Exception as error:
+        return Ending(list(ended(job.keys, error, Limits())))
 
 
 @cache
-def _starting_thread(process: int) -> ThreadPoolExecutor:
+def _joblib_thread(process: int) -> ThreadPoolExecutor:
     """Return the one thread of this process that starts workers, for as long as the process lives.
 
     Workers end with the thread that started them, and inherit that it leaves signals to others.
     """
-    return ThreadPoolExecutor(1, "workers", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
+    return ThreadPoolExecutor(1, "joblib", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
 
 
-class LocalWorkers(Workers):
-    """Worker processes on this machine; loky keeps them for the next run."""
+class LocalWorkers:
+    """Worker processes on this machine; joblib keeps them for the next run."""
 
     def __init__(self, count: int, limits: Limits) -> None:
-        super().__init__(limits)
-        self.count = count
+        self.count, self._limits = count, limits
+        #: Why the last workers ended before all was done.
+        self.trouble = ""
         self._folder = TemporaryFolder()
-        self._stop = self._folder.path / _STOP
-        #: A folder of each job, with the record of what its process has begun and finished.
-        self._places: dict[Job, Path] = {}
+        self._stop, self._going = self._folder.path / _STOP, self._folder.path / _GOING
         self._numbers = itertools.count()
+        #: What is in work, by the place of its record, and whether nothing follows.
+        self._at_work: dict[Path, Job] = {}
+        self._last = False
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
 
-        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken.
-        Jobs that wait for the next free worker, so that none waits for this process, are not computed after a stop.
+        If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
+        job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
-        from joblib.externals.loky import get_reusable_executor
-
-        thread, executor = _starting_thread(os.getpid()), None
         self._stop.unlink(missing_ok=True)
-        self.trouble = ""
-        settings = {"timeout": IDLE, "initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
+        self._last = False
+        # Without it both workers of a single job take turns, which is slower and no worse.
+        with suppress(OSError):
+            self._going.touch()
+        news: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
+        working.add_done_callback(news.put)
+        try:
+            while True:
+                if stopping():
+                    self._stop.touch()
+                try:
+                    item = news.get(timeout=TICK)
+                except queue.Empty:
+                    self._watch()
+                    yield None
+                    continue
+                if item is working:
+                    break
+                if isinstance(item, BaseException):
+                    raise item
+                record, entries = item
+                yield self._over(record), Ending(entries)
+            error = working.exception()
+            if error is not None and not isinstance(error, BrokenExecutor | OSError | MemoryError):
+                raise error
+            how = self.trouble = str(error or "").strip().partition("\n")[0]
+            for record in list(self._at_work):
+                ending = _remains(record, how)
+                yield self._over(record), ending
+        finally:
+            self._going.unlink(missing_ok=True)
+            self._abandon(working.done)
 
-        def submitted(task: Task, place: Path) -> Future[Ending]:
-            nonlocal executor
-            executor = get_reusable_executor(self.count, **settings)
-            future: Future[Ending] = executor.submit(_compute_unless_stopped, task, self._limits, place)
-            return future
+    def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
+        """Put what comes of jobs into a queue: what the thread of joblib does."""
+        from joblib import Parallel, parallel_config
 
-        def start(job: Job, task: Task) -> Future[Ending]:
-            try:
-                return thread.submit(submitted, task, self._new_place(job)).result()
-            except (BrokenExecutor, OSError, MemoryError) as error:
-                # What has been started keeps files open.
-                if executor is not None:
-                    executor.shutdown(kill_workers=True)
-                future: Future[Ending] = Future()
-                future.set_result(Ending([], self._note(error)))
-                return future
+        settings = {"initializer": initialise, "initargs": (os.getpid(),)}
+        with parallel_config("loky", inner_max_num_threads=1, **settings):
+            # With one worker joblib would compute in this very process: there are two, of which one waits for the end.
+            ahead = self.count + 1 if self.count > 1 else 2
+            how = {"n_jobs": max(self.count, 2), "pre_dispatch": ahead, "batch_size": 1, "max_nbytes": None}
+            parallel = Parallel(return_as="generator_unordered", **how)
+            for found in parallel(self._calls(jobs, news)):
+                if found is not None:
+                    news.put(found)
 
-        def at_once() -> int:
-            if stopping():
-                self._begin_nothing_more()
-            return 0 if self.trouble else 2 * self.count + 1
+    def _calls(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> Iterator[Any]:
+        """Yield what joblib is to call; it asks for the next when a worker is free, in whichever thread."""
+        from joblib import delayed
 
-        return self._computed(jobs, start, at_once)
+        try:
+            if self.count == 1:
+                yield delayed(_wait)(self._going)
+            for job in jobs:
+                record, task = self._folder.path / str(next(self._numbers)), task_of(job)
+                self._at_work[record] = job
+                if isinstance(task, Ending):
+                    news.put((record, task.entries))
+                else:
+                    yield delayed(_compute_named)(record, task, self._limits)
+        except Exception as error:
+            # joblib would wait for ever.
+            news.put(error)
+        finally:
+            self._last = True
+            self._note_end()
+
+    def _over(self, record: Path) -> Job:
+        """Forget a job that is over."""
+        for path in (record, _late(record)):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        job = self._at_work.pop(record)
+        self._note_end()
+        return job
+
+    def _note_end(self) -> None:
+        if self._last and not self._at_work:
+            self._going.unlink(missing_ok=True)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
         threads = ThreadPoolExecutor(at_once)
+        started: list[Future[Ending]] = []
 
-        def start(job: Job, task: Task) -> Future[Ending]:
-            return threads.submit(compute_alone, task, self._limits, self._new_place(job))
+        def submit(job: Job, task: Task) -> Future[Ending]:
+            folder = self._folder.path / f"alone-{next(self._numbers)}"
+            self._at_work[folder / "record"] = job
+            started.append(threads.submit(compute_alone, task, self._limits, folder))
+            return started[-1]
+
+        def died(job: Job, error: Exception) -> Ending:
+            raise error
 
         try:
-            yield from self._computed(jobs, start, lambda: at_once)
+            for over in in_parallel(jobs, submit, lambda: at_once, died):
+                if over is None:
+                    self._watch()
+                else:
+                    self._at_work = {record: job for record, job in self._at_work.items() if job is not over[0]}
+                yield over
         finally:
+            self._abandon(lambda: all(future.done() for future in started))
             threads.shutdown()
 
-    def _new_place(self, job: Job) -> Path:
-        """Return a new folder for a job, in place of that of one which is over."""
-        for over in self._places.keys() - self._at_work.keys():
-            shutil.rmtree(self._places.pop(over), ignore_errors=True)
-        self._places[job] = place = self._folder.path / str(next(self._numbers))
-        place.mkdir()
-        return place
-
-    def _died(self, job: Job, error: Exception) -> Ending:
-        """Return what is known of a job whose worker died."""
-        if not isinstance(error, BrokenExecutor | OSError | MemoryError):
-            raise error
-        return _remains(self._places[job] / _RECORD, self._note(error))
-
-    def _note(self, error: BaseException) -> str:
-        """Note why the workers ended, and return it."""
-        self.trouble = str(error).strip().partition("\n")[0] or type(error).__name__
-        return self.trouble
-
-    def _abandon(self) -> None:
+    def _abandon(self, ended: Callable[[], bool]) -> None:
         """Kill what is in work, which would be waited for otherwise, until all has ended."""
-        self._begin_nothing_more()
-        while not all(future.done() for future in self._at_work.values()):
-            for job in self._at_work:
-                _kill(self._places[job] / _RECORD)
+        while not ended():
+            for record in list(self._at_work):
+                _kill(record)
             time.sleep(TICK)
-        super()._abandon()
+        self._at_work.clear()
 
-    def _begin_nothing_more(self) -> None:
-        # Without the file workers begin what waits for them, which is slower and no worse.
-        with suppress(OSError):
-            self._stop.touch()
-
-    def _seconds(self) -> Iterator[tuple[Job, Path, float]]:
-        """Yield each job in work, its record, and for how long its estimate has been in work [s]."""
-        for job in self._at_work:
-            record = self._places[job] / _RECORD
+    def _seconds(self) -> Iterator[tuple[Path, float]]:
+        """Yield the record of each job in work, and for how long its estimate has been in work [s]."""
+        for record in list(self._at_work):
             with suppress(OSError):
-                yield job, record, time.time() - record.stat().st_mtime
+                yield record, time.time() - record.stat().st_mtime
 
     def _watch(self) -> None:
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
         if self._limits.wall_seconds is not None:
-            for _, record, seconds in self._seconds():
-                if seconds > self._limits.wall_seconds * 1.5 + GRACE:
+            for record, seconds in self._seconds():
+                # What it imports before its first estimate counts for none.
+                if seconds > self._limits.wall_seconds * 1.5 + GRACE and _remains(record, "").begun:
                     _late(record).write_bytes(b"killed")
                     _kill(record)
 
     def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
         """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
-        for job, record, seconds in self._seconds():
+        for record, seconds in self._seconds():
             if seconds > least:
+                job = self._at_work[record]
                 yield job, _remains(record, "").begun or job.keys, seconds
 
     def close(self) -> None:
