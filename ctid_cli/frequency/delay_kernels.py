@@ -65,14 +65,18 @@ class Clock(NamedTuple):
 @njit(cache=True, nogil=True)
 def add_row(row: Array, gram: Array) -> None:
     """Add a row to second moments, unless a sample of it is missing."""
-    if np.isfinite(row[0]):
-        gram += np.outer(row, row)
+    for i in range(row.size if np.isfinite(row[0]) else 0):
+        for j in range(row.size):
+            gram[i, j] += row[i] * row[j]
 
 
 @njit(cache=True, nogil=True)
 def residual_of(row: Array, theta: Array) -> float:
     """Residual ``psi - phi' theta`` of a row ``[phi psi]``."""
-    return float(row[-1] - np.sum(theta * row[:-1]))
+    residual = row[theta.size]
+    for i in range(theta.size):
+        residual -= theta[i] * row[i]
+    return float(residual)
 
 
 @njit(cache=True, nogil=True)
@@ -98,7 +102,9 @@ def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
         return False, factor, scales
     for i in range(n):
         for j in range(i + 1):
-            total = gram[i, j] / (scales[i] * scales[j]) - np.sum(factor[i, :j] * factor[j, :j])
+            total = gram[i, j] / (scales[i] * scales[j])
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
             if i > j:
                 factor[i, j] = total / factor[j, j]
             elif total + ridge > 4e-16 * n:
@@ -112,11 +118,16 @@ def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
 @njit(cache=True, nogil=True)
 def substitute(factor: Array, scales: Array, values: Array) -> None:
     """Solve ``S L L' S x = b`` in place, with S the scales."""
+    n = values.size
     values /= scales
-    for i in range(values.size):
-        values[i] = (values[i] - np.sum(factor[i, :i] * values[:i])) / factor[i, i]
-    for i in range(values.size - 1, -1, -1):
-        values[i] = (values[i] - np.sum(factor[i + 1 :, i] * values[i + 1 :])) / factor[i, i]
+    for i in range(n):
+        for k in range(i):
+            values[i] -= factor[i, k] * values[k]
+        values[i] /= factor[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            values[i] -= factor[k, i] * values[k]
+        values[i] /= factor[i, i]
     values /= scales
 
 
@@ -150,7 +161,8 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
     variance = squares / n - mean * mean
     if not variance >= 0.0:
         return False
-    roots[:] = mean + np.sqrt(2.0 * variance) * np.cos(np.pi * (np.arange(n) + 0.5) / n)
+    for i in range(n):
+        roots[i] = mean + np.sqrt(2.0 * variance) * np.cos(np.pi * (i + 0.5) / n)
     for _ in range(ROOT_STEPS):
         settled = True
         for i in range(n):
@@ -173,7 +185,7 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
 def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
     """Frequencies that belong to the parameters of the delay regression, ascending; flags what was wrong."""
     flags, n = 0, theta.size
-    if not np.isfinite(theta).all():
+    if not np.isfinite(np.sum(theta)):
         omega[:] = np.nan
         return COMPLEX_ROOTS
     if not real_roots(theta, roots):
@@ -184,11 +196,13 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
         companion[1:, : n - 1] = np.eye(n - 1)
         roots[:] = np.linalg.eigvals(companion).real
     # The largest cosine is that of the lowest frequency, and order survives the bounds.
-    found = np.sort(roots)[::-1]
-    roots[:] = np.minimum(np.maximum(found, clock.bottom), clock.top)
-    if (roots != found).any():
-        flags |= OUT_OF_BOUNDS
-    omega[:] = np.arccos(roots) / clock.delay
+    if n > 2 or flags:
+        roots[:] = np.sort(roots)[::-1]
+    for i in range(n):
+        if roots[i] < clock.bottom or roots[i] > clock.top:
+            roots[i] = min(max(roots[i], clock.bottom), clock.top)
+            flags |= OUT_OF_BOUNDS
+        omega[i] = np.arccos(roots[i]) / clock.delay
     return flags
 
 

@@ -273,18 +273,18 @@ def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool
     ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN
     change nothing.
     """
-    n, (z, q) = gains.size, steps
+    z, q = steps
     for k in range(len(mixed)):
-        delta = mixed[k, n]
-        if np.isfinite(delta):
-            # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
-            x = gains * delta * delta
-            m = -np.expm1(-x)
-            z += gains * np.where(x > 1e-8, m / x, 1.0 - 0.5 * x) * delta * mixed[k, :n] - m * z
-            q += m * (1.0 - q)
-        theta[k] = z + (1.0 - q) * initial
-        if finite_time:
-            theta[k] = np.where(q > 0.0, z / q, theta[k])
+        delta = mixed[k, -1]
+        for i in range(gains.size):
+            if np.isfinite(delta):
+                # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
+                x = gains[i] * delta * delta
+                m = -np.expm1(-x)
+                gain = gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
+                z[i] += gain * delta * mixed[k, i] - m * z[i]
+                q[i] += m * (1.0 - q[i])
+            theta[k, i] = z[i] / q[i] if finite_time and q[i] > 0.0 else z[i] + (1.0 - q[i]) * initial[i]
 
 
 @njit(cache=True, nogil=True)
