@@ -20,7 +20,7 @@ from ctid_cli.frequency import delay_kernels
 from ctid_cli.frequency.flags import Flag
 
 #: Packages that a kernel may use: Numba compiles what it knows of them into it.
-PUBLIC = {"math", "numba", "numpy"}
+PUBLIC = {"cmath", "math", "numba", "numpy"}
 #: Names of annotations that say nothing of what is compiled. A named tuple does: the order of its fields.
 PLAIN = {"Array", "BoolArray", "ComplexArray", "IndexArray", "IntArray", "NDArray", "NamedTuple"}
 

@@ -175,9 +175,9 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
 
 def moving(r: Readings, bounds: IndexArray) -> BoolArray:
     """Return which readings are lines that one moving tone makes, as shorter windows show."""
-    refuted = refute(r.omega, r.error, r.window, r.gap, r.low, r.high, bounds, c.COVERED)
     if not (r.gap > 0.0).any():
-        return np.asarray(refuted)
+        return np.zeros(r.row.size, np.bool_)
+    refuted = refute(r.omega, r.error, r.window, np.stack((r.gap, r.low, r.high)), bounds, c.COVERED)
     line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
     share: Array = np.bincount(line, refuted) / np.bincount(line)
     return np.asarray(refuted | (share[line] > c.REFUTED))

@@ -30,7 +30,7 @@ class Conditioned(NamedTuple):
         if self.weights.size == 1:
             return np.ones_like(turn)
         response = np.abs(rfft(self.weights, 2 * c.RESPONSE_PADDING * self.weights.size))
-        return np.interp(turn / self.factor, np.linspace(0.0, np.pi, response.size), response)
+        return np.asarray(np.interp(turn / self.factor, np.linspace(0.0, np.pi, response.size), response))
 
 
 def condition(samples: Array, interval: float) -> Conditioned:

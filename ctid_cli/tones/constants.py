@@ -5,16 +5,14 @@ tracker. What has neither that mark nor a source is a choice; the benchmark test
 compiled fit are in :mod:`ctid_cli.tones.tone_kernels`.
 """
 
-from typing import NamedTuple
-
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
 #: Name of the method in files.
 METHOD = "tone_windows"
 #: A row is accurate if its standard error is at most this share of the frequency, unless another limit is given.
 USUAL_ACCURACY = 0.001
-#: Most tones that can be asked for, and lines that are fitted in one window: 321 equations. The lowest string of a guitar
-#: shows 45 at once. Measured.
+#: Most tones that can be asked for, and lines that are fitted in one window: 321 equations. A low string of a guitar
+#: shows 45 of them at once. Measured.
 MOST_ASKED = 64
 MOST_LINES = 64
 #: Rows of a track if nobody says how many: what a figure shows.
@@ -23,16 +21,6 @@ USUAL_ROWS = 1000
 MOST_MISSING = 5
 #: Share of the Nyquist frequency above which a tone may be the image of one that the sampling has folded.
 SUSPICIOUS = 0.9
-
-
-class Limits(NamedTuple):
-    """What the fit of a window may take."""
-
-    #: Lines, rounds in which lines join, and steps of one stage of one round.
-    lines: int
-    rounds: int
-    steps: int
-
 
 # --- record ---------------------------------------------------------------------------------------------------------
 
@@ -111,10 +99,13 @@ SAMPLES_PER_PARAMETER = 3
 APART = 1.5
 #: Tones of shorter windows are the start in longer ones if their amplitude is so many standard errors.
 SURE = 6.0
-#: Most steps of a fit. A record of few tones that hold throughout is fitted at once, with fewer: that takes a tenth of
-#: the time of windows of all lengths. Lines of what is left are looked for in windows shorter by this factor each.
+#: Most steps of a stage of a fit. A record of few tones that hold throughout is fitted at once, in few rounds of few
+#: steps: that takes a tenth of the time of windows of all lengths. Lines of what is left are looked for in windows that
+#: are shorter by the last factor each.
 MOST_STEPS = 30
-STEADY = Limits(8, 2, 8)
+STEADY_LINES = 8
+STEADY_ROUNDS = 2
+STEADY_STEPS = 8
 STEADY_STEP = 4
 #: Samples of the windows that are computed together: what stays in the cache. No result depends on it.
 BLOCK_SAMPLES = 2**17

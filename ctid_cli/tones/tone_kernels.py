@@ -1,5 +1,6 @@
 """Compiled loops over the samples of windows: the fit of decaying chirps, and changes within a window."""
 
+import cmath
 import math
 
 import numpy as np
@@ -53,18 +54,18 @@ def _first_phasors(tone: Array, du: float, phasors: Array) -> complex:
     chunk = phasors.shape[1]
     ahead = chunk * du
     # phi(u + d) - phi(u) = w d + c (2 u d + d^2), at u = -1 to the next sample, and to the next chunk
-    z = np.exp(complex(-growth, bend - turn))
-    q = np.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
-    p = np.exp(complex(0.0, 2.0 * bend * du * du))
-    leap = np.exp(complex(growth * ahead, turn * ahead + bend * (ahead * ahead - 2.0 * ahead)))
-    longer = np.exp(complex(0.0, 2.0 * bend * ahead * du))
+    z = cmath.exp(complex(-growth, bend - turn))
+    q = cmath.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
+    p = cmath.exp(complex(0.0, 2.0 * bend * du * du))
+    leap = cmath.exp(complex(growth * ahead, turn * ahead + bend * (ahead * ahead - 2.0 * ahead)))
+    longer = cmath.exp(complex(0.0, 2.0 * bend * ahead * du))
     for j in range(chunk):
         phasors[0, j], phasors[1, j] = z.real, z.imag
         phasors[2, j], phasors[3, j] = leap.real, leap.imag
         z *= q
         q *= p
         leap *= longer
-    return complex(np.exp(complex(0.0, 2.0 * bend * ahead * ahead)))
+    return complex(cmath.exp(complex(0.0, 2.0 * bend * ahead * ahead)))
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -136,22 +137,21 @@ def _equations(
             _take_tone(tones[k], phasors[4 * k : 4 * k + 4], known, u, of_tone, rest)
             if first + chunk < length:
                 _turn(phasors[4 * k : 4 * k + 4], further[k], scratch)
-        rows[last, :here] = known
+        # Assigning an array to a slice would take seconds to compile.
+        for j in range(here):
+            rows[last, j] = known[j]
         total += _product(rest, rest, here)
         for a in range(last + 1):
             right[a] += _product(rows[a], rest, here)
-        gram[last, last] += _product(known, known, here)
-        for k in range(n):
-            wide = SEPARATE_BINS * math.pi + 2.0 * abs(tones[k, 4])
-            if abs(tones[k, 3]) < wide:
-                for a in range(PARAMETERS * k, PARAMETERS * (k + 1)):
-                    gram[last, a] += _product(rows[a], known, here)
+            # The tone that a parameter belongs to, and how far from it others matter; the constant is at zero.
+            k = min(a // PARAMETERS, n - 1)
+            turn = tones[k, 3] if a < last else 0.0
+            wide = SEPARATE_BINS * math.pi + (2.0 * abs(tones[k, 4]) if a < last else 0.0)
             for m in range(k + 1):
-                if abs(tones[k, 3] - tones[m, 3]) >= wide + 2.0 * abs(tones[m, 4]):
-                    continue
-                for a in range(PARAMETERS * k, PARAMETERS * (k + 1)):
+                if abs(turn - tones[m, 3]) < wide + 2.0 * abs(tones[m, 4]):
                     for b in range(PARAMETERS * m, min(PARAMETERS * (m + 1), a + 1)):
                         gram[a, b] += _product(rows[a], rows[b], here)
+        gram[last, last] += _product(rows[last], rows[last], here)
     return total
 
 
@@ -239,10 +239,10 @@ def fit_windows(
     converged: BoolArray,
     residuals: Array,
 ) -> None:
-    """Fit the tones of some windows by Levenberg-Marquardt steps, at most so many of a stage, starting from the parameters that they have.
+    """Fit the tones of some windows by Levenberg-Marquardt steps, starting from the parameters that they have.
 
-    ``parameters`` are of shape (R, n, 5), and their ``covariances``, in units of the noise variance, (R, n, 5, 5); what is
-    left goes to ``residuals``, shape (R, L).
+    A stage takes at most ``most_steps``. ``parameters`` are of shape (R, n, 5), and their ``covariances``, in units of
+    the noise variance, (R, n, 5, 5); what is left goes to ``residuals``, shape (R, L).
     """
     most = PARAMETERS * parameters.shape[1] + 1
     gram, trial_gram = np.zeros((2, most, most))
@@ -294,7 +294,9 @@ def fit_windows(
                         lower = _equations(y, there, trial, level, trial_gram, trial_right, trial_left, work)
                         if lower <= cost:
                             # Nearly every step is taken: its equations are those of the next one.
-                            tones[:] = trial
+                            for k in range(n):
+                                for j in range(PARAMETERS):
+                                    tones[k, j] = trial[k, j]
                             constant, cost, taken = level, lower, taken + 1
                             gram, trial_gram = trial_gram, gram
                             right, trial_right = trial_right, right
@@ -335,11 +337,11 @@ def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArr
             turn, bend = parameters[row, k, 3], parameters[row, k, 4]
             response = 0.0j
             for lag in range(filters.shape[1]):
-                response += filters[row, lag] * np.exp(complex(0.0, -turn * du * lag))
+                response += filters[row, lag] * cmath.exp(complex(0.0, -turn * du * lag))
             phase = math.atan2(-sine, cosine) + math.atan2(response.imag, response.real)
-            z = np.exp(complex(0.0, turn - bend - phase))
-            q = np.exp(complex(0.0, -turn * du - bend * (du * du - 2.0 * du)))
-            p = np.exp(complex(0.0, -2.0 * bend * du * du))
+            z = cmath.exp(complex(0.0, turn - bend - phase))
+            q = cmath.exp(complex(0.0, -turn * du - bend * (du * du - 2.0 * du)))
+            p = cmath.exp(complex(0.0, -2.0 * bend * du * du))
             real, imag, largest, third = 0.0, 0.0, 0.0, 0.0
             for i in range(length):
                 u = du * i - 1.0
@@ -375,17 +377,11 @@ def keep_readings(
 
 @njit(cache=True, nogil=True)
 def refute(
-    omega: Array,
-    error: Array,
-    window: IndexArray,
-    gap: Array,
-    low: Array,
-    high: Array,
-    bounds: IndexArray,
-    covered: float,
+    omega: Array, error: Array, window: IndexArray, comb: Array, bounds: IndexArray, covered: float
 ) -> NDArray[np.bool_]:
     """Return which readings are lines of a comb where a shorter window shows one tone that is elsewhere."""
     refuted = np.zeros(omega.size, np.bool_)
+    gap, low, high = comb
     for row in range(bounds.size - 1):
         for k in range(bounds[row], bounds[row + 1]):
             best = -1

@@ -55,6 +55,17 @@ class _Fits(NamedTuple):
     converged: BoolArray
 
 
+class _Limits(NamedTuple):
+    """Most lines of a window, rounds in which they join, and steps of a stage of each round."""
+
+    lines: int
+    rounds: int
+    steps: int
+
+
+_STEADY = _Limits(c.STEADY_LINES, c.STEADY_ROUNDS, c.STEADY_STEPS)
+
+
 class _Tests(NamedTuple):
     """What is left of windows, and what it shows."""
 
@@ -76,7 +87,7 @@ def fit_tones(
     tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
     # An empty column is kept where there is one: windows without have no room left.
     kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
-    return WindowTones(*(each[:, :kept] if each.ndim == 2 else each for each in tones))
+    return WindowTones._make(each[:, :kept] if each.ndim == 2 else each for each in tones)
 
 
 def fit_steady(samples: Array) -> WindowTones | None:
@@ -85,7 +96,7 @@ def fit_steady(samples: Array) -> WindowTones | None:
     One that does not converge soon is left to shorter windows.
     """
     length = samples.size
-    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), c.STEADY, None)
+    fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
     unexplained = (tests.lines.chance < c.LEVEL) | ~fits.converged
     if unexplained.any() or not fits.used.any():
         return None
@@ -103,17 +114,19 @@ def fit_steady(samples: Array) -> WindowTones | None:
 
 
 def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None) -> WindowTones:
-    fits, tests, _ = _fitted(samples, length, first, c.Limits(most, most, c.MOST_STEPS), shorter)
+    fits, tests, _ = _fitted(samples, length, first, _Limits(most, most, c.MOST_STEPS), shorter)
     return _tones(fits, tests, length)
 
 
 def _fitted(
-    samples: Array, length: int, first: IndexArray, limits: c.Limits, shorter: WindowTones | None
+    samples: Array, length: int, first: IndexArray, limits: _Limits, shorter: WindowTones | None
 ) -> tuple[_Fits, _Tests, Array]:
     """Return fits, what is left of them, and that itself, shape (R, L)."""
     most = limits.lines
     rows, shape = first.size, (first.size, most, PARAMETERS)
-    fits = _Fits(first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_))
+    fits = _Fits(
+        first, np.zeros(rows, np.int64), np.zeros(shape), np.zeros((*shape, PARAMETERS)), np.zeros(rows, np.bool_)
+    )
     if shorter is not None:
         _start(fits, length, shorter)
     residuals = np.empty((rows, length))
