@@ -19,7 +19,10 @@ from typing import Annotated, Any, NoReturn, TypeVar, cast
 import typer
 from typer.core import TyperCommand
 
+from ctid_cli.canonical import plain
+from ctid_cli.cli._options import with_option_groups
 from ctid_cli.errors import CtidError, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.reporting.document import Format, Result
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
 
@@ -128,6 +131,18 @@ def answer(
         typer.echo(text() + (f"\n\nWritten: {', '.join(names)}" if names else ""))
 
 
+def emit(result: Result, form: Format, written: Sequence[Path] = ()) -> None:
+    """Print a result in the form that is asked for, and name the files that were written."""
+    names = list(map(str, written))
+    if form == "json":
+        content = result.content()
+        typer.echo(json.dumps(plain({**content, "written": names} if names else content), allow_nan=False))
+        return
+    typer.echo(result.write(form))
+    if names and form == "text":
+        typer.echo(f"\nWritten: {', '.join(names)}")
+
+
 def refuse_overwriting(inputs: Iterable[Path], written: Iterable[Path]) -> None:
     """Refuse to write over what is read."""
     for file, path in itertools.product(inputs, written):
@@ -160,8 +175,9 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
-def guarded(command: Function) -> Function:
-    """Turn the exceptions of a command into one message and an exit code."""
+def guarded(function: Function) -> Function:
+    """Turn the exceptions of a command into one message and an exit code, and its option groups into options."""
+    command = with_option_groups(function)
 
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> None:

@@ -1,12 +1,17 @@
 """Columns over time as a file: CSV, or HDF5 with the units as attributes."""
 
+from __future__ import annotations
+
 import csv
 import io
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[str, str | None]) -> bytes:
@@ -29,6 +34,11 @@ def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[
             if units.get(name) is not None:
                 column.attrs["unit"] = units[name]
     return file.getvalue()
+
+
+def frame_bytes(frame: pd.DataFrame) -> bytes:
+    """The CSV file of a table, with an empty field where there is no finite number."""
+    return columns_bytes({str(name): frame[name].to_numpy() for name in frame}, "csv", {})
 
 
 def _cells(values: NDArray[Any]) -> list[Any]:
