@@ -14,9 +14,9 @@ from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.order_command import order
+from ctid_cli.cli.reproduce_command import reproduce
 from ctid_cli.cli.result_commands import export, figure, report, show, status, table
 from ctid_cli.cli.storage_commands import merge, verify
-from ctid_cli.cli.study_command import study
 from ctid_cli.cli.track_command import track
 
 # Plain help and error texts: they read well in log files, and leave rich out of the start-up.
@@ -55,10 +55,9 @@ app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
 _STORED = (status, show, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, show, export, verify)
-for _command in (fit, order, frf, track, init, run, merge, *_RESULTS, validate, schema):
+for _command in (fit, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 app.add_typer(model, name="model")
-app.add_typer(study, name="study")
 
 
 def main() -> None:

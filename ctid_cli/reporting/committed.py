@@ -17,8 +17,8 @@ NEEDED = ("table", "experiment", "initial_delay", "method", "n", "converged")
 
 
 def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
-    """File of a study's committed tables; an installed package has none."""
-    folder = data_folder("experiments").parent / "results" / "published" / study.replace("-", "_")
+    """Return the file of a study's committed tables, None if there is none."""
+    folder = data_folder("results/published") / study.replace("-", "_")
     return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
 
 

@@ -8,6 +8,8 @@ from typing import Any, Literal, NamedTuple
 
 import yaml
 
+from ctid_cli.custom_code import DATA
+
 InitialDelay = float | Literal["random"] | None
 
 #: The study that a bare table number means.
@@ -58,10 +60,8 @@ class Study:
 
 
 def data_folder(name: str) -> Path:
-    """A folder that is shipped with the program: ``experiments`` or ``configs``."""
-    package = Path(__file__).resolve().parents[1]
-    packaged = package / f"_{name}"
-    return packaged if packaged.is_dir() else package.parent / name
+    """Return a folder that is shipped with the program: ``experiments``, ``configs`` or ``results/published``."""
+    return DATA / name
 
 
 @cache

@@ -11,9 +11,9 @@ from ctid_cli.reporting.layout import Report, Table, count
 from ctid_cli.reporting.pages.page import inline, report_of, written
 from ctid_cli.reporting.results import experiments_in, out_option
 from ctid_cli.reporting.study import study_contents
-from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, read_study
-from ctid_cli.studies.claim import claims_table
-from ctid_cli.studies.publishing import evaluate, published_folder, published_texts
+from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, published_folder, read_study
+from ctid_cli.studies.claims import check_claims
+from ctid_cli.studies.publishing import published_texts
 
 CLAIMS = "claims.md"
 
@@ -25,13 +25,13 @@ def study_page(study: StudyFolder, out: Path) -> str:
     if own:
         found = read_study(study, out)
         texts = {name: text for name, text in published_texts(found).items() if name.endswith(".md")}
-        texts[CLAIMS] = claims_table(evaluate(found), "md")
+        texts[CLAIMS] = check_claims(study, out).write("md")
         origin = [f"Results in {out.name}: {', '.join(study.configs)}."]
     elif published.is_dir():
         texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
         origin = list(_published_origin(published, study.name))
     else:
-        command = f"ctid study run {study.name}{out_option(out)}"
+        command = f"ctid reproduce {study.name}{out_option(out)}"
         raise UsageError(f"an installed package does not hold the results of {study.name}; run first: {command}")
     # Claims that the tables already state are there once.
     claims = texts.pop(CLAIMS, None)
@@ -48,7 +48,7 @@ def study_page(study: StudyFolder, out: Path) -> str:
         figures=list(_figures(study, out, published, own=own)),
         provenance=[
             *origin,
-            f"To compute it again: ctid study run {study.name}; to check it: ctid study check {study.name}",
+            f"To compute it again: ctid reproduce {study.name}; to check it: ctid reproduce --check {study.name}",
         ],
         cite=f"ctid {ctid_cli.__version__}, study {study.name}." + (f" {cited}." if cited else ""),
     )

@@ -7,7 +7,7 @@ import numpy as np
 from ctid_cli.reporting.parameter_errors import mse_ratio
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import last_part
-from ctid_cli.studies.claim import Claim, within
+from ctid_cli.studies.claims import Claim, within
 
 from .measures import by_estimator, errors_of, is_misused
 

@@ -6,7 +6,7 @@ from ctid_cli.reporting.comparison import compare
 from ctid_cli.reporting.percentages import study_rows
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import load_study
-from ctid_cli.studies.claim import Claim, within
+from ctid_cli.studies.claims import Claim, within
 
 #: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
 RELIABLE = ("redundancy", "delay_profile")

@@ -1,4 +1,4 @@
-"""``ctid study``: what each study has, its claims, the first estimates, and what is refused to be published."""
+"""``ctid reproduce``: what each study has, its claims, the first estimates, and what is refused to be published."""
 
 import dataclasses
 import json
@@ -6,9 +6,9 @@ import json
 import pytest
 
 from ctid_cli.errors import RefusedError, UsageError
-from ctid_cli.studies import catalogue, first_estimates, publishing
+from ctid_cli.studies import catalogue, claims, first_estimates, publishing
 from ctid_cli.studies.catalogue import all_studies, find_study, read_study
-from ctid_cli.studies.claim import Claim
+from ctid_cli.studies.claims import Claim
 from tests.reporting.frequency_results import run_here
 
 STUDIES = all_studies()
@@ -35,13 +35,8 @@ def out(tmp_path_factory):
     return folder
 
 
-def test_list_names_every_study_and_specification(ctid):
-    text = ctid("study", "list").stdout
-    for study in STUDIES.values():
-        assert f"{study.name}: {study.title}" in text
-        for experiment, config in study.configs.items():
-            assert f"  {experiment}  configs/{config}" in text
-    assert list(STUDIES) == ["additive", "coverage", "finite-time-frequency", "useful-redundancy"]
+def test_list_names_every_study_and_specification(ctid, snapshot):
+    assert ctid("reproduce", "--list").stdout == snapshot
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))
@@ -76,22 +71,28 @@ def test_studies_are_never_loaded_from_the_working_directory(monkeypatch, tmp_pa
 
 
 def test_unknown_studies_are_refused(ctid):
-    assert "there is no study named 'addition'" in ctid("study", "run", "addition", code=2).stderr
+    assert "there is no study named 'addition'" in ctid("reproduce", "addition", code=2).stderr
 
 
 def test_what_was_not_run_does_not_hold(ctid, tmp_path):
-    done = ctid("study", "check", "coverage", "--out", tmp_path, code=7)
+    done = ctid("reproduce", "--check", "coverage", "--out", tmp_path, code=7)
     claims = len(find_study("coverage").configs)
     assert done.stdout.count("was run") == claims
-    assert f"{claims} of the claims do not hold" in done.stderr
+    assert f"coverage: {claims} claims do not hold" in done.stderr
+
+
+def test_actions_exclude_each_other(ctid):
+    assert "--check and --publish exclude each other" in ctid("reproduce", "--check", "--publish", code=2).stderr
 
 
 def test_run_runs_every_specification(ctid, tmp_path, monkeypatch):
-    from ctid_cli.cli import study_command
+    from ctid_cli.cli import experiment_commands
 
     calls = []
-    monkeypatch.setattr(study_command, "run", lambda configs, **options: calls.append(options | {"configs": configs}))
-    ctid("study", "run", "coverage", "--runs", 3, "--jobs", 1, "--out", tmp_path)
+    monkeypatch.setattr(
+        experiment_commands, "run", lambda configs, **options: calls.append(options | {"configs": configs})
+    )
+    ctid("reproduce", "coverage", "--runs", 3, "--jobs", 1, "--out", tmp_path)
     (call,) = calls
     assert [file.name for file in call["configs"]] == [
         config.partition("/")[2] for config in find_study("coverage").configs.values()
@@ -176,12 +177,25 @@ def clean(monkeypatch):
     return answers
 
 
-def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
-    target = tmp_path / "published"
+@pytest.fixture
+def target(monkeypatch, tmp_path):
+    """The folder that everything is published in."""
+    for module in (publishing, claims):
+        monkeypatch.setattr(module, "published_folder", lambda study: tmp_path / "published")
+    return tmp_path / "published"
+
+
+def checked(small, out, *found):
+    return claims.CheckedClaims(read_study(small, out), found)
+
+
+def test_everything_is_published_with_its_commit(small, out, target, clean):
     (target / "figures").mkdir(parents=True)
     (target / "figures" / "figure_9.svg").write_text("old", encoding="utf-8")
-    claims = [Claim("one", "1", "at most 2", True, "two-tones"), Claim("other", "3", "at most 2", False, "two-tones")]
-    publishing.publish(read_study(small, out), claims, target)
+    first = Claim("one", "1", "at most 2", True, "two-tones")
+    other = Claim("other", "3", "at most 2", False, "two-tones")
+    assert checked(small, out, first).changed == []
+    publishing.publish(checked(small, out, first, other), out)
     assert {file.relative_to(target).as_posix() for file in target.rglob("*.*")} == {
         "settling.csv", "claims.md", "claims.csv", "environment.json", "figures/figure_1.svg",
     }  # fmt: skip
@@ -189,21 +203,19 @@ def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
     assert environment == {"commit": "1234abcd", "sessions": {"two-tones": []}}
     assert "| two-tones | other | 3 | at most 2 | NO |" in (target / "claims.md").read_text(encoding="utf-8")
     assert "1 of 2 hold" in (target / "claims.md").read_text(encoding="utf-8")
-    changed = publishing.against_published([dataclasses.replace(claims[1], holds=True), claims[0]], target)
-    assert changed == [claims[1]]
-    assert publishing.against_published(claims, tmp_path / "nowhere") == []
+    assert checked(small, out, dataclasses.replace(other, holds=True), first).changed == [other]
 
 
 def test_changed_files_are_not_published(small, out, tmp_path, clean):
     clean["status"] = " M ctid_cli/signals/record.py"
     with pytest.raises(RefusedError, match=r"not committed:\n M ctid_cli/signals/record\.py"):
-        publishing.publish(read_study(small, out), [], tmp_path)
+        publishing.publish(checked(small, out), out)
 
 
 def test_results_of_other_code_are_not_published(small, out, tmp_path, clean, monkeypatch):
     monkeypatch.setattr(publishing, "current_version", lambda plan: "d")
     with pytest.raises(RefusedError, match="was not computed by the code that is checked out"):
-        publishing.publish(read_study(small, out), [], tmp_path)
+        publishing.publish(checked(small, out), out)
 
 
 def test_mixed_results_are_not_published(small, out, tmp_path, clean):
@@ -212,10 +224,10 @@ def test_mixed_results_are_not_published(small, out, tmp_path, clean):
     (origin,) = results.stored.origins
     results.stored.export.origins = (origin, origin._replace(code_version="d"))
     with pytest.raises(RefusedError, match="mixes results"):
-        publishing.publish(found, [], tmp_path)
+        publishing.publish(claims.CheckedClaims(found, []), out)
 
 
 def test_an_installed_package_publishes_nothing(small, out, tmp_path, monkeypatch):
-    monkeypatch.setattr(publishing, "data_folder", lambda name: tmp_path / "package" / f"_{name}")
+    monkeypatch.setattr(publishing, "DATA", tmp_path / "package" / "_data")
     with pytest.raises(UsageError, match="from a checkout of the repository"):
-        publishing.publish(read_study(small, out), [], tmp_path)
+        publishing.publish(checked(small, out), out)
