@@ -11,7 +11,6 @@ import numpy as np
 import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.experiment_plot import Kind, experiment_drawing, kinds_of, main_measure
-from ctid_cli.reporting.figures.measure_plot import FEWEST
 from ctid_cli.reporting.layout import Report, Table, count
 from ctid_cli.reporting.measure_tables import measure_report
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
@@ -37,10 +36,7 @@ FAILURES_LISTED = 20
 #: What the figures show.
 CAPTIONS: dict[Kind, str] = {
     "measure": "over all settings",
-    "errors": "Errors of two parameters against each other, one point for each data set",
-    "delays": "Where the estimated delays lie",
     "box": "How the errors of each parameter are spread",
-    "convergence": "How sure that is: the same from the first data sets only",
 }
 
 
@@ -107,15 +103,8 @@ def _figures(results: Results, out: Path) -> Iterator[dict[str, Any]]:
     except UsageError:
         return
     name = main_measure(results)
-    # From so few data sets it is one point.
-    few = max(cell["replicates"] for cell in results.manifest["data_cells"]) <= FEWEST
     for kind in kinds:
-        if kind == "convergence" and few:
-            continue
-        try:
-            drawing = experiment_drawing(results, kind, name if kind in ("measure", "convergence") else None)
-        except UsageError:
-            continue
+        drawing = experiment_drawing(results, kind, name if kind == "measure" else None)
         caption = f"{name.capitalize()} {CAPTIONS[kind]}" if kind == "measure" else CAPTIONS[kind]
         command = f"ctid figure {results.experiment} --kind {kind}{out_option(out)}"
         yield {"svg": inline(drawing.laid_out_once(), kind), "caption": caption, "command": command}

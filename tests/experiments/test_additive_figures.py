@@ -9,12 +9,12 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.figures import frequency_plot
-from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, labelled, mse_svg, symbol
 from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
+from experiments.additive import frequency_plot
+from experiments.additive.parameter_plot import bias_svg, coverage_svg, labelled, mse_svg, symbol
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 STUDY = find_study("additive")

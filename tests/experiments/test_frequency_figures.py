@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures import error_plot
-from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import read_results
 from ctid_cli.studies.catalogue import find_figures, require_results
+from experiments.finite_time_frequency import error_plot
+from experiments.finite_time_frequency.error_plot import Curve, Group, Row, errors_svg
 from tests.reporting.frequency_results import STUDY, run_here
 
 figures = STUDY.module("figures")

@@ -10,10 +10,10 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.filtering.filter_set import FilterSet, check_filters, extrema, ideal_cost
-from ctid_cli.reporting.figures.search_plot import costs_svg, landscape, trajectory_svg
 from ctid_cli.reporting.figures.style import STRIPES, outline, ramp, spread
 from ctid_cli.studies import catalogue
 from ctid_cli.studies.catalogue import find_figures, find_study
+from experiments.useful_redundancy.search_plot import costs_svg, landscape, trajectory_svg
 
 useful_redundancy = find_study("useful-redundancy").module("figures")
 CASE_1, CASE_2 = useful_redundancy.CASE_1, useful_redundancy.CASE_2
@@ -136,7 +136,7 @@ def test_legs_follow_the_search(name, request):
 
 
 def test_stars_are_drawn_where_the_search_switched(switching):
-    from ctid_cli.reporting.figures import search_plot
+    from experiments.useful_redundancy import search_plot
 
     assert switching.fit.switches
     axes = Recorder()
