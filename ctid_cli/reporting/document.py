@@ -35,7 +35,8 @@ class Section:
     formats: Mapping[str, str] = field(default_factory=dict)
     #: Sentences below the table: what its columns mean.
     notes: Sequence[str] = ()
-    drawing: Drawing | None = None
+    #: A figure that is still to be drawn, or an SVG file.
+    drawing: Drawing | bytes | None = None
     caption: str = ""
 
 
@@ -60,7 +61,9 @@ class Result(ABC):
 
     def plot(self) -> Figure:
         """Draw the main figure of the result."""
-        return next(section.drawing for section in self.sections() if section.drawing is not None).figure()
+        from ctid_cli.reporting.figures.style import Drawing
+
+        return next(each.drawing.figure() for each in self.sections() if isinstance(each.drawing, Drawing))
 
     def summary(self) -> str:
         """Return the result as text."""
@@ -91,14 +94,14 @@ def _is_named(frame: pd.DataFrame) -> bool:
     return frame.index.name is not None
 
 
-def _lines(section: Section) -> tuple[list[list[str]], str]:
-    """Header and rows of a table as texts, and the side to which each column is aligned: texts left, numbers right."""
+def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
+    """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
     assert section.frame is not None
     frame = section.frame.reset_index() if _is_named(section.frame) else section.frame
     columns, sides = [], ""
-    for name in map(str, frame.columns):
-        values = frame[name].tolist()
-        columns.append([name, *(cell(value, section.formats.get(name, ".6g")) for value in values)])
+    for name, values in frame.items():
+        form = section.formats.get(str(name), ".6g")
+        columns.append([str(name), *(cell(value, form) for value in values.tolist())])
         sides += "r" if all(map(_is_number, columns[-1][1:])) else "l"
     return [list(row) for row in zip(*columns, strict=True)], sides
 
@@ -113,7 +116,7 @@ def render_text(sections: Iterable[Section]) -> str:
     for section in sections:
         parts = [section.title] if section.title else []
         parts += [_paragraph(sentence) for sentence in section.sentences]
-        parts += [_text_table(*_lines(section))] if section.frame is not None else []
+        parts += [_text_table(*aligned_lines(section))] if section.frame is not None else []
         parts += [_paragraph(note) for note in section.notes]
         blocks += ["\n".join(parts)] if parts else []
     return "\n\n".join(blocks)
@@ -137,7 +140,7 @@ def render_markdown(sections: Iterable[Section]) -> str:
     for section in sections:
         blocks += [f"### {section.title}"] if section.title else []
         blocks += section.sentences
-        blocks += [_markdown_table(*_lines(section))] if section.frame is not None else []
+        blocks += [_markdown_table(*aligned_lines(section))] if section.frame is not None else []
         blocks += section.notes
     return "\n\n".join(blocks)
 
@@ -154,7 +157,7 @@ def render_latex(sections: Iterable[Section]) -> str:
     for section in sections:
         comments = [section.title] if section.title else []
         blocks += [f"% {line}" for text in (*comments, *section.sentences) for line in text.splitlines()]
-        blocks += [_latex_table(*_lines(section))] if section.frame is not None else []
+        blocks += [_latex_table(*aligned_lines(section))] if section.frame is not None else []
         blocks += [f"% {line}" for text in section.notes for line in text.splitlines()]
     return "\n\n".join(blocks)
 
@@ -178,7 +181,7 @@ def render_html(sections: Iterable[Section]) -> str:
 
 def html_table(section: Section, limit: int | None = None) -> str:
     """Return the table of a section as HTML, of a long one the first rows."""
-    (header, *rows), sides = _lines(section)
+    (header, *rows), sides = aligned_lines(section)
     styles = [f' style="text-align: {"left" if side == "l" else "right"}"' for side in sides]
 
     def row(tag: str, texts: Sequence[str]) -> str:
