@@ -14,8 +14,9 @@ from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
 from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.order_command import order
+from ctid_cli.cli.page_commands import figure, report
 from ctid_cli.cli.reproduce_command import reproduce
-from ctid_cli.cli.result_commands import export, figure, report, show, status, table
+from ctid_cli.cli.result_commands import export, show, status, table
 from ctid_cli.cli.storage_commands import merge, verify
 from ctid_cli.cli.track_command import track
 

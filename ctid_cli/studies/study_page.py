@@ -5,17 +5,38 @@ from pathlib import Path
 from typing import Any
 
 import ctid_cli
+from ctid_cli.errors import UsageError
 from ctid_cli.reporting.committed import environment_of, made_by
 from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
-from ctid_cli.reporting.results import experiments_in, out_option
+from ctid_cli.reporting.results import experiments_in, out_option, read_results
 from ctid_cli.reporting.study import study_contents
-from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, published_folder, read_study
+from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, all_studies, published_folder, read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
-from ctid_cli.text import count
+from ctid_cli.text import count, did_you_mean
 
 CLAIMS = "claims.md"
+
+
+def page_of(name: str, out: Path) -> tuple[str, Path]:
+    """Return the page of an experiment or a study, and where it usually goes.
+
+    Raises
+    ------
+    UsageError
+        If there are no results of an experiment, and no study, of this name.
+    """
+    known, studies = experiments_in(out), all_studies()
+    if name in known:
+        results = read_results(out, name)
+        return experiment_page(results, out), results.folder / "report.html"
+    if name in studies:
+        return study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
+    hint = did_you_mean(name, [*known, *studies]) or "."
+    wrong = f"{name!r} is neither an experiment with results in {out} nor a study{hint}"
+    raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
 
 
 def study_page(study: StudyFolder, out: Path) -> str:
