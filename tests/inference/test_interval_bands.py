@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from experiments.coverage import bands
+from benchmarks import interval_bands as bands
 
 RUNS = 40
 

@@ -1,4 +1,4 @@
-"""Whether pointwise bands contain the true responses: ``python -m experiments.coverage.bands [RUNS]``.
+"""Whether pointwise bands contain the true responses: ``python -m benchmarks.interval_bands [RUNS]``.
 
 The data sets of rows a, c, d and f of the study, fitted as there, and of each fit the linearised bands of gain and
 phase, of the step response, and of the output for an input that is not the experiment's. Writes ``bands.csv`` and
@@ -23,7 +23,7 @@ from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.specification.load import load_spec
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 PUBLISHED = ROOT / "results" / "published" / "intervals"
 #: Row of the study, specification, what the noise is taken for, and a time constant of the system [s].
 ROWS = (

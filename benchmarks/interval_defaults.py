@@ -1,4 +1,4 @@
-"""Coverage of 95 % intervals with default settings: ``python -m experiments.coverage.defaults [RUNS [SEED]]``.
+"""Coverage of 95 % intervals with default settings: ``python -m benchmarks.interval_defaults [RUNS [SEED]]``.
 
 Three systems with a delay, after a PRBS and after a step, in white and in coloured noise. ``delay_profile`` is told
 nothing of the noise. Writes ``defaults.csv`` and ``defaults.md`` to ``results/published/intervals``.
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.interval_bands import PUBLISHED
 from ctid_cli.arrays import Array
 from ctid_cli.canonical import plain
 from ctid_cli.estimators.delay_profile import DelayProfile
@@ -27,8 +28,6 @@ from ctid_cli.signals.noise import ArmaNoise, Noise, WhiteNoise
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.storage.truth import found_of_rows
-
-from .bands import PUBLISHED
 
 SAMPLING = RegularSampling(interval=0.05, samples=600)
 DELAY = 0.63  # s, between samples
