@@ -56,10 +56,10 @@ def order(
     here. Residuals that are not white are made so first, by one noise model for all. Writes order.json and order.svg.
     """
     from ctid_cli.estimators.order_search import search_orders
-    from ctid_cli.reporting.identification_report import common_units
     from ctid_cli.reporting.order_plot import order_drawing
     from ctid_cli.reporting.order_proposal import proposed_delay
     from ctid_cli.reporting.order_report import order_object, order_text
+    from ctid_cli.reporting.records import Records
     from ctid_cli.signals.measurement import read_measurement
 
     check_integrators(integrators, offset)
@@ -68,7 +68,7 @@ def order(
     read = partial(read_measurement, time=time, input=input, output=output, hold=hold)
     measurements = [read(file, start=start, stop=stop) for file in files]
     other = None if validate is None else read(validate)
-    units = common_units(measurements if other is None else [*measurements, other])
+    units = Records(measurements, other).units
     said = ""
     if bounds is None:
         bounds, said = proposed_delay([item.record for item in measurements], units.time)

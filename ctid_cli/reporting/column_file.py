@@ -37,8 +37,8 @@ def columns_bytes(table: Mapping[str, NDArray[Any]], style: str, units: Mapping[
 
 
 def frame_bytes(frame: pd.DataFrame) -> bytes:
-    """The CSV file of a table, with an empty field where there is no finite number."""
-    return columns_bytes({str(name): frame[name].to_numpy() for name in frame}, "csv", {})
+    """Return the CSV file of a table, with all digits, and an empty field where there is no number."""
+    return frame.to_csv(index=False, lineterminator="\n").encode()
 
 
 def _cells(values: NDArray[Any]) -> list[Any]:

@@ -8,8 +8,8 @@ from typing import Any
 from ctid_cli.canonical import plain
 from ctid_cli.estimators.order_search import FittedOrder, OrderSearch
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.identification_report import notes_of, records_line, records_object
 from ctid_cli.reporting.layout import Report, Table, count, number, picked
+from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import wrapped
 
@@ -23,7 +23,7 @@ def order_object(
     """An order search for ``order.json``."""
     best = found.recommended
     content = {
-        **records_object(measurements, units),
+        **Records(measurements).content(),
         "recommended": None if best is None else {"poles": best.options.poles, "zeros": best.options.zeros},
         "reason": found.reason,
         "noise_order": found.noise.order,
@@ -62,7 +62,7 @@ def order_text(found: OrderSearch, measurements: Sequence[Measurement], units: U
     verdict = found.reason
     if best is not None:
         verdict = f"Recommended: {spelled(best)}. {found.reason}"
-    notes = notes_of(measurements)
+    notes = Records(measurements).notes
     if found.noise.order:
         notes.append(
             f"The residuals are not white: the criteria are of the innovations, with one autoregressive noise model of "
@@ -73,7 +73,7 @@ def order_text(found: OrderSearch, measurements: Sequence[Measurement], units: U
         notes.append(f"* A pole runs to infinity, so that the model is one with fewer poles: {', '.join(lost)}.")
     if len(found.orders) > ROWS:
         notes.append(f"The {ROWS} structures of least BIC of {len(found.orders)}; all are in order.json.")
-    head = f"{records_line(measurements)}, {count(len(found.orders), 'structure')}"
+    head = f"{Records(measurements).line}, {count(len(found.orders), 'structure')}"
     lines = [wrapped(head), wrapped(verdict), "", Report([[_table(found, units)]]).draw()]
     return "\n".join([*lines, *([""] if notes else []), *(wrapped(f"- {note}", hanging="  ") for note in notes)])
 
