@@ -140,7 +140,6 @@ def _fraction(asked: Asked) -> Options:
     from ctid_cli.estimators.delay_profile import DelayProfile
 
     assert asked.model.poles is not None
-    chosen = asked.treatment
     treatment: dict[str, Any] = {
         "initial_state": asked.treatment.initial_state,
         "offset": asked.treatment.offset,

@@ -9,6 +9,7 @@ import typer
 
 from ctid_cli.cli._common import AllowCode, Json, Out, answer, guarded, write_files
 from ctid_cli.errors import MismatchError, UsageError
+from ctid_cli.reporting.document import Tool
 
 
 @guarded
@@ -148,16 +149,30 @@ def show(
 
 @guarded
 def export(
-    experiment: Annotated[str, typer.Argument(metavar="EXPERIMENT", help="Name of the experiment.")],
-    style: Annotated[Literal["csv", "json"], typer.Option("--format", help="Form of the output.")] = "csv",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Experiment (quickstart), or a fit (fit.json).")],
+    style: Annotated[Literal["csv", "json"], typer.Option("--format", help="Form of the estimates.")] = "csv",
+    tool: Annotated[Tool | None, typer.Option("--as", help="Of a fit: the tool that the model is for.")] = None,
+    pade: Annotated[
+        int | None, typer.Option("--pade", metavar="ORDER", help="With --as control: approximate the delay.")
+    ] = None,
     out: Out = Path("results"),
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
 ) -> None:
-    """Write every estimate of an experiment, one row each."""
+    """Write every estimate of an experiment, one row each, or the model of a fit as code for another tool."""
+    if name.endswith(".json"):
+        from ctid_cli.reporting.fit_tables import stored_model_code
+
+        if tool is None:
+            raise UsageError(f"{name} is a fit; say which tool it is for: --as control, matlab or scipy")
+        code = stored_model_code(Path(name), tool, pade)
+        typer.echo(code, nl=False) if file is None else write_files({file: code.encode()})
+        return
+    if tool is not None or pade is not None:
+        raise UsageError("--as and --pade are for a fit (fit.json), not for an experiment")
     from ctid_cli.reporting.exporting import csv_lines, json_lines
     from ctid_cli.reporting.results import read_results
 
-    results = read_results(out, experiment)
+    results = read_results(out, name)
     lines = csv_lines(results.stored) if style == "csv" else json_lines(results.rows)
     if file is None:
         for text in lines:
