@@ -14,7 +14,7 @@ from ctid_cli.signals.treatment import Hold, InitialState, Offset
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ctid_cli.reporting.comparison_result import NamedFit
+    from ctid_cli.reporting.compare_result import NamedFit
     from ctid_cli.signals.measurement import Measurement
 
 
@@ -41,7 +41,7 @@ def compare(
     """
     from ctid_cli.estimators import model_comparison
     from ctid_cli.reporting.column_file import frame_bytes
-    from ctid_cli.reporting.comparison_result import ModelComparison, named_fits
+    from ctid_cli.reporting.compare_result import ModelComparison, named_fits
 
     written = [out / "comparison.csv", out / "comparison.svg"]
     refuse_overwriting([*files, on], written)
@@ -58,7 +58,7 @@ def _record(models: Sequence[NamedFit], file: Path, columns: RecordOptions, hold
     """Read a record: by the column names of the fits where the file has them and none are named."""
     from dataclasses import replace
 
-    from ctid_cli.reporting.comparison_result import require_units
+    from ctid_cli.reporting.compare_result import require_units
     from ctid_cli.signals.measurement import open_table
 
     own = models[0].columns
