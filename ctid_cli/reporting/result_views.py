@@ -61,7 +61,11 @@ def summary(result: Result) -> str:
     >>> print(summary(Svf(poles=1, zeros=0, svf_cutoff=2.0).fit(Record(t, y, u), None)).splitlines()[0])
     parameter  estimate  standard error  relative %  95 % low  95 % high  unit      status
     """
-    return _report(result).draw()
+    return (
+        _report(result).draw()
+        if isinstance(result, Fit | Identification | FrequencyTrack)
+        else _of_experiment(result).summary()
+    )
 
 
 def html(result: Any) -> str:
@@ -142,8 +146,6 @@ def _report(result: Any) -> Report:
     if isinstance(result, FrequencyTrack):
         track = _with_columns(result)
         return Report([tones_block(track), warning_lines(invalid_rows(track))[1:]])
-    if not isinstance(result, Fit | Identification):
-        return _of_experiment(result).report
     fit = result.fit if isinstance(result, Identification) else result
     blocks: list[list[str | Table]] = [[parameter_table(_parameters(result))]]
     if isinstance(result, Identification):
