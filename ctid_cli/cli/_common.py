@@ -21,7 +21,7 @@ from typer.core import TyperCommand
 
 from ctid_cli.canonical import plain
 from ctid_cli.cli._options import with_option_groups
-from ctid_cli.errors import CtidError, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.errors import CtidError, ExitCode, RefusedError, SpecError, StorageError, UsageError
 from ctid_cli.reporting.document import Format, Result
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
@@ -58,7 +58,6 @@ InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its s
 From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
 To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
-INTERRUPTED = 130
 #: Options that say where and in what form results are written, not what they are.
 _OF_OUTPUT = ("as_json", "format", "json", "out", "report", "csv", "export")
 #: Errors that are the disk's: full, over quota, read-only, or failing.
@@ -200,18 +199,18 @@ def guarded(function: Function) -> Function:
             typer.echo(printable(str(error) if isinstance(error, SpecError) else f"ctid: {error}"), err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(ExitCode.INTERRUPTED) from None
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except OSError as error:
             if error.errno == errno.ENAMETOOLONG:
                 typer.echo(f"ctid: {str(error.filename)[:40]}...: the name is too long for a file", err=True)
-                raise typer.Exit(UsageError.exit_code) from None
+                raise typer.Exit(ExitCode.BAD_INPUT) from None
             if error.errno not in _OF_THE_DISK and "temporary directory" not in str(error):
                 _report(error, kwargs.get("out"))
             where = f"{error.filename}: " if error.filename else ""
             typer.echo(f"ctid: {where}{error.strerror or error}; what was reported as done is safe", err=True)
-            raise typer.Exit(StorageError.exit_code) from None
+            raise typer.Exit(ExitCode.STORAGE) from None
         except Exception as error:
             _report(error, kwargs.get("out"))
 
@@ -222,7 +221,7 @@ def _report(error: Exception, out: Path | None) -> NoReturn:
     """Say that an error was not foreseen, and where its details are."""
     file, kind = _write_traceback(out), type(error).__name__
     typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
-    raise typer.Exit(1) from None
+    raise typer.Exit(ExitCode.INTERNAL) from None
 
 
 def _one_line(error: Exception) -> str:

@@ -39,10 +39,12 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
             )
 
     @functools.wraps(command)
-    def wrapper(**given: Any) -> None:
-        for name, group in groups.items():
-            given[name] = group(**{option.name: given.pop(option.name) for option in fields(group)})
-        command(**given)
+    def wrapper(*values: Any, **given: Any) -> None:
+        for name in groups.keys() - given.keys():
+            group = groups[name]
+            known = {option.name for option in fields(group)} & given.keys()
+            given[name] = group(**{option: given.pop(option) for option in known})
+        command(*values, **given)
 
     as_options = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
     wrapper.__signature__ = inspect.Signature(as_options)  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ from ctid_cli.cli.init_command import init
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.page_commands import figure, report
 from ctid_cli.cli.reproduce_command import reproduce
-from ctid_cli.cli.result_commands import export, show, status, table
+from ctid_cli.cli.result_commands import export, status, table
 from ctid_cli.cli.storage_commands import merge, verify
 from ctid_cli.cli.track_command import track
 
@@ -54,8 +54,8 @@ def _root(
 
 app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
-_STORED = (status, show, export, verify, merge, init)
-_RESULTS = (status, table, figure, report, show, export, verify)
+_STORED = (status, export, verify, merge, init)
+_RESULTS = (status, table, figure, report, export, verify)
 for _command in (fit, compare, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 

@@ -64,7 +64,7 @@ def reproduce(
     (exit code 7 if one does not hold). --publish is refused unless one commit of this repository, without changes,
     computed all results. A study runs the code that its own specifications name, as part of the repository.
     """
-    from ctid_cli.cli.experiment_commands import run
+    from ctid_cli.cli.experiment_commands import EndOptions, PlaceOptions, SpecOptions, run
     from ctid_cli.studies.catalogue import all_studies, find_study, last_part
 
     studies = [find_study(name) for name in names or all_studies()]
@@ -78,7 +78,8 @@ def reproduce(
         case "run":
             for study in studies:
                 configs = [study.config(last_part(name)) for name in study.configs]
-                run(configs, jobs=jobs, runs=runs, out=out, fresh=fresh)
+                place = PlaceOptions(out=out, fresh=fresh)
+                run(configs, spec=SpecOptions(), place=place, end=EndOptions(), jobs=jobs, runs=runs)
         case first:
             _compute_first(studies, jobs, update=first == "update_first")
 
@@ -91,7 +92,7 @@ def _list(studies: Sequence[StudyFolder], form: FormatOptions) -> None:
 
 def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> None:
     """Test the claims of studies, and compare the tables of the one that has any."""
-    from ctid_cli.reporting.comparison import check_tables, mismatch_sentence, write_comparison
+    from ctid_cli.reporting.comparison_result import check_tables
     from ctid_cli.reporting.study import DEFAULT_STUDY
     from ctid_cli.studies.claims import check_claims
 
@@ -102,8 +103,8 @@ def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> No
         failed += [f"{study.name}: {len(found.failed)} claims do not hold"] if found.failed else []
         if study.name == DEFAULT_STUDY:
             comparison = check_tables([], out)
-            typer.echo(write_comparison(comparison, form.form))
-            failed += [mismatch_sentence(comparison)] if comparison.mismatches else []
+            emit(comparison, form.form)
+            failed += [] if comparison.mismatches.empty else [comparison.verdict]
     if failed:
         raise MismatchError("; ".join(failed))
 

@@ -80,7 +80,11 @@ class Result(ABC):
         if form == "json":
             return json.dumps(plain(self.content()), indent=1, allow_nan=False)
         if form == "csv":
-            return str(self.to_frame().to_csv(index=_is_named(self.to_frame()), lineterminator="\n")).rstrip("\n")
+            frame = self.to_frame().copy()
+            for name, values in frame.select_dtypes("object").items():
+                held = values.map(lambda value: isinstance(value, list | dict)).astype(bool)
+                frame[name] = values.mask(held, values[held].map(json.dumps))
+            return str(frame.to_csv(index=_is_named(frame), lineterminator="\n")).rstrip("\n")
         return RENDERERS[form](self.sections())
 
     def _repr_html_(self) -> str:

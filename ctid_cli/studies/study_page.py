@@ -6,12 +6,12 @@ from typing import Any
 
 import ctid_cli
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.committed import environment_of, made_by
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
 from ctid_cli.reporting.results import experiments_in, out_option, read_results
 from ctid_cli.reporting.study import study_contents
+from ctid_cli.reporting.study_table import environment_of, made_by
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, all_studies, published_folder, read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts

@@ -10,7 +10,8 @@ import numpy as np
 
 from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing
-from ctid_cli.reporting.parameter_errors import ParameterErrors
+
+from .measures import ParameterErrors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,9 +13,8 @@ from ctid_cli.inference.monte_carlo import quantile
 from ctid_cli.reporting.figures.measure_plot import PANELS
 from ctid_cli.reporting.figures.settings import Scale, Settings, settings_in, value_text
 from ctid_cli.reporting.figures.style import MIDDLE, Drawing, columns_for, look, panels_of, plain, size_for
-from ctid_cli.reporting.measures import parameter_unit
+from ctid_cli.reporting.measures import Row, labelled_groups, parameter_unit
 from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
-from ctid_cli.reporting.percentages import Row, labelled_groups
 from ctid_cli.reporting.results import Results
 
 if TYPE_CHECKING:

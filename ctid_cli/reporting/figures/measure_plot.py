@@ -17,8 +17,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.reporting.figures.settings import Scale, Settings, scale_of, settings_in, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.reporting.measures import measure_of, measure_rows
-from ctid_cli.reporting.percentages import Row
+from ctid_cli.reporting.measures import Row, measure_of, measure_rows
 from ctid_cli.reporting.results import Results
 
 if TYPE_CHECKING:

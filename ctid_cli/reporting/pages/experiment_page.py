@@ -12,16 +12,14 @@ import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing, kinds_of, main_measure
-from ctid_cli.reporting.measure_tables import measure_report
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
-from ctid_cli.reporting.overview import sentence_of
-from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
+from ctid_cli.reporting.pages.page import Chapter, write_page
 from ctid_cli.reporting.pages.question import estimators, formula_of, parts, references
-from ctid_cli.reporting.paired_table import compare_estimators
+from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
+from ctid_cli.reporting.status_result import first_line
 from ctid_cli.reporting.surprises import surprises
-from ctid_cli.reporting.table_blocks import success_sentence
-from ctid_cli.reporting.tables import experiment_report, notes_of
+from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.folder import SPEC
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import public_sessions
@@ -85,11 +83,11 @@ def _question(results: Results) -> Iterator[Section]:
 
 def _tables(results: Results) -> list[Section]:
     """Return the tables of ``ctid table``, and the usual measures where they are not among them."""
-    reports = [experiment_report(results)]
+    tables = [experiment_table(results)]
     if any(map(true_values, results.manifest["data_cells"])):
         others = [name for name in MEASURES if name not in default_measures(results)]
-        reports += [measure_report(results, others)] if others else []
-    return [section for report in reports for section in sections_of(report.draw("md"))]
+        tables += [measure_table(results, others)] if others else []
+    return [section for table in tables for section in table.shown]
 
 
 def _figures(results: Results, out: Path) -> Iterator[Section]:
@@ -111,7 +109,7 @@ def _comparisons(results: Results, out: Path) -> Iterator[Section]:
     pairs = itertools.combinations(names, 2)
     for pair in pairs if len(names) <= ALL_PAIRS else ((names[0], name) for name in names[1:]):
         try:
-            yield from sections_of(compare_estimators(results, ",".join(pair), out).draw("md"))
+            yield from compare_estimators(results, ",".join(pair), out).shown
         except UsageError:
             continue
 
@@ -124,7 +122,7 @@ def _outcomes(results: Results, out: Path) -> list[Section]:
     notes = [f"Note: {note}" for note in notes_of(results, out)]
     if not failed:
         return [Section(sentences=["Nothing: every estimate ended as it should."], notes=notes)]
-    frame = pd.DataFrame([{**row, "reason": sentence_of(row)} for row in failed])
+    frame = pd.DataFrame([{**row, "reason": first_line(row["message"])} for row in failed])
     groups = frame.groupby(["estimator", "status", "reason"], sort=False)["id"].agg(["size", "first"]).reset_index()
     listed = groups.sort_values("size", ascending=False, kind="stable").head(FAILURES_LISTED)
     listed["first"] = [f"`ctid export {results.experiment} --id {id}{out_option(out)}`" for id in listed["first"]]
