@@ -7,7 +7,8 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._common import Command, ComputingCommand
-from ctid_cli.cli.check_commands import CheckCommand, check
+from ctid_cli.cli.accuracy_command import accuracy
+from ctid_cli.cli.check_command import check
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.frf_command import frf
@@ -52,11 +53,10 @@ def _root(
     """
 
 
-app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
 _STORED = (status, show, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, show, export, verify)
-for _command in (fit, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, schema):
+for _command in (check, fit, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, accuracy, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 app.add_typer(model, name="model")
 
