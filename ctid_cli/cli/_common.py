@@ -103,7 +103,7 @@ def given_command(context: typer.Context) -> str:
     words = context.command_path.split()
     for option in context.command.params:
         value = context.params.get(str(option.name))
-        if value == option.get_default(context) or option.name in ("as_json", "out", "report"):
+        if value == option.get_default(context) or option.name in ("as_json", "json", "format", "out", "report"):
             continue
         name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
         for each in value if isinstance(value, list | tuple) else [value]:

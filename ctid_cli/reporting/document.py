@@ -123,10 +123,8 @@ def render_text(sections: Iterable[Section]) -> str:
 
 
 def _paragraph(sentence: str) -> str:
-    """Wrap a sentence; one that begins with a hyphen hangs, and what is indented is a command, in one line."""
-    if "\n" in sentence or sentence.startswith("    "):
-        return sentence
-    return wrapped(sentence, hanging="  " if sentence.startswith("- ") else "")
+    """Wrap a sentence; one that begins with a hyphen hangs, one with line ends is drawn already."""
+    return sentence if "\n" in sentence else wrapped(sentence, hanging="  " if sentence.startswith("- ") else "")
 
 
 def _text_table(lines: list[list[str]], sides: str) -> str:

@@ -38,13 +38,12 @@ class RecordCheckResult(Result):
         duration = f"{report.duration:.6g} {measurement.time_unit or 's'}"
         head = f"{report.name}: {count(report.n_samples, 'sample')} in {duration} ({columns})"
         found = [f"- {_label(each.level)}, {each.topic}: {each.sentence}" for each in report.findings]
-        further = [] if self.proposal is None else [self.proposal.sentence]
-        if report.worst != "problem":
-            further += ["next:", f"    {self.next_command()}"]
+        further = [] if report.worst == "problem" else [f"next:\n    {self.next_command()}"]
         return [
             Section("", [head, self.verdict, *measurement.notes]),
             Section("", found),
             Section(frame=self.to_frame(), formats=dict.fromkeys(NUMBERS, ".4g")),
+            Section("", [] if self.proposal is None else [self.proposal.sentence]),
             Section("", further),
         ]
 

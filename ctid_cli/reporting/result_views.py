@@ -11,15 +11,13 @@ from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
-from ctid_cli.reporting import identification_plot, track_plot
+from ctid_cli.reporting import identification_plot
 from ctid_cli.reporting.estimate import Units, parameter_object, parameter_table
 from ctid_cli.reporting.figures.style import Picture, require_kind
 from ctid_cli.reporting.identification_report import derived_block, derived_of, parameters_of
 from ctid_cli.reporting.layout import Report, Table, number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.track_columns import flag_words
-from ctid_cli.reporting.track_report import tones_block
-from ctid_cli.reporting.track_summary import invalid_rows
+from ctid_cli.reporting.track_result import TrackResult, flag_names
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import warning_lines
 from ctid_cli.tones.track import Track
@@ -61,11 +59,13 @@ def summary(result: Result) -> str:
     >>> print(summary(Svf(poles=1, zeros=0, svf_cutoff=2.0).fit(Record(t, y, u), None)).splitlines()[0])
     parameter  estimate  standard error  relative %  95 % low  95 % high  unit      status
     """
-    return _report(result).draw()
+    return _track_result(result).summary() if isinstance(result, FrequencyTrack) else _report(result).draw()
 
 
 def html(result: Any) -> str:
     """The same as tables of a notebook."""
+    if isinstance(result, FrequencyTrack):
+        return _track_result(result).write("html")
     return _report(result).draw("html")
 
 
@@ -129,8 +129,8 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
         shown: Any = kind
         return identification_plot.identification_drawing(result, measured, Units(), shown).picture()
     if isinstance(result, FrequencyTrack):
-        require_kind(kind, get_args(track_plot.Kind)[:2])
-        return track_plot.track_drawing(_with_columns(result), 0.0, None, "frequencies").picture()
+        require_kind(kind, ("tones", "frequencies"))
+        return _track_result(result).drawing().picture()
     if isinstance(result, Fit):
         what = f"a single {type(result).__name__} does not hold the record that it would be drawn with"
         raise UsageError(f"{what}; plot(identify(DelayProfile(...), [record])) does")
@@ -139,9 +139,6 @@ def plot(result: Identification | FrequencyTrack | ExperimentResults, kind: str 
 
 def _report(result: Any) -> Report:
     """What is said of a result."""
-    if isinstance(result, FrequencyTrack):
-        track = _with_columns(result)
-        return Report([tones_block(track), warning_lines(invalid_rows(track))[1:]])
     if not isinstance(result, Fit | Identification):
         return _of_experiment(result).report
     fit = result.fit if isinstance(result, Identification) else result
@@ -154,10 +151,10 @@ def _report(result: Any) -> Report:
     return Report(blocks)
 
 
-def _with_columns(track: FrequencyTrack) -> Track:
-    """A track as those of records are."""
+def _track_result(track: FrequencyTrack) -> TrackResult:
+    """Return a track as those of records are."""
     every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
-    return Track.of(track.t, track.frequencies, track.flags, every)
+    return TrackResult(Track.of(track.t, track.frequencies, track.flags, every))
 
 
 def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:
@@ -166,7 +163,7 @@ def _frame_of_track(track: FrequencyTrack) -> pd.DataFrame:
     tones = range(track.frequencies.shape[1])
     columns: dict[str, Any] = {"t": track.t, **{f"omega_{k + 1}": track.frequencies[:, k] for k in tones}}
     columns |= {f"frequency_{k + 1}_hz": track.frequencies[:, k] / (2.0 * np.pi) for k in tones}
-    columns |= {"valid": track.valid, "flags": [flag_words(int(flags)) for flags in track.flags]}
+    columns |= {"valid": track.valid, "flags": flag_names(track.flags)}
     return pd.DataFrame(columns).set_index("t")
 
 
