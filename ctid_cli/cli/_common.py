@@ -104,15 +104,7 @@ def given_command(context: typer.Context) -> str:
     words = context.command_path.split()
     for option in context.command.params:
         value = context.params.get(str(option.name))
-        if value == option.get_default(context) or option.name in (
-            "as_json",
-            "format",
-            "json",
-            "out",
-            "report",
-            "csv",
-            "export",
-        ):
+        if value == option.get_default(context) or option.name in _OF_OUTPUT:
             continue
         name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
         for each in value if isinstance(value, list | tuple) else [value]:

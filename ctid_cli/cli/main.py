@@ -7,7 +7,8 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._common import Command, ComputingCommand
-from ctid_cli.cli.check_commands import CheckCommand, check
+from ctid_cli.cli.accuracy_command import accuracy
+from ctid_cli.cli.check_command import check
 from ctid_cli.cli.compare_command import compare
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
@@ -52,11 +53,11 @@ def _root(
     """
 
 
-app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
 _STORED = (status, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, export, verify)
-for _command in (fit, compare, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, schema):
+_RECORDS = (check, fit, compare, order, frf, track)
+for _command in (*_RECORDS, init, run, reproduce, merge, *_RESULTS, validate, accuracy, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
 
 

@@ -15,15 +15,10 @@ from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.estimate import PARAMETER_FORMATS, parameter_frame, parameter_object
-from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.pages.page import sections_of
-from ctid_cli.reporting.track_columns import flag_words
-from ctid_cli.reporting.track_plot import track_drawing
-from ctid_cli.reporting.track_report import tones_block
-from ctid_cli.reporting.track_summary import invalid_rows
+from ctid_cli.reporting.track_result import TURN, TrackResult, flag_names
 from ctid_cli.tones.track import Track
 
 
@@ -31,7 +26,9 @@ def result_of(shown: Any) -> Result:
     """Return the result that shows a fit, an identification or a track."""
     if isinstance(shown, Identification):
         return FitResult.of(shown)
-    return TrackView(shown) if isinstance(shown, FrequencyTrack) else SingleFit(shown)
+    if isinstance(shown, Track):
+        return TrackResult(shown)
+    return OnlineTrackResult.of(shown) if isinstance(shown, FrequencyTrack) else SingleFit(shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,44 +70,21 @@ class SingleFit(Result):
         ]
 
 
-@dataclass(frozen=True, eq=False)
-class TrackView(Result):
-    """Frequencies over time, without the signal that they were found in."""
+class OnlineTrackResult(TrackResult):
+    """Frequencies over time, of an estimator that gives nothing else."""
 
-    track: FrequencyTrack
-
-    def sections(self) -> list[Section]:
-        """Return the tones, and how many rows are not valid."""
-        from ctid_cli.reporting.layout import Report
-
-        track = _with_columns(self.track)
-        tones = sections_of(Report([tones_block(track)]).draw("md"))
-        warnings = [f"- {warning}" for warning in invalid_rows(track)]
-        return [*tones, *([Section("Warnings:", warnings)] if warnings else [])]
-
-    def content(self) -> dict[str, Any]:
-        """Return the columns for JSON."""
-        return {str(name): column.tolist() for name, column in self.to_frame().reset_index().items()}
+    @classmethod
+    def of(cls, track: FrequencyTrack) -> OnlineTrackResult:
+        """Return the result of a track that has no amplitudes and errors."""
+        every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
+        return cls(Track.of(track.t, track.frequencies, track.flags, every))
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a row for each instant: frequencies [rad/s] and [Hz], whether all are valid, and flags in words."""
+        """Return a row for each instant: frequencies [rad/s] and [Hz], whether all are valid, and flags by name."""
         track = self.track
-        tones = range(track.frequencies.shape[1])
-        columns: dict[str, Any] = {"t": track.t, **{f"omega_{k + 1}": track.frequencies[:, k] for k in tones}}
-        columns |= {f"frequency_{k + 1}_hz": track.frequencies[:, k] / (2.0 * np.pi) for k in tones}
-        columns |= {"valid": track.valid, "flags": [flag_words(int(flags)) for flags in track.flags]}
+        names = [f"omega_{k + 1}" for k in range(track.omega.shape[1])]
+        columns: dict[str, Any] = {"t": track.t, **dict(zip(names, track.omega.T, strict=True))}
+        columns |= {f"frequency_{k + 1}_hz": column / TURN for k, column in enumerate(track.omega.T)}
+        flags = np.bitwise_or.reduce(track.flags, axis=1)
+        columns |= {"valid": track.valid.all(axis=1), "flags": flag_names(flags)}
         return pd.DataFrame(columns).set_index("t")
-
-    def plot(self) -> Any:
-        """Draw the frequencies over time."""
-        return self.drawing().figure()
-
-    def drawing(self) -> Drawing:
-        """Return the figure of the frequencies over time."""
-        return track_drawing(_with_columns(self.track), 0.0, None, "frequencies")
-
-
-def _with_columns(track: FrequencyTrack) -> Track:
-    """Return a track with the columns of one of a recorded signal."""
-    every = float(track.t[1] - track.t[0]) if track.t.size > 1 else 0.0
-    return Track.of(track.t, track.frequencies, track.flags, every)
