@@ -32,13 +32,12 @@ test: $(VENV)/.test-installed
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 reproduce: $(VENV)/.installed
-	$(BIN)/ctid study run $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"
-	$(BIN)/ctid table --check --out "$(OUT)"
-	@if [ -n "$(RUNS)" ]; then $(BIN)/ctid study check --out "$(OUT)" || true; \
-	else $(BIN)/ctid study publish --out "$(OUT)"; fi
+	$(BIN)/ctid reproduce $(if $(RUNS),--runs $(RUNS)) --jobs $(JOBS) --out "$(OUT)"
+	@if [ -n "$(RUNS)" ]; then $(BIN)/ctid reproduce --check --out "$(OUT)" || true; \
+	else $(BIN)/ctid reproduce --check --out "$(OUT)" && $(BIN)/ctid reproduce --publish --out "$(OUT)"; fi
 
 reproduce-small: $(VENV)/.installed
-	$(BIN)/ctid study check --first --jobs $(JOBS)
+	$(BIN)/ctid reproduce --first --jobs $(JOBS)
 
 bench: $(VENV)/.test-installed
 	set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; PYTHONPATH=. $(BIN)/python "$$file"; done

@@ -29,8 +29,10 @@ _UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)
 #: Letters of the text that names a class.
 MAX_LENGTH = 200
 _PACKAGE = Path(__file__).resolve().parent
-#: The studies that are shipped with the program, in an installed package and in a checkout.
-STUDIES = _PACKAGE / "_experiments" if (_PACKAGE / "_experiments").is_dir() else _PACKAGE.parent / "experiments"
+#: The folder with configs, studies and published results: part of an installed package, or the checkout.
+DATA = _PACKAGE / "_data" if (_PACKAGE / "_data").is_dir() else _PACKAGE.parent
+#: The studies that are shipped with the program.
+STUDIES = DATA / "experiments"
 _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 

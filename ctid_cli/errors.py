@@ -2,21 +2,38 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import IntEnum
 
 #: Problems of a specification that a message lists.
 MAX_SHOWN = 100
 
 
+class ExitCode(IntEnum):
+    """What a command ends with."""
+
+    DONE = 0
+    INTERNAL = 1
+    BAD_INPUT = 2
+    REFUSED = 3
+    ALL_FAILED = 4
+    STOPPED = 5
+    STORAGE = 6
+    DIFFERENCE = 7
+    MACHINE = 8
+    INTERRUPTED = 130
+    TERMINATED = 143
+
+
 class CtidError(Exception):
     """Base of every error that ctid raises on purpose; its text is meant for the user."""
 
-    exit_code = 1
+    exit_code = ExitCode.INTERNAL
 
 
 class UsageError(CtidError):
     """The request itself cannot be carried out: a bad option, specification or record."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 class DataError(UsageError):
@@ -84,19 +101,19 @@ class SpecError(UsageError):
 class RefusedError(CtidError):
     """The folder holds something that this command must not touch or mix with."""
 
-    exit_code = 3
+    exit_code = ExitCode.REFUSED
 
 
 class TooManyFailuresError(CtidError):
     """The run finished, but more estimates failed than the user accepts."""
 
-    exit_code = 4
+    exit_code = ExitCode.ALL_FAILED
 
 
 class StorageError(CtidError):
     """Results could not be written or read back; what was finished before is safe."""
 
-    exit_code = 6
+    exit_code = ExitCode.STORAGE
 
 
 class DamageError(StorageError):
@@ -106,10 +123,10 @@ class DamageError(StorageError):
 class MismatchError(CtidError):
     """A comparison or verification found a difference."""
 
-    exit_code = 7
+    exit_code = ExitCode.DIFFERENCE
 
 
 class MachineError(CtidError):
     """The machine did not let estimates finish (memory, descriptors, killed processes); they are not stored."""
 
-    exit_code = 8
+    exit_code = ExitCode.MACHINE

@@ -19,7 +19,10 @@ from typing import Annotated, Any, NoReturn, TypeVar, cast
 import typer
 from typer.core import TyperCommand
 
-from ctid_cli.errors import CtidError, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.canonical import plain
+from ctid_cli.cli._options import with_option_groups
+from ctid_cli.errors import CtidError, ExitCode, RefusedError, SpecError, StorageError, UsageError
+from ctid_cli.reporting.document import Format, Result
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
 
@@ -55,7 +58,8 @@ InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its s
 From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
 To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
-INTERRUPTED = 130
+#: Options that say where and in what form results are written, not what they are.
+_OF_OUTPUT = ("as_json", "format", "json", "out", "report", "csv", "export")
 #: Errors that are the disk's: full, over quota, read-only, or failing.
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
@@ -100,7 +104,7 @@ def given_command(context: typer.Context) -> str:
     words = context.command_path.split()
     for option in context.command.params:
         value = context.params.get(str(option.name))
-        if value == option.get_default(context) or option.name in ("as_json", "out", "report"):
+        if value == option.get_default(context) or option.name in _OF_OUTPUT:
             continue
         name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
         for each in value if isinstance(value, list | tuple) else [value]:
@@ -126,6 +130,20 @@ def answer(
         typer.echo(json.dumps({**content(), **({"written": names} if names else {})}, allow_nan=False))
     else:
         typer.echo(text() + (f"\n\nWritten: {', '.join(names)}" if names else ""))
+
+
+def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:
+    """Print a result in the form that is asked for, JSON as it was stored, and name the files that were written."""
+    names = list(map(str, written))
+    if form == "json":
+        if stored is None:
+            content = result.content()
+            stored = json.dumps(plain({**content, "written": names} if names else content), allow_nan=False)
+        typer.echo(stored.rstrip("\n"))
+        return
+    typer.echo(result.write(form))
+    if names and form == "text":
+        typer.echo(f"\nWritten: {', '.join(names)}")
 
 
 def refuse_overwriting(inputs: Iterable[Path], written: Iterable[Path]) -> None:
@@ -160,8 +178,9 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
-def guarded(command: Function) -> Function:
-    """Turn the exceptions of a command into one message and an exit code."""
+def guarded(function: Function) -> Function:
+    """Turn the exceptions of a command into one message and an exit code, and its option groups into options."""
+    command = with_option_groups(function)
 
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> None:
@@ -172,18 +191,18 @@ def guarded(command: Function) -> Function:
             typer.echo(printable(str(error) if isinstance(error, SpecError) else f"ctid: {error}"), err=True)
             raise typer.Exit(error.exit_code) from None
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(ExitCode.INTERRUPTED) from None
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except OSError as error:
             if error.errno == errno.ENAMETOOLONG:
                 typer.echo(f"ctid: {str(error.filename)[:40]}...: the name is too long for a file", err=True)
-                raise typer.Exit(UsageError.exit_code) from None
+                raise typer.Exit(ExitCode.BAD_INPUT) from None
             if error.errno not in _OF_THE_DISK and "temporary directory" not in str(error):
                 _report(error, kwargs.get("out"))
             where = f"{error.filename}: " if error.filename else ""
             typer.echo(f"ctid: {where}{error.strerror or error}; what was reported as done is safe", err=True)
-            raise typer.Exit(StorageError.exit_code) from None
+            raise typer.Exit(ExitCode.STORAGE) from None
         except Exception as error:
             _report(error, kwargs.get("out"))
 
@@ -194,7 +213,7 @@ def _report(error: Exception, out: Path | None) -> NoReturn:
     """Say that an error was not foreseen, and where its details are."""
     file, kind = _write_traceback(out), type(error).__name__
     typer.echo(f"ctid: unexpected error ({kind}: {_one_line(error)}); please report it with {file}", err=True)
-    raise typer.Exit(1) from None
+    raise typer.Exit(ExitCode.INTERNAL) from None
 
 
 def _one_line(error: Exception) -> str:

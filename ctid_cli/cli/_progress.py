@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import typer
 
-from ctid_cli.reporting.layout import count, rate, seconds
-from ctid_cli.reporting.precision_words import block_sentence
+from ctid_cli.reporting.layout import rate, seconds
+from ctid_cli.text import count
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn, TaskID
@@ -144,6 +144,8 @@ class Reporter(_Progress):
         if progress.message:
             self._say(progress.message)
         if progress.precision:
+            from ctid_cli.reporting.status_result import block_sentence
+
             self._say(block_sentence(progress.precision))
         if not self._ready:
             self._begin(progress.total)

@@ -7,6 +7,7 @@ import json
 import shlex
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,13 +25,16 @@ from ctid_cli.cli._common import (
     Overrides,
     Runs,
     duration,
+    emit,
     guarded,
     printable,
     require_within,
 )
+from ctid_cli.cli._options import FormatOptions
 from ctid_cli.cli._progress import Reporter
-from ctid_cli.errors import MachineError, Problem, SpecError, TooManyFailuresError, UsageError
-from ctid_cli.reporting.layout import count, seconds
+from ctid_cli.errors import ExitCode, Problem, SpecError, TooManyFailuresError, UsageError
+from ctid_cli.reporting.layout import seconds
+from ctid_cli.text import count
 
 if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary, Workload
@@ -88,40 +92,62 @@ def load_plans(
     return plans
 
 
-def _workload(plan: Plan) -> str:
-    """How much work a plan asks for."""
-    sets, cells = count(plan.data_sets, "data set"), count(len(plan.data_cells), "data cell")
-    text = f"{sets} ({cells}), {count(plan.data_sets * plan.estimates_each, 'estimate')}"
-    section = plan.spec.monte_carlo
-    return text if section is None or section.until is None else f"{text}; at most {section.most} data sets of a cell"
+@dataclass(frozen=True)
+class SpecOptions:
+    """How specifications are read."""
+
+    overrides: Overrides = None
+    allow_code: AllowCode = False
+    allow_outside: AllowOutside = False
+
+    def plans(self, configs: Sequence[Path], runs: int | None = None) -> list[tuple[Path, Plan]]:
+        """Read and check specifications."""
+        allowed = {"allow_code": self.allow_code, "allow_outside": self.allow_outside}
+        return load_plans(configs, self.overrides or [], runs, **allowed)
+
+
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Where results go, and what becomes of those that are there."""
+
+    out: Out = Path("results")
+    fresh: Fresh = False
+    keep_readable: Annotated[
+        bool, typer.Option("--keep-readable", help="With --fresh: keep what can be read of damaged results.")
+    ] = False
+    allow_mixed: AllowMixed = False
+    retry: Annotated[
+        list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
+    ] = None
+
+    @property
+    def treatment(self) -> dict[str, Any]:
+        """What becomes of results that are there, as options of a run."""
+        retry = [kind.upper() for kind in self.retry or ()]
+        return {"fresh": self.fresh, "allow_mixed": self.allow_mixed, "retry": retry}
+
+
+@dataclass(frozen=True)
+class EndOptions:
+    """What ends a run early."""
+
+    max_failures: Annotated[
+        int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
+    ] = None
+    time_budget: Annotated[
+        float | None,
+        typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
+    ] = None
 
 
 @guarded
 def run(
     configs: Configs,
+    spec: SpecOptions,
+    place: PlaceOptions,
+    end: EndOptions,
     jobs: Jobs = None,
     runs: Runs = None,
-    overrides: Overrides = None,
-    allow_code: AllowCode = False,
-    allow_outside: AllowOutside = False,
-    retry: Annotated[
-        list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
-    ] = None,
-    max_failures: Annotated[
-        int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
-    ] = None,
-    time_budget: Annotated[
-        float | None,
-        typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
-    ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
-    out: Out = Path("results"),
-    fresh: Fresh = False,
-    keep_readable: Annotated[
-        bool,
-        typer.Option("--keep-readable", help="With --fresh: keep what can be read of damaged results."),
-    ] = False,
-    allow_mixed: AllowMixed = False,
     shard: Annotated[
         str | None,
         typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
@@ -130,6 +156,7 @@ def run(
         str | None,
         typer.Option("--dask", metavar="ADDRESS", help="Workers of the dask scheduler at tcp://host:port compute."),
     ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> None:
     """Run experiments; the same command again resumes.
@@ -137,43 +164,64 @@ def run(
     Finished estimates are stored as they come, so nothing is lost when a run is stopped or killed. A section limits of
     the file, or for example --set limits.wall_seconds=600, ends single estimates that take too much.
     """
-    from ctid_cli.running.engine import preview, run_experiment
-    from ctid_cli.running.stopping import StopRequest
-    from ctid_cli.storage.manifest import Shard
+    from ctid_cli.running.engine import preview
 
-    if keep_readable and not fresh:
+    if place.keep_readable and not place.fresh:
         raise UsageError("--keep-readable goes with --fresh")
-    allowed = {"allow_code": allow_code, "allow_outside": allow_outside}
-    plans = [plan for _, plan in load_plans(configs, overrides or [], runs, **allowed)]
-    folders = [out / plan.experiment for plan in plans]
-    part = None if shard is None else Shard.read(shard)
-    if part is not None:
-        plans, folders = [plan.part(part) for plan in plans], [out / part.folder(p.experiment) for p in plans]
-    require_within(out, *folders)
-    how: dict[str, Any] = {"fresh": fresh, "allow_mixed": allow_mixed, "retry": [kind.upper() for kind in retry or ()]}
+    plans, part = _parts([plan for _, plan in spec.plans(configs, runs)], shard)
+    folders = [place.out / (plan.experiment if part is None else part.folder(plan.experiment)) for plan in plans]
+    require_within(place.out, *folders)
     if dry_run:
         for plan, folder in zip(plans, folders, strict=True):
-            typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **how), folder)}")
+            typer.echo(f"{plan.experiment}: {_intention(preview(plan, folder, **place.treatment), folder)}")
         return
     # What was imported stays: looking for garbage in it again and again would be a tenth of exporting many estimates.
     gc.freeze()
-    hopeless, ends = [], None if time_budget is None else time.monotonic() + time_budget
+    summaries = _run_all(plans, folders, place, end, jobs=jobs, dask=dask, quiet=quiet, part=part)
+    failed = [
+        f"{one.experiment}: all {one.planned} estimates failed" for one in summaries if one.failed == one.planned > 0
+    ]
+    if failed:
+        raise TooManyFailuresError("\n".join(failed))
+
+
+def _parts(plans: list[Plan], shard: str | None) -> tuple[list[Plan], Shard | None]:
+    """Return plans, or the part of each that one of several shards computes."""
+    from ctid_cli.storage.manifest import Shard
+
+    part = None if shard is None else Shard.read(shard)
+    return (plans, None) if part is None else ([plan.part(part) for plan in plans], part)
+
+
+def _run_all(
+    plans: Sequence[Plan],
+    folders: Sequence[Path],
+    place: PlaceOptions,
+    end: EndOptions,
+    *,
+    quiet: bool,
+    part: Any,
+    **how: Any,
+) -> list[RunSummary]:
+    """Run one experiment after the other, as long as none ends early."""
+    from ctid_cli.running.engine import run_experiment
+    from ctid_cli.running.stopping import StopRequest
+
+    summaries, ends = [], None if end.time_budget is None else time.monotonic() + end.time_budget
+    how |= place.treatment | {"keep_readable": place.keep_readable}
     for plan, folder in zip(plans, folders, strict=True):
         left = None if ends is None else max(ends - time.monotonic(), 0.0)
-        stop = StopRequest(failures=max_failures, seconds=left)
+        stop = StopRequest(failures=end.max_failures, seconds=left)
         with Reporter(plan.experiment, quiet=quiet) as reporter:
-            how |= {"progress": reporter, "dask": dask}
-            summary = run_experiment(plan, folder, jobs=jobs, stop=stop, keep_readable=keep_readable, **how)
+            summary = run_experiment(plan, folder, stop=stop, progress=reporter, **how)
         if not quiet:
-            typer.echo(_conclusion(summary, out, part))
-        if summary.exit_code == MachineError.exit_code:
+            typer.echo(_conclusion(summary, place.out, part))
+        if summary.exit_code == ExitCode.MACHINE:
             raise summary.machine_error()
         if summary.exit_code:
             raise typer.Exit(summary.exit_code)
-        if summary.failed == summary.planned > 0:
-            hopeless.append(f"{plan.experiment}: all {summary.planned} estimates failed")
-    if hopeless:
-        raise TooManyFailuresError("\n".join(hopeless))
+        summaries.append(summary)
+    return summaries
 
 
 def _intention(work: Workload, folder: Path) -> str:
@@ -186,8 +234,8 @@ def _intention(work: Workload, folder: Path) -> str:
 
 
 def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
-    from ctid_cli.reporting.precision_words import precision_lines
     from ctid_cli.reporting.results import out_option
+    from ctid_cli.reporting.status_result import precision_lines
     from ctid_cli.reporting.study import tables_of
 
     stored, option = summary.reused + summary.computed, out_option(out)
@@ -210,18 +258,19 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
 
 
 @guarded
-def validate(
-    configs: Configs,
-    overrides: Overrides = None,
-    allow_code: AllowCode = False,
-    allow_outside: AllowOutside = False,
-) -> None:
+def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
     """Check experiment files without running them.
 
     Prints every mistake with its place in the file, or how much work the experiment asks for.
     """
-    for config, plan in load_plans(configs, overrides or [], allow_code=allow_code, allow_outside=allow_outside):
-        typer.echo(f"{config}: ok, {plan.experiment}: {_workload(plan)}")
+    from ctid_cli.reporting.status_result import ValidationResult
+
+    for config, plan in spec.plans(configs):
+        section, sets = plan.spec.monte_carlo, plan.data_sets
+        at_most = section.most if section is not None and section.until is not None else None
+        cells, estimates = len(plan.data_cells), sets * plan.estimates_each
+        warnings = list(plan.spec.warnings)
+        emit(ValidationResult(config, plan.experiment, sets, cells, estimates, at_most, warnings), form.form)
 
 
 @guarded

@@ -1,23 +1,12 @@
 """``ctid frf``."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
-from ctid_cli.cli._common import (
-    From,
-    InputColumn,
-    InputHold,
-    Json,
-    OutputColumn,
-    TimeColumn,
-    To,
-    answer,
-    guarded,
-    refuse_overwriting,
-    write_files,
-)
+from ctid_cli.cli._common import InputHold, emit, guarded, refuse_overwriting, write_files
+from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import ResponseMethod
 
@@ -28,6 +17,8 @@ def frf(
         list[Path],
         typer.Argument(metavar="FILE...", help="Record (.csv, .mat, .h5); several: realisations of one input."),
     ],
+    columns: RecordOptions,
+    form: FormatOptions,
     method: Annotated[ResponseMethod, typer.Option("--method", help="How the response is estimated.")] = "auto",
     period: Annotated[
         int | None, typer.Option("--period", metavar="SAMPLES", help="Period of the input, if it is not found.")
@@ -39,12 +30,6 @@ def frf(
         int | None, typer.Option("--segment", metavar="SAMPLES", help="Length of the segments of Welch's method.")
     ] = None,
     hold: InputHold = "zoh",
-    time: TimeColumn = None,
-    input: InputColumn = None,
-    output: OutputColumn = None,
-    start: From = None,
-    stop: To = None,
-    as_json: Json = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for frf.csv and frf.svg.")] = Path("."),
 ) -> None:
     """Estimate the frequency response of measured records, without a model.
@@ -54,50 +39,44 @@ def frf(
     polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
-    from ctid_cli.reporting.column_file import columns_bytes
-    from ctid_cli.reporting.frf_plot import frf_drawing
-    from ctid_cli.reporting.frf_report import frf_columns, frf_object, frf_text
-    from ctid_cli.reporting.identification_report import common_units
-    from ctid_cli.signals.measurement import read_measurement
+    from ctid_cli.reporting.column_file import frame_bytes
+    from ctid_cli.reporting.frf_result import FrequencyResponseResult
+    from ctid_cli.reporting.records import Records
 
-    data, figure = out / "frf.csv", out / "frf.svg"
-    refuse_overwriting(files, [data, figure])
-    for name, value, wanted in (("--period", period, "periodic"), ("--segment", segment, "welch")):
-        if value is not None and method not in ("auto", wanted):
-            raise UsageError(f"{name} belongs to --method {wanted}, not to {method}")
-    for name, value, least in (("--period", period, 2), ("--width", width, 4)):
-        if value is not None and value < least:
-            raise UsageError(f"{name} must be {least} or more, not {value}")
-    if width is not None and method not in ("auto", "local-polynomial"):
-        raise UsageError(f"--width belongs to --method local-polynomial, not to {method}")
-    measurements = [
-        read_measurement(file, time=time, input=input, output=output, hold=hold, start=start, stop=stop)
-        for file in files
-    ]
-    units = common_units(measurements)
+    written = [out / "frf.csv", out / "frf.svg"]
+    refuse_overwriting(files, written)
+    method = _method(method, period, width, segment)
+    records = Records([columns.read(file, hold) for file in files])
     found = estimate_frequency_response(
-        [item.record for item in measurements],
-        method=_method(method, period, width, segment),
+        records.data,
+        method=method,
         period=period,
         half_width=width,
         segment=segment,
-        time_unit=units.time,
+        time_unit=records.units.time,
     )
-    title = ", ".join(file.name for file in files)
-    content = columns_bytes(frf_columns(found, units), "csv", {})
-    write_files({data: content, figure: frf_drawing(found, units, title).saved()})
-    answer(
-        as_json,
-        lambda: frf_object(found, measurements, units),
-        lambda: frf_text(found, measurements, units),
-        [data, figure],
-    )
+    result = FrequencyResponseResult(found, records)
+    write_files({written[0]: frame_bytes(result.to_frame()), written[1]: result.drawing().saved()})
+    emit(result, form.form, written)
 
 
 def _method(method: ResponseMethod, period: int | None, width: int | None, segment: int | None) -> ResponseMethod:
-    """An option of one method asks for that method."""
-    asked: dict[ResponseMethod, int | None] = {"periodic": period, "local-polynomial": width, "welch": segment}
-    wanted = [name for name, value in asked.items() if value is not None]
-    if len(wanted) > 1:
-        raise UsageError(f"--period, --width and --segment belong to different methods: {' and '.join(wanted)}")
-    return wanted[0] if wanted else method
+    """Return the method that the options belong to, and refuse those of two methods and values that are too small."""
+    given = [
+        (name, owner, value, least)
+        for name, owner, value, least in (
+            ("--period", "periodic", period, 2),
+            ("--width", "local-polynomial", width, 4),
+            ("--segment", "welch", segment, 1),
+        )
+        if value is not None
+    ]
+    for name, owner, value, least in given:
+        if method not in ("auto", owner):
+            raise UsageError(f"{name} belongs to --method {owner}, not to {method}")
+        if value < least:
+            raise UsageError(f"{name} must be {least} or more, not {value}")
+    if len(given) > 1:
+        names = " and ".join(owner for _, owner, _, _ in given)
+        raise UsageError(f"--period, --width and --segment belong to different methods: {names}")
+    return cast(ResponseMethod, given[0][1]) if given else method

@@ -1,17 +1,18 @@
 """The commands that look after stored results: ``ctid merge`` and ``ctid verify``."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import AllowMixed, Json, Out, guarded
+from ctid_cli.cli._common import AllowMixed, Out, emit, guarded
+from ctid_cli.cli._options import FormatOptions
 from ctid_cli.errors import MismatchError, UsageError
 
 
 @guarded
 def merge(
+    form: FormatOptions,
     folders: Annotated[
         list[Path], typer.Argument(metavar="FOLDER", help="Folders of shards, or folders that hold some.")
     ],
@@ -24,26 +25,20 @@ def merge(
     `ctid run --shard K/N` computes one of N shards. Merged in whatever order, they give the runs.h5 of a single run,
     byte for byte. The folders of the shards stay as they are.
     """
-    from ctid_cli.reporting.results import out_option
+    from ctid_cli.reporting.status_result import MergeResult
     from ctid_cli.storage.merge import find_sources, merge_all
 
     for merged in merge_all(find_sources(folders), out, allow_mixed=allow_mixed, partial=partial):
-        text = f"{merged.experiment}: {merged.stored} of {merged.planned} estimates in {merged.folder}"
-        lines = [f"{text} ({merged.new} new, from {merged.sources} folders)"]
-        if merged.mixed:
-            lines.append("  they mix code versions or processors, which tables will say")
-        lines += [f"  {merged.missing}"] if merged.missing else []
-        lines.append(f"  next: ctid table {merged.experiment}{out_option(out)}")
-        typer.echo("\n".join(lines))
+        emit(MergeResult(merged, out), form.form)
 
 
 @guarded
 def verify(
+    form: FormatOptions,
     names: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments (quickstart); all by default.")
     ] = None,
     out: Out = Path("results"),
-    as_json: Json = False,
 ) -> None:
     """Check what is stored of experiments.
 
@@ -51,15 +46,15 @@ def verify(
     changed: `ctid run --fresh --keep-readable` moves damaged results aside, keeps what can be read and computes the
     rest.
     """
-    from ctid_cli.reporting.integrity import verification_object, verification_text
     from ctid_cli.reporting.results import experiments_in, stored_folder
+    from ctid_cli.reporting.status_result import VerificationResult
     from ctid_cli.storage.verify import verify as check
 
     found = [check(stored_folder(out, name)) for name in dict.fromkeys(names or experiments_in(out))]
     if not found:
         raise UsageError(f"there are no results in {out}")
     for item in found:
-        typer.echo(json.dumps(verification_object(item, out)) if as_json else verification_text(item, out))
+        emit(VerificationResult(item, out), form.form)
     wrong = [item.folder for item in found if not item.is_intact]
     if wrong:
         raise MismatchError(f"not as it was written: {', '.join(map(str, wrong))}")

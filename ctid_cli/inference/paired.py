@@ -1,6 +1,8 @@
 """Two estimators on the same data sets: how far apart they are, and whether that may be chance."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from functools import cache, partial
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -104,6 +106,16 @@ def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, seco
     return Difference(value, ends[0], ends[1], p_value)
 
 
+def rms_difference(first: Array, second: Array) -> Difference:
+    """Return the difference of two root mean square errors on the same data sets, by the bootstrap, shapes (n,)."""
+    return bootstrap_difference(lambda squares: np.asarray(np.sqrt(squares.mean(axis=-1))), first**2, second**2)
+
+
+def median_difference(first: Array, second: Array) -> Difference:
+    """Return the difference of two medians on the same data sets, by the bootstrap, shapes (n,)."""
+    return bootstrap_difference(lambda values: np.asarray(np.median(values, axis=-1)), first, second)
+
+
 def _left_out(n: int) -> IntArray:
     """Data sets that the jackknife leaves out one by one, a thousand at most: acceleration is a small correction."""
     return np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
@@ -126,3 +138,36 @@ def holm(p_values: Sequence[float]) -> list[float]:
     scaled = np.arange(len(order), 0, -1) * np.asarray(p_values, dtype=float)[order]
     adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0) if len(order) else 0.0
     return adjusted.tolist()
+
+
+@cache
+def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -> float:
+    """Two-sided p-value of Fisher's exact test that two percentages are equal [-]."""
+    from scipy.stats import fisher_exact
+
+    reference = [reference_converged, reference_n - reference_converged]
+    return float(fisher_exact([reference, [converged, n - converged]]).pvalue)
+
+
+def smallest_detectable(
+    n: int, reference_converged: int, reference_n: int, level: float, *, rise: bool = True, power: float = 0.8
+) -> float | None:
+    """Smallest difference from a reference that n data sets show with the given power [percentage points].
+
+    The reference counts as given. Successes of the n data sets are binomial with probability q, and k of them or fewer
+    are significant at the level, so that the drop is the one to the q with P(K <= k) = 0.8. A rise of successes is a
+    drop of failures. None where not even 0 and n successes are significant.
+    """
+    from scipy.stats import beta
+
+    drops = []
+    for expected in (reference_converged, reference_n - reference_converged)[: 1 + rise]:
+        insignificant = partial(_agrees, n, expected, reference_n, level)
+        low = bisect_left(range(n * expected // reference_n + 1), True, key=insignificant) - 1
+        if 0 <= low < n:
+            drops.append(100 * (expected / reference_n - float(beta.ppf(1 - power, low + 1, n - low))))
+    return min(drops, default=None)
+
+
+def _agrees(n: int, expected: int, reference_n: int, level: float, converged: int) -> bool:
+    return fisher(converged, n, expected, reference_n) >= level

@@ -10,24 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import MachineError
 from ctid_cli.reporting import surprises as unexpected
+from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
 from ctid_cli.reporting.figures.style import Picture
-from ctid_cli.reporting.layout import Report, count
-from ctid_cli.reporting.measures import default_measures, measure_rows
-from ctid_cli.reporting.paired_table import compare_estimators
+from ctid_cli.reporting.measures import Row, default_measures, measure_rows
+from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.tables import experiment_report, notes_of
+from ctid_cli.reporting.table_result import TableResult, experiment_table, notes_of
 from ctid_cli.running import engine
 from ctid_cli.running.plan import build_plan
 from ctid_cli.running.trial import load_tried
 from ctid_cli.storage.estimates import read_stored
 from ctid_cli.storage.manifest import planned_count
+from ctid_cli.text import count
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
 
-class ExperimentResults(Results):
+class ExperimentResults(Results, Result):
     """Results of one experiment.
 
     Parameters
@@ -48,13 +50,26 @@ class ExperimentResults(Results):
         head = f"{self.experiment}: {stored} of {planned} estimates by {estimators}, {self.failed} failed"
         return f"{head}\n  in {count(len(self.manifest['data_cells']), 'data cell')}, {self.folder}"
 
-    def _repr_html_(self) -> str:
-        return self.report.draw("html")
-
     @property
-    def report(self) -> Report:
-        """What ``ctid table`` prints, to draw as text or HTML."""
-        return experiment_report(self, [*notes_of(self, self.out), *self.surprises])
+    def table(self) -> TableResult:
+        """What ``ctid table`` prints."""
+        return experiment_table(self, [*notes_of(self, self.out), *self.surprises])
+
+    def sections(self) -> Sequence[Section]:
+        """Return the table of the experiment."""
+        return self.table.sections()
+
+    def content(self) -> list[Row]:
+        """Return the rows of the table."""
+        return self.table.content()
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row for each estimate, the same as ``estimates``."""
+        return self.estimates
+
+    def plot(self) -> Figure:
+        """Draw the figure that tells most; ``figure`` has options."""
+        return experiment_drawing(self).figure()
 
     @property
     def out(self) -> Path:
@@ -114,21 +129,19 @@ class ExperimentResults(Results):
         UsageError
             If there is no such estimator, or they have too few data sets in common.
         """
-        import pandas as pd
-
-        return pd.DataFrame(compare_estimators(self, f"{first},{second}", self.out).records)
+        return compare_estimators(self, f"{first},{second}", self.out).to_frame().infer_objects()
 
     def figure(self, kind: str | None = None, measure: str | None = None, parameters: Sequence[str] = ()) -> Picture:
         """A figure of the experiment, what ``ctid figure`` draws.
 
         Parameters
         ----------
-        kind : {"measure", "box", "errors", "delays", "convergence"}, optional
+        kind : {"measure", "box"}, optional
             What is drawn; by default what tells most.
         measure : str, optional
-            With ``measure`` and ``convergence``: such as ``"rmse"`` or ``"rmse:delay"``.
+            With ``measure``: such as ``"rmse"`` or ``"rmse:delay"``.
         parameters : sequence of str, default ()
-            With ``errors`` and ``box``: of which parameters; of all by default.
+            With ``box``: of which parameters; of all by default.
 
         Returns
         -------

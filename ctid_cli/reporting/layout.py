@@ -186,6 +186,16 @@ def seconds(value: float | None) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
 
 
+def setting_title(key: str) -> str:
+    """Return a swept field as the title of a column."""
+    return "SNR" if key == "snr_db" else key
+
+
+def setting_text(key: str, value: Any) -> str:
+    """Return the value of a swept field, with its unit where the title does not say it."""
+    return f"{number(value)} dB" if key == "snr_db" and value is not None else number(value)
+
+
 def delay_label(initial_delay: float | str | None) -> str:
     """An initial delay as a column title."""
     if initial_delay is None:

@@ -1,12 +1,19 @@
 """Published studies: their tables, and which experiments fill them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
+
+from ctid_cli.custom_code import DATA
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 InitialDelay = float | Literal["random"] | None
 
@@ -14,17 +21,7 @@ InitialDelay = float | Literal["random"] | None
 DEFAULT_STUDY = "useful-redundancy"
 
 
-class Place(NamedTuple):
-    """A cell of a published table."""
-
-    experiment: str
-    #: Values of the fields of the study.
-    settings: tuple[float, ...]
-    method: str
-    initial_delay: InitialDelay
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StudyTable:
     """One published table."""
 
@@ -32,13 +29,13 @@ class StudyTable:
     title: str
     #: Initial delays [s] of its columns, or ``("random",)``.
     initial_delays: tuple[InitialDelay, ...]
-    #: Published percentages [%].
-    published: Mapping[Place, float]
+    #: Published cells: ``experiment``, the fields of the study, ``method``, ``initial_delay``, ``published_percent``.
+    published: pd.DataFrame
 
     @property
     def experiments(self) -> list[str]:
         """Names of the experiments that fill it."""
-        return list(dict.fromkeys(place.experiment for place in self.published))
+        return list(self.published["experiment"].unique())
 
 
 @dataclass(frozen=True)
@@ -58,10 +55,8 @@ class Study:
 
 
 def data_folder(name: str) -> Path:
-    """A folder that is shipped with the program: ``experiments`` or ``configs``."""
-    package = Path(__file__).resolve().parents[1]
-    packaged = package / f"_{name}"
-    return packaged if packaged.is_dir() else package.parent / name
+    """Return a folder that is shipped with the program: ``experiments``, ``configs`` or ``results/published``."""
+    return DATA / name
 
 
 @cache
@@ -89,15 +84,24 @@ def load_study() -> Study:
 
 def tables_of(experiment: str) -> list[int]:
     """Numbers of the default study's tables that an experiment fills."""
-    return [number for number, table in load_study().tables.items() if experiment in table.experiments]
+    tables = study_contents()[DEFAULT_STUDY]["tables"]
+    return [number for number, table in tables.items() if experiment in {row["experiment"] for row in table["rows"]}]
 
 
 def _table(number: int, content: dict[str, Any], fields: Mapping[str, str]) -> StudyTable:
+    import pandas as pd
+
     delays = tuple(delay if delay == "random" else float(delay) for delay in content["initial_delays"])
-    published = {
-        Place(row["experiment"], tuple(float(row[field]) for field in fields), method, delay): float(value)
+    published = [
+        {
+            "experiment": row["experiment"],
+            **{field: float(row[field]) for field in fields},
+            "method": method,
+            "initial_delay": delay,
+            "published_percent": float(value),
+        }
         for row in content["rows"]
         for method, values in row["published"].items()
         for delay, value in zip(delays, values, strict=True)
-    }
-    return StudyTable(number, content["title"], delays, published)
+    ]
+    return StudyTable(number, content["title"], delays, pd.DataFrame(published, dtype=object))

@@ -16,12 +16,10 @@ import numpy as np
 from ctid_cli.inference.monte_carlo import QUANTILE
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.expected_accuracy import why_biased
-from ctid_cli.reporting.layout import delay_label
-from ctid_cli.reporting.measures import counted_in, measure_rows
+from ctid_cli.reporting.layout import delay_label, setting_text, setting_title
+from ctid_cli.reporting.measures import Row, counted_in, labelled_groups, measure_rows, settings_of
 from ctid_cli.reporting.parameter_errors import place_of, readable_plan
-from ctid_cli.reporting.percentages import Row, labelled_groups, settings_of
 from ctid_cli.reporting.results import Group, Results, lookup
-from ctid_cli.reporting.table_blocks import setting_text, setting_title
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.specification.joint_warnings import joint_warnings
 from ctid_cli.storage.manifest import is_of_signal, true_values

@@ -180,7 +180,7 @@ class Estimates:
         if name == "true_delay":
             return self._by_block(lambda block: self._truths[block.cell["hash"]].get("delay"))
         if name == "converged":
-            return [None if value != value else bool(value) for value in self._judged.tolist()]
+            return [None if value != value else bool(value) for value in self.judged.tolist()]
         values: list[Any] = self._span(lambda first, last: self.export.values(known[name], first, last))
         return values
 
@@ -238,11 +238,11 @@ class Estimates:
     @property
     def converged(self) -> BoolArray | None:
         """Return which of them satisfy the rule of success; None where there is none for all of them."""
-        found = self._judged
+        found = self.judged
         return None if not len(found) or np.isnan(found).any() else found.astype(bool)
 
     @cached_property
-    def _judged(self) -> Array:
+    def judged(self) -> Array:
         """Return 1 for those that satisfy the rule of success, 0 for others, NaN where there is none."""
         found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:

@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from ctid_cli.errors import UsageError
+from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
 from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
 from ctid_cli.running.plan import Plan, build_plan
@@ -63,11 +64,7 @@ class StudyFolder:
 
     def config(self, short: str) -> Path:
         """Specification of one of its experiments."""
-        file = data_folder("configs") / self.configs[self.experiment(short)]
-        if not file.is_file():
-            missing = f"the specification {file.parent.name}/{file.name} is not in an installed package"
-            raise UsageError(f"{missing}; run the command in a checkout of the repository")
-        return file
+        return data_folder("configs") / self.configs[self.experiment(short)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +80,11 @@ class StudyResults:
 
     def __getitem__(self, short: str) -> Results:
         return self.experiments[short]
+
+
+def published_folder(study: StudyFolder) -> Path:
+    """Return the folder that a study is published in, also in an installed package."""
+    return data_folder("results/published") / study.folder.name
 
 
 def last_part(experiment: str) -> str:
@@ -118,6 +120,32 @@ def _study(content: Mapping[str, Any]) -> StudyFolder:
         figures={str(name): parts for name, parts in content["figures"].items()},
         **{name: content[name] for name in ("texts", "numbers", "claims", "first")},
     )
+
+
+@dataclass(frozen=True, eq=False)
+class StudyList(Result):
+    """The studies with their experiments."""
+
+    studies: Sequence[StudyFolder]
+
+    def content(self) -> list[dict[str, Any]]:
+        """Return the studies for JSON."""
+        return [{"study": each.name, "title": each.title, "experiments": dict(each.configs)} for each in self.studies]
+
+    def sections(self) -> list[Section]:
+        """Return a list of experiments for each study."""
+        import pandas as pd
+
+        return [
+            Section(
+                f"{each.name}: {each.title}",
+                frame=pd.DataFrame(
+                    [(name, f"configs/{config}") for name, config in each.configs.items()],
+                    columns=["experiment", "specification"],
+                ),
+            )
+            for each in self.studies
+        ]
 
 
 @dataclass(frozen=True)

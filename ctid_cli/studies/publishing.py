@@ -1,40 +1,19 @@
 """What is published of a study: tables, figures, claims, and the environment that made them, from one commit."""
 
-import csv
-import io
 import json
 import subprocess
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
+from ctid_cli.custom_code import DATA
 from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.reporting.layout import csv_text
-from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.status import public_sessions
-from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, StudyResults, last_part
-from ctid_cli.studies.claim import COLUMNS, Claim, claims_table
+from ctid_cli.studies.catalogue import StudyFigure, StudyResults, published_folder
+from ctid_cli.studies.claims import CheckedClaims
 from ctid_cli.written_files import write_file
-
-
-def published_folder(study: StudyFolder) -> Path:
-    """Where a study is published in a checkout of the repository."""
-    return data_folder("experiments").parent / "results" / "published" / study.folder.name
-
-
-def evaluate(found: StudyResults) -> list[Claim]:
-    """All claims of a study; one that fails for every experiment that was not run."""
-    missing = [short for short in map(last_part, found.study.configs) if short not in found]
-    claims = [Claim("was run", "no", "yes", False, short) for short in missing]
-    for function, calls in found.study.claims.items():
-        state = getattr(found.study.module("claims"), function)
-        for shorts in calls:
-            if not set(shorts) & set(missing):
-                made = state(*(found[short] for short in shorts))
-                claims += (replace(claim, experiment=" and ".join(shorts)) for claim in made)
-    return claims
 
 
 def commit_of(found: StudyResults) -> str:
@@ -56,7 +35,7 @@ def commit_of(found: StudyResults) -> str:
 
 
 def _git(*arguments: str) -> str:
-    root = data_folder("experiments").parent
+    root = DATA
     # An installed package may lie in a folder of some other repository.
     if not (root / ".git").exists():
         raise UsageError(f"results are published from a checkout of the repository, and {root} is none")
@@ -79,36 +58,20 @@ def published_texts(found: StudyResults) -> dict[str, str]:
     return texts
 
 
-def publish(found: StudyResults, claims: Sequence[Claim], target: Path) -> None:
+def publish(checked: CheckedClaims, out: Path) -> None:
     """Write everything that is published of a study, in place of what was published before."""
+    found, target = checked.results, published_folder(checked.results.study)
     commit = commit_of(found)
     texts = published_texts(found)
-    texts["claims.md"] = claims_table(claims, "md")
-    lines = io.StringIO()
-    csv.writer(lines, lineterminator="\n").writerows([COLUMNS, *(claim.cells for claim in claims)])
-    texts["claims.csv"] = lines.getvalue()
+    claims = Section(frame=checked.to_frame(), notes=[checked.counted])
+    texts |= {"claims.md": render_markdown([claims]) + "\n", "claims.csv": checked.write("csv") + "\n"}
     sessions = {short: public_sessions(results.folder) for short, results in found.experiments.items()}
     texts["environment.json"] = json.dumps({"commit": commit, "sessions": sessions}, indent=2) + "\n"
-    files = {Path(name): text.encode() for name, text in texts.items()}
+    files = {target / name: text.encode() for name, text in texts.items()}
     for number in found.study.figures:
-        files[Path("figures") / f"figure_{number}.svg"] = StudyFigure(found.study, number).svg(found.out)
+        files[target / "figures" / f"figure_{number}.svg"] = StudyFigure(found.study, number).svg(out)
     for old in target.rglob("*.*"):
         old.unlink()
-    for name, content in files.items():
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        write_file(target / name, content)
-
-
-def against_published(claims: Sequence[Claim], folder: Path) -> list[Claim]:
-    """Claims that hold now and did not when the study was published, or the other way round, as they were then."""
-    try:
-        with (folder / "claims.csv").open(encoding="utf-8", newline="") as file:
-            before = {(row["experiment"], row["claim"]): row for row in csv.DictReader(file)}
-    except OSError:
-        return []
-    changed = []
-    for claim in claims:
-        row = before.get((claim.experiment, claim.claim))
-        if row is not None and row["holds"] != claim.cells[-1]:
-            changed.append(Claim(**{**row, "holds": {"yes": True, "NO": False}.get(row["holds"])}))  # type: ignore[arg-type]
-    return changed
+    for path, content in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, content)

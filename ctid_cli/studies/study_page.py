@@ -1,72 +1,87 @@
 """The page of a reproduced study: its question, claims, tables and figures, from its results or as published."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import ctid_cli
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.committed import environment_of, made_by
-from ctid_cli.reporting.layout import Report, Table, count
-from ctid_cli.reporting.pages.page import inline, report_of, written
-from ctid_cli.reporting.results import experiments_in, out_option
+from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.pages.experiment_page import experiment_page
+from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
+from ctid_cli.reporting.results import experiments_in, out_option, read_results
 from ctid_cli.reporting.study import study_contents
-from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, read_study
-from ctid_cli.studies.claim import claims_table
-from ctid_cli.studies.publishing import evaluate, published_folder, published_texts
+from ctid_cli.reporting.study_table import environment_of, made_by
+from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, all_studies, published_folder, read_study
+from ctid_cli.studies.claims import check_claims
+from ctid_cli.studies.publishing import published_texts
+from ctid_cli.text import count, did_you_mean
 
 CLAIMS = "claims.md"
 
 
+def page_of(name: str, out: Path) -> tuple[str, Path]:
+    """Return the page of an experiment or a study, and where it usually goes.
+
+    Raises
+    ------
+    UsageError
+        If there are no results of an experiment, and no study, of this name.
+    """
+    known, studies = experiments_in(out), all_studies()
+    if name in known:
+        results = read_results(out, name)
+        return experiment_page(results, out), results.folder / "report.html"
+    if name in studies:
+        return study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
+    hint = did_you_mean(name, [*known, *studies]) or "."
+    wrong = f"{name!r} is neither an experiment with results in {out} nor a study{hint}"
+    raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
+
+
 def study_page(study: StudyFolder, out: Path) -> str:
-    """The page as HTML: of the results in a folder where all experiments were run, else of what is published."""
+    """Return the page as HTML: of the results in a folder where all experiments were run, else of what is published."""
     published = published_folder(study)
     own = set(study.configs) <= set(experiments_in(out))
     if own:
-        found = read_study(study, out)
-        texts = {name: text for name, text in published_texts(found).items() if name.endswith(".md")}
-        texts[CLAIMS] = claims_table(evaluate(found), "md")
+        texts = {name: text for name, text in published_texts(read_study(study, out)).items() if name.endswith(".md")}
+        claims = list(check_claims(study, out).sections())
         origin = [f"Results in {out.name}: {', '.join(study.configs)}."]
-    elif published.is_dir():
-        texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
-        origin = list(_published_origin(published, study.name))
     else:
-        command = f"ctid study run {study.name}{out_option(out)}"
-        raise UsageError(f"an installed package does not hold the results of {study.name}; run first: {command}")
-    # Claims that the tables already state are there once.
-    claims = texts.pop(CLAIMS, None)
+        texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
+        claims = sections_of(texts.pop(CLAIMS)) if CLAIMS in texts else []
+        origin = list(_published_origin(published, study.name))
     source = study_contents()[study.name].get("source")
-    cited = f"{source['authors']}: {source['title']} ({source['identifier']})" if source else ""
-    return written(
-        "study.html",
-        title=study.title,
-        version=ctid_cli.__version__,
-        lead=f"The study {study.name} of ctid {ctid_cli.__version__}" + (f", after {cited}." if cited else "."),
-        question=_question(study),
-        claims=report_of(claims) if claims else None,
-        reports=[report_of(text) for text in texts.values()],
-        figures=list(_figures(study, out, published, own=own)),
-        provenance=[
-            *origin,
-            f"To compute it again: ctid study run {study.name}; to check it: ctid study check {study.name}",
-        ],
-        cite=f"ctid {ctid_cli.__version__}, study {study.name}." + (f" {cited}." if cited else ""),
-    )
+    cited = f" {source['authors']}: {source['title']} ({source['identifier']})." if source else ""
+    again = [
+        f"- to compute it again: `ctid reproduce {study.name}`",
+        f"- to check it: `ctid reproduce --check {study.name}`",
+    ]
+    chapters = [
+        Chapter("Question", list(_question(study, study_contents()[study.name]))),
+        Chapter("Claims", claims),
+        Chapter("Tables", [section for text in texts.values() for section in sections_of(text)]),
+        Chapter("Figures", list(_figures(study, out, published, own=own))),
+        Chapter("Provenance", [Section(sentences=[*origin, *again])]),
+        Chapter("How to cite", [Section(sentences=[f"ctid {ctid_cli.__version__}, study {study.name}.{cited}"])]),
+    ]
+    after = f", after{cited}" if cited else "."
+    return write_page(study.title, f"The study {study.name} of ctid {ctid_cli.__version__}{after}", chapters)
 
 
-def _question(study: StudyFolder) -> Report:
-    content = study_contents()[study.name]
-    blocks: list[list[str | Table]] = []
+def _question(study: StudyFolder, content: Mapping[str, Any]) -> Iterator[Section]:
+    import pandas as pd
+
     if content.get("success"):
-        blocks.append([f"Counted: {content['success']}."])
+        yield Section(sentences=[f"Counted: {content['success']}."])
     if content.get("methods"):
-        blocks.append([Table(["method", "what it does"], [[*item] for item in content["methods"].items()], "ll")])
-    rows = [[name, f"configs/{config}"] for name, config in study.configs.items()]
-    return Report([*blocks, [Table(["experiment", "specification"], rows, "ll")]])
+        yield Section(frame=pd.DataFrame(content["methods"].items(), columns=["method", "what it does"]))
+    rows = [(name, f"configs/{config}") for name, config in study.configs.items()]
+    yield Section(frame=pd.DataFrame(rows, columns=["experiment", "specification"]))
 
 
-def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> Iterator[dict[str, Any]]:
-    """Its figures as published, but for those that its own results have."""
+def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> Iterator[Section]:
+    """Return its figures as published, but for those that its own results have."""
     for number, needed in study.figures.items():
         file = published / "figures" / f"figure_{number}.svg"
         drawn = own and bool(needed)
@@ -75,11 +90,11 @@ def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> It
             svg = figure.svg(out) if drawn else file.read_bytes()
             caption = f"Figure {number}. {figure.caption}" if number.isdigit() else figure.caption
             command = f"ctid figure {study.name}/{number}{out_option(out)}"
-            yield {"svg": inline(svg, f"figure-{number}"), "caption": caption, "command": command}
+            yield Section(drawing=svg, caption=f"{caption}. `{command}`")
 
 
 def _published_origin(published: Path, study: str) -> Iterator[str]:
-    """What made the published results."""
+    """Return what made the published results, in sentences."""
     environment = environment_of(published)
     if environment is None:
         return

@@ -4,12 +4,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ctid_cli.reporting.parameter_errors import mse_ratio
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import last_part
-from ctid_cli.studies.claim import Claim, within
+from ctid_cli.studies.claims import Claim, within
 
-from .measures import by_estimator, errors_of, is_misused
+from .measures import by_estimator, errors_of, is_misused, mse_ratio
 
 #: From so many samples on the limit for long records is expected to hold.
 LONG = 20_000
@@ -88,15 +87,15 @@ def submodels_have_the_least_errors(results: Results) -> Iterator[Claim]:
     reference = groups.pop("additive", [])
     for estimator, others in groups.items() if reference else ():
         for k, parameter in enumerate(reference[0].names):
-            ratio = mse_ratio(others, reference, parameter)
+            ratio, _ = mse_ratio(others, reference, parameter)
             theory = [group.theory for group in (others[0], reference[0])]
             expected = f"; theory {theory[0][k] / theory[1][k]:.3f}" if all(x is not None for x in theory) else ""
             band = RATIOS.get((last_part(results.experiment), estimator, parameter))
             yield Claim(
                 f"MSE of {estimator} / MSE of additive, {parameter}, N >= {LONG} together",
-                f"{ratio.ratio:.3f} ± {ratio.standard_error:.3f}{expected}",
+                f"{ratio.value:.3f} ± {ratio.error or 0.0:.3f}{expected}",
                 f"{band[0]:g} to {band[1]:g}" if band else "",
-                band[0] <= ratio.ratio <= band[1] if band else None,
+                band[0] <= ratio.value <= band[1] if band else None,
             )
 
 

@@ -8,15 +8,14 @@ import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.reporting.figures.frequency_plot import Response, dense_frequencies, response_svg
-from ctid_cli.reporting.figures.parameter_plot import bias_svg, coverage_svg, mse_svg
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
-from ctid_cli.reporting.parameter_errors import ParameterErrors
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import find_study
 
-from .measures import errors_of, parameters
+from .frequency_plot import Response, dense_frequencies, response_svg
+from .measures import ParameterErrors, errors_of, parameters
+from .parameter_plot import bias_svg, coverage_svg, mse_svg
 
 #: Estimators of each experiment, and what they are called: those in open loop,
 OPEN_LOOP = {"additive": "sum of four submodels", "srivc": "SRIVC, 8 poles and 6 zeros, factored"}

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.reporting.layout import Table, number
-from ctid_cli.reporting.parameter_errors import ParameterErrors
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults, last_part
 
-from .measures import by_estimator, errors_of, is_misused, parameters, ratios
+from .measures import ParameterErrors, by_estimator, errors_of, is_misused, parameters, ratios
 
 #: Numbers of samples that the text shows, of all that were run.
 SIZES = 6

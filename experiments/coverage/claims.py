@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.studies.claim import Claim, within
+from ctid_cli.studies.claims import Claim, within
 
 from .tables import coverage
 

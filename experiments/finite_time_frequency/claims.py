@@ -7,7 +7,7 @@ import numpy as np
 
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import last_part
-from ctid_cli.studies.claim import Claim, near, within
+from ctid_cli.studies.claims import Claim, near, within
 
 from .measures import READINGS, Row, efficiency, followed, larger_error, recovery, residuals, settling
 

@@ -10,12 +10,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from ctid_cli.frequency.base import FrequencyTrack
-from ctid_cli.reporting.figures.error_plot import Curve, Group, Row, errors_svg
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.job import DataCell, EstimatorCell
 from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.specification.load import spec_from_canonical
+
+from .error_plot import Curve, Group, Row, errors_svg
 
 #: What estimators are called that the paper compares with, but that are not theirs.
 DERIVED = "derived, not the published algorithm"

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 
-from ctid_cli.reporting.comparison import compare
-from ctid_cli.reporting.percentages import study_rows
+import pandas as pd
+
+from ctid_cli.reporting.comparison_result import compare
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import load_study
-from ctid_cli.studies.claim import Claim, within
+from ctid_cli.reporting.study_table import study_frame
+from ctid_cli.studies.claims import Claim, within
 
 #: Methods that must find the delay nearly always, wherever they start, and in how many of 100 data sets [%].
 RELIABLE = ("redundancy", "delay_profile")
@@ -16,12 +18,11 @@ ALWAYS = 99.0
 def reaches_the_paper(results: Results) -> Iterator[Claim]:
     """Ours converges as often as the published method was published to, in every cell."""
     study, found = load_study(), {results.experiment: results}
-    rows = [row for table in study.tables.values() for row in study_rows(study, table, found)]
-    rows = [row for row in rows if row["experiment"] == results.experiment]
-    against = compare(rows, None, study).decisive
-    if against:
-        lower = sum(cell["mismatch"] for cell in against)
-        shown = f"{lower} of {len(against)}; the lowest is {min(cell['percent'] for cell in against):.1f} %"
+    rows = pd.concat([study_frame(study, table, found) for table in study.tables.values()], ignore_index=True)
+    against = compare(rows[rows["experiment"] == results.experiment], None, study).decisive
+    if len(against):
+        lower = int(against["mismatch"].sum())
+        shown = f"{lower} of {len(against)}; the lowest is {against['percent'].min():.1f} %"
         name = "cells of redundancy below the paper, beyond chance"
         yield within(name, lower, high=0, shown=shown)
 

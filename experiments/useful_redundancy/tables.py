@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.reporting.layout import Table, write_reports
-from ctid_cli.reporting.percentages import ALWAYS
+from ctid_cli.reporting.layout import Table
+from ctid_cli.reporting.measures import ALWAYS
 from ctid_cli.reporting.results import Results, lookup
-from ctid_cli.reporting.tables import build_tables
+from ctid_cli.reporting.study_table import build_tables
 from ctid_cli.studies.catalogue import StudyResults, last_part
 
 #: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
@@ -22,12 +22,12 @@ refined on unfiltered data; searches that switched the filter at least once, and
 
 def markdown(found: StudyResults) -> str:
     """The tables for people."""
-    return write_reports(build_tables([], found.out, "md"), "md") + "\n"
+    return build_tables([], found.out).write("md") + "\n"
 
 
 def cells(found: StudyResults) -> str:
     """The tables as numbers."""
-    return write_reports(build_tables([], found.out), "csv") + "\n"
+    return build_tables([], found.out).write("csv") + "\n"
 
 
 def failures(results: Results) -> Iterator[dict[str, Any]]:

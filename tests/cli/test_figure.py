@@ -4,7 +4,6 @@ from xml.etree import ElementTree
 
 import pytest
 
-from ctid_cli.studies import catalogue
 from ctid_cli.studies.catalogue import find_study
 
 
@@ -49,15 +48,6 @@ def test_unknown_figures_are_refused_before_anything_is_drawn(ctid, tmp_path, na
 def test_one_file_for_several_figures_is_refused(ctid, tmp_path):
     done = ctid("figure", "1", "2", "--file", tmp_path / "x.svg", code=2)
     assert done.stderr == "ctid: --file takes one figure, not 2; --out names the folder of several\n"
-
-
-def test_an_installed_package_without_specifications_says_so(ctid, tmp_path, monkeypatch):
-    find_study("useful-redundancy").module("figures")._computed.cache_clear()
-    place = catalogue.data_folder
-    monkeypatch.setattr(catalogue, "data_folder", lambda name: place(name) if name == "experiments" else tmp_path)
-    done = ctid("figure", "3", "--out", tmp_path, code=2)
-    assert "is not in an installed package" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
 
 
 def test_a_file_that_cannot_be_written_is_a_storage_error(ctid, tmp_path):

@@ -9,8 +9,8 @@ from ctid_cli import HeldSignal, TransferFunction, simulate
 def test_the_figure_of_an_experiment_goes_to_its_folder(ctid, done):
     shown = ctid("figure", "tiny", "--out", done).stdout.strip()
     assert shown == str(done / "tiny" / "figures" / "measure.svg")
-    shown = ctid("figure", "tiny", "--kind", "convergence", "--measure", "rmse:delay", "--format", "pdf", "--out", done)
-    assert shown.stdout.strip().endswith("figures/convergence_rmse-delay.pdf")
+    shown = ctid("figure", "tiny", "--measure", "rmse:delay", "--format", "pdf", "--out", done)
+    assert shown.stdout.strip().endswith("figures/measure_rmse-delay.pdf")
 
 
 def test_the_suffix_of_a_file_is_its_format(ctid, done, tmp_path):

@@ -16,7 +16,7 @@ from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.frequency.drem import DremFiniteTime
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
-from ctid_cli.studies.claim import Claim, near, within
+from ctid_cli.studies.claims import Claim, near, within
 
 #: Standard deviation of noise between -0.2 and 0.2.
 SIGMA = 0.4 / np.sqrt(12.0)

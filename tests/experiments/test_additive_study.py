@@ -11,7 +11,7 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
-from ctid_cli.studies.claim import claims_table
+from ctid_cli.studies.claims import claims_table
 from ctid_cli.studies.publishing import evaluate, published_texts
 from tests.reporting.ideal_results import ideal_results
 from tests.storage.made_results import export_image

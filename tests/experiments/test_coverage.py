@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from benchmarks import interval_defaults as defaults
 from ctid_cli.studies.catalogue import find_study, read_study
 from ctid_cli.studies.publishing import published_texts
-from experiments.coverage import defaults
 from tests.reporting.frequency_results import run_here
 
 STUDY = find_study("coverage")

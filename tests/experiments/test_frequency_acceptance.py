@@ -2,7 +2,7 @@
 
 import pytest
 
-from ctid_cli.studies.claim import near, within
+from ctid_cli.studies.claims import near, within
 from tests.experiments import frequency_acceptance as acceptance
 
 SHORT = {

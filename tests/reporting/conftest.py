@@ -2,7 +2,6 @@
 
 import pytest
 
-from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key
@@ -110,19 +109,3 @@ def make_results(tmp_path):
         return Results(tmp_path, MadeResults(manifest, results, tuple(Origin(str(k), "x", ()) for k in range(origins))))
 
     return make
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """Matplotlib figures in the order in which they are drawn, in place of SVG files."""
-    from matplotlib.figure import Figure
-
-    figures = []
-
-    def keep(drawing):
-        figures.append(Figure(figsize=drawing[:2], layout="constrained"))
-        drawing.draw(figures[-1])
-        return b""
-
-    monkeypatch.setattr(Drawing, "saved", keep)
-    return figures

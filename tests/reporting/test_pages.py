@@ -4,12 +4,13 @@ import re
 from collections import Counter
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from ctid_cli.reporting.layout import Report, Table
+from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.reporting.pages.experiment_page import experiment_page
-from ctid_cli.reporting.pages.page import ROWS, inline, report_of
-from ctid_cli.reporting.pages.question import equation, parts, polynomial
+from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
+from ctid_cli.reporting.pages.question import formula_of, parts, polynomial
 from ctid_cli.storage.folder import SPEC
 from tests.reporting.parsed_page import Page
 
@@ -34,11 +35,11 @@ def page(results):
 def test_a_page_says_all_that_it_should(page, results):
     titles = ["Question", "Tables", "Figures", "What went wrong", "Provenance", "How to cite"]
     assert all(title in page.text for title in titles)
-    assert page.tags["svg"] == 4
+    assert page.tags["svg"] == 2
     assert "2 estimators on 8 data sets in 2 settings: 16 estimates, 1 of them failed." in page.text
     assert "percent of the data sets whose delay estimate lies within 1 % of the true delay" in page.text
     failed = next(row["id"] for row in results.rows if row["status"] == "FAILED")
-    assert f"ctid show {failed}" in page.text
+    assert f"ctid export useful-redundancy/case1-regular --id {failed}" in page.text
     assert "Huong Ha" not in page.text  # nobody's method but td_srivc's
     assert "doi:10.1016/j.jprocont.2014.10.003" in page.text
 
@@ -59,15 +60,12 @@ def test_text_of_others_stays_text(page, results):
     assert not [name for name, _ in page.attributes if name.startswith("on")]
 
 
-def test_long_tables_are_cut_and_say_so(results, monkeypatch):
-    from ctid_cli.reporting.pages import experiment_page as module
-
-    table = Table(["a"], [[str(k)] for k in range(ROWS + 5)], "r")
-    monkeypatch.setattr(module, "_tables", lambda results: [Report([[table]])])
-    monkeypatch.setattr(module, "_figures", lambda results, out: [])
-    text = Page(experiment_page(results, Path("results"))).text
+def test_long_tables_are_cut_and_say_so():
+    frame = pd.DataFrame({"a": range(ROWS + 5)})
+    text = Page(write_page("t", "lead", [Chapter("Tables", [Section(frame=frame)])])).text
     assert f"The first {ROWS} of {ROWS + 5} rows" in text
     assert f"{ROWS - 1}" in text
+    assert f"{ROWS + 1}" not in text
 
 
 def test_drawings_do_not_share_names():
@@ -79,19 +77,22 @@ def test_drawings_do_not_share_names():
 
 
 def test_equations_are_read_from_the_specification():
-    assert polynomial([0.25, -1, 0, 1]) == [("", "0.25", 3), ("−", "", 2), ("+", "1", 0)]
-    assert polynomial([0.0]) == [("", "0", 0)]
-    (one,), delayed = equation({"system": {"numerator": [2], "denominator": [1, 1], "delay": [0.0, 1.0]}})
-    assert (one.numerator, one.denominator, delayed) == ([("", "2", 0)], [("", "", 1), ("+", "1", 0)], True)
-    two, delayed = equation({"system": {"additive": [{"numerator": [1], "denominator": [1, 2], "integrators": 1}] * 2}})
-    assert ([part.integrators for part in two], delayed) == ([1, 1], False)
-    assert equation({"system": {"kind": "own.py:Tank", "truth": {"k": 1.0}}}) is None
+    assert polynomial([0.25, -1, 0, 1]) == "0.25 s³ − s² + 1"
+    assert polynomial([0.0]) == "0"
+    assert polynomial([-1.0, 0.5]) == "−s + 0.5"
+    one = {"system": {"numerator": [2], "denominator": [1, 1], "delay": [0.0, 1.0]}}
+    assert formula_of(one) == "G(s) = 2 / (s + 1) · e^(−τ s)"
+    two = {"system": {"additive": [{"numerator": [1], "denominator": [1, 2], "integrators": 1}] * 2}}
+    assert formula_of(two) == "G(s) = 1 / [s (s + 2)] + 1 / [s (s + 2)]"
+    assert formula_of({"system": {"kind": "own.py:Tank", "truth": {"k": 1.0}}}) == ""
 
 
-def test_markdown_of_the_house_is_read_back():
-    report = Report([["### Title"], ["Some words."], [Table(["a | b", "n"], [["x", "1"], ["y", "2"]], "lr")]])
-    again = report_of(report.draw("md"))
-    assert again.blocks == report.blocks
+def test_published_markdown_is_read_back():
+    frame = pd.DataFrame({"a | b": ["x", "y"], "n": ["1", "2"]})
+    text = render_markdown([Section("Title", ["Some words."], frame)])
+    title, words, table = sections_of(text)
+    assert (title.title, words.sentences) == ("Title", ["Some words."])
+    assert table.frame.equals(frame)
 
 
 def test_styles_are_those_of_print_and_phones():
@@ -104,5 +105,5 @@ def test_styles_are_those_of_print_and_phones():
 def test_of_a_noise_the_polynomials_are_options():
     noise = {"kind": "arma", "numerator": [1.0], "denominator": [1.0, -0.9], "variance": 0.02}
     system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.5}
-    found = {part.title: [option.name for option in part.options] for part in parts({"noise": noise, "system": system})}
-    assert found == {"System": ["delay"], "Noise": ["numerator", "denominator", "variance"]}
+    found = {part.title: part.frame["option"].tolist() for part in parts({"noise": noise, "system": system})}
+    assert found == {"System": ["delay"], "Noise (arma)": ["numerator", "denominator", "variance"]}

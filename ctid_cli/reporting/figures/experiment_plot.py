@@ -4,15 +4,14 @@ from collections.abc import Sequence
 from typing import Literal, get_args
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures.estimate_plot import box_drawing, delays_drawing, errors_drawing
-from ctid_cli.reporting.figures.measure_plot import convergence_drawing, measure_drawing
+from ctid_cli.reporting.figures.estimate_plot import box_drawing
+from ctid_cli.reporting.figures.measure_plot import measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
 from ctid_cli.reporting.measures import asked_measures, default_measures
-from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
 from ctid_cli.storage.manifest import true_values
 
-Kind = Literal["measure", "errors", "delays", "box", "convergence"]
+Kind = Literal["measure", "box"]
 
 
 def kinds_of(results: Results) -> list[Kind]:
@@ -24,11 +23,7 @@ def kinds_of(results: Results) -> list[Kind]:
         raise UsageError(f"{one}; ctid fit draws a fit")
     kinds: list[Kind] = ["measure"]
     if any(map(true_values, results.manifest["data_cells"])):
-        names = [one.names for one in estimates_by_group(results)]
         kinds += ["box"]
-        kinds += ["errors"] if any(len(own) > 1 for own in names) else []
-        kinds += ["delays"] if any("delay" in own for own in names) else []
-    kinds += ["convergence"]
     alone = len(results.groups()) == 1 and "box" in kinds
     return sorted(kinds, key=lambda kind: kind != "box") if alone else kinds
 
@@ -58,14 +53,10 @@ def experiment_drawing(
 ) -> Drawing:
     """A figure of an experiment."""
     chosen = chosen_kind(results, kind, measure)
-    if chosen in ("measure", "convergence"):
+    if chosen == "measure":
         if parameters:
-            one = f"for one parameter: --measure rmse:{parameters[0]}"
-            raise UsageError(f"--parameters goes with --kind errors and box; {one}")
-        draw = measure_drawing if chosen == "measure" else convergence_drawing
-        return draw(results, measure or main_measure(results))
+            raise UsageError(f"--parameters goes with --kind box; for one parameter: --measure rmse:{parameters[0]}")
+        return measure_drawing(results, measure or main_measure(results))
     if measure is not None:
-        raise UsageError(f"--measure goes with --kind measure and convergence, not {chosen}")
-    if chosen == "delays":
-        return delays_drawing(results)
-    return (errors_drawing if chosen == "errors" else box_drawing)(results, parameters)
+        raise UsageError(f"--measure goes with --kind measure, not {chosen}")
+    return box_drawing(results, parameters)

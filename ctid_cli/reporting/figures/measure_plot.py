@@ -1,4 +1,4 @@
-"""Drawings of a measure: over what an experiment varies, and over the number of data sets that it is known from.
+"""A measure over what an experiment varies.
 
 Over several settings at once it is a nested loop plot: all combinations side by side, the last setting varying fastest,
 with stairs below that say which is which (G. Rücker and G. Schwarzer, Presenting simulation results in a nested loop
@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.reporting.figures.settings import Scale, Settings, part_of, scale_of, settings_in, value_text
+from ctid_cli.reporting.figures.settings import Scale, Settings, scale_of, settings_in, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.reporting.measures import measure_of, measure_rows
-from ctid_cli.reporting.percentages import Row
+from ctid_cli.reporting.measures import Row, measure_of, measure_rows
 from ctid_cli.reporting.results import Results
 
 if TYPE_CHECKING:
@@ -27,12 +26,10 @@ if TYPE_CHECKING:
 
 #: What a measure of a good estimator is.
 IDEAL = {"bias": 0.0, "median_bias": 0.0, "coverage": 95.0, "error_ratio": 1.0, "efficiency": 100.0}
-#: Panels at most, and numbers of data sets at which a measure is followed.
-PANELS, STEPS = 12, 8
+#: Panels at most.
+PANELS = 12
 #: Heights of a panel of a nested loop plot, and of a flight of its stairs [inch].
 NESTED, FLIGHT = 1.9, 0.42
-#: Fewest data sets that a measure is followed from.
-FEWEST = 10
 #: An axis is logarithmic where positive values span so much.
 SPAN = 8.0
 #: Stretches of the stairs that are labelled.
@@ -184,52 +181,3 @@ def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
     runs = [row["n"] for row in rows]
     sets = count(max(runs), "data set") if min(runs) == max(runs) else f"{min(runs)} to {max(runs)} data sets"
     return f"{results.experiment}: {measure_of(measure, results).meaning}\n{sets} a point, 95 % intervals"
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Convergence
-
-
-def convergence_drawing(results: Results, measure: str) -> Drawing:
-    """A measure over the number of data sets that it is computed from: one panel for each combination of settings."""
-    by_size = {n: [row for row in measure_rows(results, [measure], n) if row["n"]] for n in _sizes(results)}
-    last = list(by_size.values())[-1]
-    settings = settings_in(last, results)
-    names = list(dict.fromkeys(row["parameter"] for row in last))
-    # One parameter; the delay is what most experiments are about.
-    name = "delay" if "delay" in names else names[0]
-    points = settings.points[:PANELS]
-
-    def draw(figure: Figure) -> None:
-        panels = panels_of(figure, len(points), sharex=True, sharey=True)
-        for axes, point in zip(panels, points, strict=True):
-            for k, method in enumerate(settings.methods):
-                found = [
-                    settings.row_at(point, [r for r in rows if (r["method"], r["parameter"]) == (method, name)])
-                    for rows in by_size.values()
-                ]
-                _draw_band(axes, np.array([*by_size], dtype=float), found, look(k))
-        for axes, point in zip(panels, points, strict=True):
-            _label(axes, [row for row in last if row["parameter"] == name], measure)
-            Scale([float(n) for n in (min(by_size), max(by_size))], True, None).apply(axes)
-            axes.set_title(settings.words(point) or plain(name or ""), loc="left", fontsize=8)
-            axes.set_xlabel("data sets")
-        _legend(figure, last, settings)
-        what = measure_of(measure, results).meaning + (f" of {plain(name)}" if name else "")
-        figure.suptitle(
-            f"{results.experiment}: {what}\nfrom the first data sets{part_of(points, settings.points)}, 95 % bands"
-        )
-
-    return Drawing(*size_for(len(points)), draw)
-
-
-def _draw_band(axes: Axes, sizes: Array, found: Sequence[Row | None], style: Mapping[str, Any]) -> None:
-    value, low, high = (np.array([_number(row, key) for row in found]) for key in ("value", "low", "high"))
-    axes.fill_between(sizes, low, high, color=style["color"], alpha=0.15, linewidth=0)
-    axes.plot(sizes, value, **style, markersize=3, linewidth=0.9)
-
-
-def _sizes(results: Results) -> list[int]:
-    """Numbers of data sets at which a measure is followed, evenly spaced on a logarithmic axis."""
-    runs = max(cell["replicates"] for cell in results.manifest["data_cells"])
-    return [int(n) for n in np.unique(np.geomspace(min(FEWEST, runs), runs, STEPS).round().astype(int))]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
-from ctid_cli.reporting.percentages import Row, settings_of
+from ctid_cli.reporting.measures import Row, settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.sampling import InstantsFile
 from ctid_cli.signals.sinusoids import SumOfSinusoids

@@ -1,32 +1,29 @@
 """The page of one experiment: what was asked, what came out, how sure that is, and how to get it again."""
 
 import itertools
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import ctid_cli
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.figures.experiment_plot import Kind, experiment_drawing, kinds_of, main_measure
-from ctid_cli.reporting.figures.measure_plot import FEWEST
-from ctid_cli.reporting.layout import Report, Table, count
-from ctid_cli.reporting.measure_tables import measure_report
+from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.figures.experiment_plot import experiment_drawing, kinds_of, main_measure
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
-from ctid_cli.reporting.overview import sentence_of
-from ctid_cli.reporting.pages.page import inline, written
-from ctid_cli.reporting.pages.question import equation, estimators, parts, references
-from ctid_cli.reporting.paired_table import compare_estimators
+from ctid_cli.reporting.pages.page import Chapter, write_page
+from ctid_cli.reporting.pages.question import estimators, formula_of, parts, references
+from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
+from ctid_cli.reporting.status_result import first_line
 from ctid_cli.reporting.surprises import surprises
-from ctid_cli.reporting.table_blocks import success_sentence
-from ctid_cli.reporting.tables import experiment_report, notes_of
-from ctid_cli.storage.estimates import Estimates
+from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.folder import SPEC
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import public_sessions
+from ctid_cli.text import count
 
 #: What is measured of every simulated system, beside what the specification asks for.
 MEASURES = ("bias", "rmse", "coverage")
@@ -34,46 +31,26 @@ MEASURES = ("bias", "rmse", "coverage")
 ALL_PAIRS = 3
 #: Kinds of failure that are listed.
 FAILURES_LISTED = 20
-#: What the figures show.
-CAPTIONS: dict[Kind, str] = {
-    "measure": "over all settings",
-    "errors": "Errors of two parameters against each other, one point for each data set",
-    "delays": "Where the estimated delays lie",
-    "box": "How the errors of each parameter are spread",
-    "convergence": "How sure that is: the same from the first data sets only",
-}
 
 
 def experiment_page(results: Results, out: Path) -> str:
-    """The page as HTML."""
-    settings = results.settings
+    """Return the page as HTML."""
     sessions = public_sessions(results.folder)
-    sizes = [cell["replicates"] for cell in results.manifest["data_cells"]]
-    return written(
-        "experiment.html",
-        title=results.experiment,
-        version=ctid_cli.__version__,
-        made=max((str(session.get("stopped") or session.get("started") or "") for session in sessions), default=""),
-        counts=_counts(results),
-        equation=equation(settings),
-        parts=list(parts(settings)),
-        estimators=list(estimators(settings)),
-        runs=" to ".join(map(str, dict.fromkeys((min(sizes), max(sizes))))),
-        seed=results.manifest["seed"],
-        success=success_sentence(settings) if settings.get("success") else "",
-        reports=_tables(results),
-        figures=list(_figures(results, out)),
-        comparisons=list(_comparisons(results, out)),
-        outcomes=_outcomes(results.stored, out),
-        notes=notes_of(results, out),
-        surprises=surprises(results),
-        spec_hash=results.manifest["spec_hash"],
-        origins=results.stored.origins,
-        sessions=sessions,
-        specification=_specification(results),
-        out=out_option(out),
-        references=references(settings),
-    )
+    made = max((str(session.get("stopped") or session.get("started") or "") for session in sessions), default="")
+    lead = f"{_counts(results)}.{f' Computed until {made}.' if made else ''}"
+    numbers = f"All numbers: `ctid table {results.experiment}{out_option(out)} --format csv`; every estimate: "
+    numbers += f"`ctid export {results.experiment}{out_option(out)}`."
+    chapters = [
+        Chapter("Before using it", [Section(sentences=[f"- {note}"]) for note in surprises(results)]),
+        Chapter("Question", [*_question(results)]),
+        Chapter("Tables", [*_tables(results), Section(notes=[numbers])]),
+        Chapter("Figures", list(_figures(results, out))),
+        Chapter("Differences on the same data sets", list(_comparisons(results, out))),
+        Chapter("What went wrong", _outcomes(results, out)),
+        Chapter("Provenance", list(_provenance(results, sessions))),
+        Chapter("How to cite", [_cited(results)]),
+    ]
+    return write_page(results.experiment, lead, chapters)
 
 
 def _counts(results: Results) -> str:
@@ -87,75 +64,110 @@ def _counts(results: Results) -> str:
     return f"{count(methods, 'estimator')} on {count(sets, 'data set')}{cells}: {estimates}{failed}"
 
 
-def _tables(results: Results) -> list[Report]:
-    """The tables of ``ctid table``, and the usual measures where they are not among them."""
-    reports = [experiment_report(results)]
+def _question(results: Results) -> Iterator[Section]:
+    """Return the data and the estimators as the specification describes them."""
+    settings, seed = results.settings, results.manifest["seed"]
+    yield Section(sentences=[formula_of(settings)] if formula_of(settings) else [])
+    yield from parts(settings)
+    sizes = [cell["replicates"] for cell in results.manifest["data_cells"]]
+    runs = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
+    sets = "One measured record, the same for all estimators."
+    if seed is not None:
+        sets = f"{runs} of each setting, seed {seed}. The same data sets for all estimators."
+    yield Section("Data sets", [sets])
+    if settings.get("success"):
+        rule = f"Counted: {success_sentence(settings)}. Estimates that failed count as not converged."
+        yield Section("Success", [rule])
+    yield from estimators(settings)
+
+
+def _tables(results: Results) -> list[Section]:
+    """Return the tables of ``ctid table``, and the usual measures where they are not among them."""
+    tables = [experiment_table(results)]
     if any(map(true_values, results.manifest["data_cells"])):
         others = [name for name in MEASURES if name not in default_measures(results)]
-        reports += [measure_report(results, others)] if others else []
-    return [Report([_untitled(block) for block in report.blocks], notes=report.notes) for report in reports]
+        tables += [measure_table(results, others)] if others else []
+    return [section for table in tables for section in table.shown]
 
 
-def _untitled(block: Any) -> list[str | Table]:
-    """The name of the experiment is that of the page."""
-    return [item for item in block if not (isinstance(item, str) and item.startswith("### "))]
-
-
-def _figures(results: Results, out: Path) -> Iterator[dict[str, Any]]:
+def _figures(results: Results, out: Path) -> Iterator[Section]:
     try:
         kinds = kinds_of(results)
     except UsageError:
         return
     name = main_measure(results)
-    # From so few data sets it is one point.
-    few = max(cell["replicates"] for cell in results.manifest["data_cells"]) <= FEWEST
     for kind in kinds:
-        if kind == "convergence" and few:
-            continue
-        try:
-            drawing = experiment_drawing(results, kind, name if kind in ("measure", "convergence") else None)
-        except UsageError:
-            continue
-        caption = f"{name.capitalize()} {CAPTIONS[kind]}" if kind == "measure" else CAPTIONS[kind]
-        command = f"ctid figure {results.experiment} --kind {kind}{out_option(out)}"
-        yield {"svg": inline(drawing.laid_out_once(), kind), "caption": caption, "command": command}
+        drawing = experiment_drawing(results, kind, name if kind == "measure" else None)
+        caption = f"{name.capitalize()} over all settings" if kind == "measure" else "Errors of each parameter"
+        command = f"`ctid figure {results.experiment} --kind {kind}{out_option(out)}`"
+        yield Section(drawing=drawing, caption=f"{caption}. {command}")
 
 
-def _comparisons(results: Results, out: Path) -> Iterator[Report]:
-    """Differences of estimators on the same data sets, where they have enough of them in common."""
+def _comparisons(results: Results, out: Path) -> Iterator[Section]:
+    """Return differences of estimators on the same data sets, where they have enough of them in common."""
     names = list(dict.fromkeys(part["name"] for part in results.manifest["estimators"]))
     pairs = itertools.combinations(names, 2)
     for pair in pairs if len(names) <= ALL_PAIRS else ((names[0], name) for name in names[1:]):
         try:
-            yield compare_estimators(results, ",".join(pair), out)
+            yield from compare_estimators(results, ",".join(pair), out).shown
         except UsageError:
             continue
 
 
-def _outcomes(rows: Estimates, out: Path) -> list[dict[str, Any]]:
-    """How the estimates ended that did not end well, with the command that shows one of them."""
-    first: dict[tuple[str, str, str], str] = {}
-    found: Counter[tuple[str, str, str]] = Counter()
+def _outcomes(results: Results, out: Path) -> list[Section]:
+    """Return how the estimates ended that did not end well, with the command that shows one of them."""
+    rows = results.stored
     well = np.isin(rows.column("status"), [status.encode() for status in SUCCESSES])
-    for row in rows.chosen(~well).rows("estimator", "status", "message", "id"):
-        how = (row["estimator"], row["status"], sentence_of(row))
-        found[how] += 1
-        first.setdefault(how, row["id"])
-    return [
-        {
-            "estimator": how[0],
-            "status": how[1],
-            "reason": how[2],
-            "n": n,
-            "command": f"ctid show {first[how]}{out_option(out)}",
-        }
-        for how, n in found.most_common(FAILURES_LISTED)
-    ]
+    failed = list(rows.chosen(~well).rows("estimator", "status", "message", "id"))
+    notes = [f"Note: {note}" for note in notes_of(results, out)]
+    if not failed:
+        return [Section(sentences=["Nothing: every estimate ended as it should."], notes=notes)]
+    frame = pd.DataFrame([{**row, "reason": first_line(row["message"])} for row in failed])
+    groups = frame.groupby(["estimator", "status", "reason"], sort=False)["id"].agg(["size", "first"]).reset_index()
+    listed = groups.sort_values("size", ascending=False, kind="stable").head(FAILURES_LISTED)
+    listed["first"] = [f"`ctid export {results.experiment} --id {id}{out_option(out)}`" for id in listed["first"]]
+    columns = {"size": "estimates", "first": "the first of them"}
+    return [Section(frame=listed.rename(columns=columns), notes=notes)]
 
 
-def _specification(results: Results) -> str:
-    """The specification as it was written."""
+def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
+    """Return what computed the results, and the specification as it was written."""
+    seed = results.manifest["seed"]
+    sown = "" if seed is None else f", seed {seed}"
+    made = f"Specification {results.manifest['spec_hash'][:16]}{sown}; page by ctid {ctid_cli.__version__}."
+    origins = [(each.code_version, each.platform, _versions(dict(each.packages))) for each in results.stored.origins]
+    yield Section(sentences=[made], frame=pd.DataFrame(origins, columns=["code version", "platform", "libraries"]))
+    if sessions:
+        frame = pd.DataFrame(
+            [
+                {
+                    "session": each.get("started"),
+                    "until": each.get("stopped"),
+                    "computed": each.get("computed"),
+                    "failed": each.get("failed"),
+                    "workers": each.get("jobs"),
+                    "Python and libraries": _versions(each.get("packages") or {}),
+                }
+                for each in sessions
+            ]
+        )
+        yield Section(frame=frame)
     try:
-        return (results.folder / SPEC).read_text(encoding="utf-8")
+        text = (results.folder / SPEC).read_text(encoding="utf-8")
     except OSError:
-        return ""
+        return
+    where, same = (" beside its record", "") if seed is None else ("", ": the same seed gives the same data sets")
+    yield Section("The specification", [f"Save it as a file{where} and run `ctid run FILE`{same}.", text + "\n"])
+
+
+def _versions(packages: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in packages.items())
+
+
+def _cited(results: Results) -> Section:
+    """Return what to cite."""
+    seed = results.manifest["seed"]
+    own = f"ctid {ctid_cli.__version__}, experiment {results.experiment}, "
+    own += f"specification {results.manifest['spec_hash'][:16]}{'' if seed is None else f', seed {seed}'}."
+    others = references(results.settings)
+    return Section(sentences=[own + (" And the articles whose methods these are:" if others else ""), *others])

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 
-import ctid_cli
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification, costs_about_delay
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.reporting.citations import bibtex
-from ctid_cli.reporting.estimate import Units, parameter_table
+from ctid_cli.reporting.document import Section, pairs
+from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.fit_drawings import (
     bode_drawing,
     delay_drawing,
@@ -19,20 +19,13 @@ from ctid_cli.reporting.fit_drawings import (
     step_drawing,
     validation_drawing,
 )
-from ctid_cli.reporting.identification_plot import MOST_DRAWN, identification_drawing
-from ctid_cli.reporting.identification_report import (
-    asked_for,
-    covariance_line,
-    derived_block,
-    derived_of,
-    parameters_of,
-    quality,
-    record_line,
-)
-from ctid_cli.reporting.layout import Report, Table, count, number
-from ctid_cli.reporting.pages.page import Chapter, figure, shown, shown_command, written
-from ctid_cli.reporting.pages.question import Fraction, polynomial
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.identification_plot import MOST_DRAWN, Kind, identification_drawing
+from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.pages.page import Chapter, citation, provenance, shown, write_page
+from ctid_cli.reporting.pages.question import formula
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.text import count
 
 #: Digits of the coefficients in the equation.
 DIGITS = 5
@@ -40,127 +33,82 @@ DIGITS = 5
 POINTS = 500
 
 
-def fit_page(
-    result: Identification,
-    measurements: Sequence[Measurement],
-    validation: Measurement | None,
-    content: Mapping[str, Any],
-) -> str:
-    """The page as HTML, of a fit and what its file says."""
-    units = Units(**content["units"])
-    chapters = list(_chapters(result, measurements, validation, units))
-    return written(
-        "fit.html",
-        title="Fit of " + ", ".join(measurement.record.name or "a record" for measurement in measurements),
-        version=ctid_cli.__version__,
-        lead=_lead(result),
-        warnings=result.warnings,
-        data=_data(result, measurements, units),
-        equation=_equation(result),
-        model=_model(result, units),
-        chapters=chapters,
-        titles=[("model", "Model"), *((chapter.name, chapter.title) for chapter in chapters)],
-        provenance=_provenance(content),
-        command=shown_command(content["command"]),
-        bibtex=bibtex(result),
+def fit_page(result: FitResult, content: Mapping[str, Any]) -> str:
+    """Return the page as HTML, of a fit and what its file says."""
+    fitted, fine = (
+        result.fitted,
+        "Nothing that was tested speaks against this model: the search ended well, the residuals ",
     )
+    model = fitted.fit.model
+    terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+    equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
+    quality = Section("How good it is", frame=pairs(result.quality()))
+    chapters = [
+        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [fine])]),
+        Chapter("Data", [result.data(), Section(frame=pairs(result.settings()))]),
+        Chapter("Model", [Section(sentences=[equation]), result.parameters(), result.derived(), quality]),
+        *_figures(fitted, result.records.measurements, result.records.validation, result.units),
+        Chapter("Provenance", provenance(_origin(content), content["command"])),
+        Chapter("How to cite", citation(bibtex(fitted))),
+    ]
+    title = "Fit of " + ", ".join(record.name or "a record" for record in result.records.data)
+    return write_page(title, _lead(fitted), chapters)
 
 
 def _lead(result: Identification) -> str:
-    fit, judged = result.fit, result.validation
-    model = f"{count(fit.model.order, 'pole')}, {count(result.options.zeros, 'zero')}"
-    beyond = f"; {number(judged.fit_percent, 4)} % on {judged.name}, which it was not made from" if judged else ""
-    return (
-        f"{model}: simulates {number(fit.fit_percent, 4)} % of {count(fit.count, 'sample')}{beyond}. {fit.status.value}"
-    )
+    fit, validation = result.fit, result.validation
+    lead = f"{count(fit.model.order, 'pole')}, {count(result.options.zeros, 'zero')}: simulates "
+    lead += f"{number(fit.fit_percent, 4)} % of {count(fit.count, 'sample')}"
+    if validation is not None:
+        lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
+    return f"{lead}. {fit.status.value}"
 
 
-def _equation(result: Identification) -> tuple[list[Fraction], bool]:
-    model = result.fit.model
-    above, below = polynomial(model.numerator.tolist(), DIGITS), polynomial(model.denominator.tolist(), DIGITS)
-    return [Fraction(above, below, 0)], model.delay > 0
-
-
-def _data(result: Identification, measurements: Sequence[Measurement], units: Units) -> Report:
-    lines: list[str | Table] = []
-    for measurement, use in zip(measurements, result.fit.used, strict=True):
-        lines += [record_line(measurement, int(np.count_nonzero(use)), units), *measurement.notes]
-    rows = [[label, text] for label, text in asked_for(result, measurements, units)]
-    return Report([lines, [Table(["", ""], rows, "ll")]])
-
-
-def _model(result: Identification, units: Units) -> Report:
-    rows: list[list[str]] = []
-    for label, text in quality(result, units):
-        if not label:
-            rows[-1][1] += f"; {text}"
-        elif not label.startswith("residuals"):  # these have a chapter of their own
-            rows.append([label, text])
-    return Report(
-        [
-            [parameter_table(parameters_of(result, units)), covariance_line(result)],
-            ["### What follows from them", *derived_block(derived_of(result, units))],
-            ["### How good it is", Table(["", ""], rows, "ll")],
-        ]
-    )
-
-
-def _provenance(content: Mapping[str, Any]) -> Report:
-    rows = [["ctid", str(content["ctid"])]]
+def _origin(content: Mapping[str, Any]) -> list[tuple[str, str]]:
+    rows = [("ctid", str(content["ctid"]))]
     named = [("record", each) for each in content["records"]]
     named += [("validation record", content["validation"])] if content["validation"] else []
     for label, each in named:
         if each["path"] is None:
-            rows.append([label, "its samples are in the file of the fit"])
+            rows.append((label, "its samples are in the file of the fit"))
         else:
             window = [f"{word} {each[word]}" for word in ("from", "to") if each[word] is not None]
-            rows.append([label, ", ".join([shown(str(each["path"])), f"hold {each['hold']}", *window])])
-            rows.append(["its SHA-256", str(each["sha256"])])
-    rows.append(["checksum of the fit", str(content.get("checksum", ""))])
-    return Report([[Table(["", ""], rows, "ll")]])
+            rows.append((label, ", ".join([shown(str(each["path"])), f"hold {each['hold']}", *window])))
+            rows.append(("its SHA-256", str(each["sha256"])))
+    return [*rows, ("checksum of the fit", str(content.get("checksum", "")))]
 
 
 # --- figures ---------------------------------------------------------------------------------------
 
 
-def _chapters(
+def _figures(
     result: Identification, measurements: Sequence[Measurement], validation: Measurement | None, units: Units
 ) -> Iterator[Chapter]:
+    def part(kind: Kind, caption: str, notes: Sequence[str] = ()) -> Section:
+        return Section(drawing=identification_drawing(result, measurements, units, kind), caption=caption, notes=notes)
+
     more = len(measurements) - MOST_DRAWN
-    notes = [f"{more} more experiments are not drawn."] if more > 0 else []
-    overlay = [
-        figure(identification_drawing(result, measurements, units, "overlay"), "overlay", "Measured and simulated")
-    ]
+    output = [part("overlay", "Measured and simulated.")]
     judged = result.validation
     if judged is not None and validation is not None:
-        caption = f"The same on {judged.name}, from which nothing was estimated but the initial state and the offset"
-        overlay.append(figure(validation_drawing(judged, validation, units), "validation", caption))
-    yield Chapter("output", "Output", overlay, notes)
-    figures = [figure(identification_drawing(result, measurements, units, "residuals"), "residuals", "What is left")]
-    if result.tests:
-        drawing = identification_drawing(result, measurements, units, "correlation")
-        figures.append(figure(drawing, "correlation", "Their correlation with themselves and with the input"))
-    yield Chapter("residuals", "Residuals", figures, [test.sentence for test in result.tests])
-    yield _responses(result, measurements, units)
-    yield Chapter(
-        "poles",
-        "Poles",
-        [
-            figure(
-                poles_drawing(result.poles(), result.fit.model.zeros, units),
-                "poles",
-                "Poles with their regions, and zeros",
-            )
-        ],
-    )
+        caption = f"The same on {judged.name}, from which nothing was estimated but the initial state and the offset."
+        output.append(Section(drawing=validation_drawing(judged, validation, units), caption=caption))
+    output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
+    yield Chapter("Output", output)
+    residuals = [part("residuals", "Residuals.")]
+    residuals += [part("correlation", "Their correlation with themselves and with the input.")] if result.tests else []
+    yield Chapter("Residuals", [*residuals, Section(notes=[test.sentence for test in result.tests])])
+    yield Chapter("Responses", _responses(result, measurements, units))
+    poles = poles_drawing(result.poles(), result.fit.model.zeros, units)
+    yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
     if result.fit.profile is not None:
         near = costs_about_delay(result)
-        caption = "The search over the whole range" + (", and the cost about the estimate" if near else "")
-        yield Chapter("delay", "Delay", [figure(delay_drawing(result, near, units), "delay", caption)])
+        caption = "The search over the whole range" + (", and the cost about the estimate." if near else ".")
+        yield Chapter("Delay", [Section(drawing=delay_drawing(result, near, units), caption=caption)])
 
 
-def _responses(result: Identification, measurements: Sequence[Measurement], units: Units) -> Chapter:
-    """The model over frequency and time, with the frequency response that the first record shows without a model."""
+def _responses(result: Identification, measurements: Sequence[Measurement], units: Units) -> list[Section]:
+    """Return the model over frequency and time, with the frequency response of the first record without a model."""
     notes: list[str] = []
     found = None
     try:
@@ -169,15 +117,16 @@ def _responses(result: Identification, measurements: Sequence[Measurement], unit
     except DataError as error:
         notes.append(f"The record gives no frequency response without a model: {error}.")
     band = result.frequency_response(None if found is None else _frequencies(result, found))
-    figures = [
-        figure(bode_drawing(band, found, units), "bode", "Frequency response, with pointwise 95 % bands"),
-        figure(step_drawing(result.step_response(), units), "step", "Response to a unit step, with its pointwise band"),
+    step = step_drawing(result.step_response(), units)
+    return [
+        Section(drawing=bode_drawing(band, found, units), caption="Frequency response, with pointwise 95 % bands."),
+        Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
+        Section(notes=notes),
     ]
-    return Chapter("responses", "Responses", figures, notes)
 
 
 def _frequencies(result: Identification, found: FrequencyResponse) -> Array:
-    """Frequencies at which the model is drawn: its own, and those of the record."""
+    """Return the frequencies at which the model is drawn: its own, and those of the record."""
     own = result.frequency_response().frequencies
     low, high = min(own[0], found.frequencies[0]), max(own[-1], found.frequencies[-1])
     return np.geomspace(low, high, POINTS)

@@ -3,9 +3,10 @@
 import inspect
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from ctid_cli.kinds import KINDS, resolve
+from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.settings import documentation, unit_in
 from ctid_cli.reporting.layout import number
 
@@ -22,60 +23,42 @@ TITLES = {
     "starts": "Starts",
 }
 
+SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 #: What of a system is in its equation.
 IN_EQUATION = ("numerator", "denominator", "additive")
 
 
-class Option(NamedTuple):
-    """A value of a specification."""
-
-    name: str
-    value: str
-    unit: str
-    meaning: str
-
-
-class Part(NamedTuple):
-    """A section of a specification, or an estimator."""
-
-    title: str
-    kind: str
-    summary: str
-    options: list[Option]
-
-
-class Fraction(NamedTuple):
-    """A fraction of polynomials as the signs, coefficients and powers of their terms."""
-
-    numerator: list[tuple[str, str, int]]
-    denominator: list[tuple[str, str, int]]
-    #: Power of s that stands before the denominator.
-    integrators: int
-
-
-def parts(settings: Mapping[str, Any]) -> Iterator[Part]:
-    """The data of an experiment, section by section."""
+def parts(settings: Mapping[str, Any]) -> Iterator[Section]:
+    """Return the data of an experiment, section by section."""
     for section, title in TITLES.items():
         content = settings.get(section)
         if isinstance(content, Mapping):
             yield _part(title, section, content)
 
 
-def estimators(settings: Mapping[str, Any]) -> Iterator[Part]:
-    """The estimators of an experiment."""
+def estimators(settings: Mapping[str, Any]) -> Iterator[Section]:
+    """Return the estimators of an experiment."""
     for name, content in settings["estimators"].items():
         section = "estimator" if content.get("kind") in KINDS["estimator"] else "frequency_estimator"
         yield _part(name, section, content)
 
 
-def _part(title: str, section: str, content: Mapping[str, Any]) -> Part:
+def _part(title: str, section: str, content: Mapping[str, Any]) -> Section:
+    """Return a section of a specification with a table of its options; custom components have no documented ones."""
+    import pandas as pd
+
+    kind = str(content.get("kind") or "")
     summary, docs = documentation(section, content)
     options = [
-        Option(name, _text(value), *_unit_and_meaning(docs.get(name, "")))
+        (name, _text(value), *_unit_and_meaning(docs.get(name, "")))
         for name, value in content.items()
         if name != "kind" and value is not None and not (section == "system" and name in IN_EQUATION)
     ]
-    return Part(title, str(content.get("kind") or ""), summary if content.get("kind") else "", options)
+    frame = pd.DataFrame(options, columns=["option", "value", "unit", "meaning"]) if options else None
+    if frame is not None and not frame["meaning"].any():
+        frame = frame[["option", "value"]]
+    named = f"{title} ({kind})" if kind not in ("", title) else title
+    return Section(named, [summary] if kind and summary else [], frame)
 
 
 def _unit_and_meaning(text: str) -> tuple[str, str]:
@@ -92,27 +75,48 @@ def _text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else number(value, 15)
 
 
-def equation(settings: Mapping[str, Any]) -> tuple[list[Fraction], bool] | None:
-    """The fractions of a system whose equation is known, and whether there is a delay."""
+def formula_of(settings: Mapping[str, Any]) -> str:
+    """Return the transfer function of a system whose equation is known, else an empty text."""
     system = settings.get("system") or {}
     if "additive" in system:
         terms = [(item["numerator"], item["denominator"], item.get("integrators") or 0) for item in system["additive"]]
     elif "denominator" in system:
         terms = [(system["numerator"], system["denominator"], 0)]
     else:
-        return None
-    fractions = [Fraction(polynomial(above), polynomial(below), power) for above, below, power in terms]
-    return fractions, bool(system.get("delay"))
+        return ""
+    return formula(terms, delayed=bool(system.get("delay")))
 
 
-def polynomial(coefficients: Sequence[float], digits: int = 15) -> list[tuple[str, str, int]]:
-    """Sign, size and power of s of the terms of a polynomial in descending powers; a size of 1 is not written."""
-    found: list[tuple[str, str, int]] = []
+def formula(terms: Sequence[tuple[Sequence[float], Sequence[float], int]], *, delayed: bool, digits: int = 15) -> str:
+    """Return a sum of fractions, each with poles at the origin besides, as one line."""
+    shown = []
+    for numerator, denominator, integrators in terms:
+        above, below = _bracketed(polynomial(numerator, digits)), _bracketed(polynomial(denominator, digits))
+        shown.append(f"{above} / {f'[{_power(integrators)} {below}]' if integrators else below}")
+    text = " + ".join(shown)
+    if delayed:
+        text = f"[{text}] e^(−τ s)" if len(shown) > 1 else f"{text} · e^(−τ s)"
+    return f"G(s) = {text}"
+
+
+def _bracketed(text: str) -> str:
+    return f"({text})" if " " in text else text
+
+
+def polynomial(coefficients: Sequence[float], digits: int = 15) -> str:
+    """Return a polynomial in descending powers of s; coefficients of 1 are not written."""
+    text = ""
     for power, value in zip(range(len(coefficients) - 1, -1, -1), coefficients, strict=True):
         if value:
-            sign = "−" if value < 0 else "+" if found else ""
-            found.append((sign, "" if abs(value) == 1 and power else number(abs(float(value)), digits), power))
-    return found or [("", "0", 0)]
+            size = "" if abs(value) == 1 and power else number(abs(float(value)), digits)
+            sign = " − " if value < 0 else " + "
+            text += f"{sign if text else sign.strip(' +')}{' '.join(filter(None, (size, _power(power))))}"
+    return text or "0"
+
+
+def _power(power: int) -> str:
+    """Return a power of s, with a superscript."""
+    return "" if power == 0 else "s" if power == 1 else f"s{str(power).translate(SUPERSCRIPTS)}"
 
 
 def references(settings: Mapping[str, Any]) -> list[str]:

@@ -1,0 +1,150 @@
+"""``ctid reproduce``: the published studies, run, checked and published."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ctid_cli.cli._common import Fresh, Jobs, Out, Runs, emit, guarded
+from ctid_cli.cli._options import FormatOptions
+from ctid_cli.errors import MismatchError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ctid_cli.studies.catalogue import StudyFolder
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What is done instead of running the studies; one at a time."""
+
+    list: Annotated[bool, typer.Option("--list", help="Name the studies with their experiments.")] = False
+    check: Annotated[
+        bool, typer.Option("--check", help="Test the claims, and compare the tables with those committed.")
+    ] = False
+    first: Annotated[
+        bool, typer.Option("--first", help="Compute the first data sets, and compare with those committed.")
+    ] = False
+    update_first: Annotated[
+        bool, typer.Option("--update-first", help="Compute the first data sets, and commit to them anew.")
+    ] = False
+    publish: Annotated[
+        bool, typer.Option("--publish", help="Write tables, figures, claims and environment to results/published.")
+    ] = False
+
+    @property
+    def chosen(self) -> str:
+        """Name of the action, ``run`` if none is given."""
+        given = [action.name for action in fields(self) if getattr(self, action.name)]
+        if len(given) > 1:
+            names = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise UsageError(f"{names} exclude each other; give one of them")
+        return given[0] if given else "run"
+
+
+@guarded
+def reproduce(
+    actions: Actions,
+    form: FormatOptions,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[STUDY]...", help="Studies; all by default.")] = None,
+    runs: Runs = None,
+    jobs: Jobs = None,
+    out: Out = Path("results"),
+    fresh: Fresh = False,
+) -> None:
+    """Run the published studies; the same command again resumes.
+
+    With --check their claims are tested and their tables compared with those that are committed and with the paper
+    (exit code 7 if one does not hold). --publish is refused unless one commit of this repository, without changes,
+    computed all results. A study runs the code that its own specifications name, as part of the repository.
+    """
+    from ctid_cli.cli.experiment_commands import EndOptions, PlaceOptions, SpecOptions, run
+    from ctid_cli.studies.catalogue import all_studies, find_study, last_part
+
+    studies = [find_study(name) for name in names or all_studies()]
+    match actions.chosen:
+        case "list":
+            _list(studies, form)
+        case "check":
+            _check(studies, out, form)
+        case "publish":
+            _publish(studies, out)
+        case "run":
+            for study in studies:
+                configs = [study.config(last_part(name)) for name in study.configs]
+                place = PlaceOptions(out=out, fresh=fresh)
+                run(configs, spec=SpecOptions(), place=place, end=EndOptions(), jobs=jobs, runs=runs)
+        case first:
+            _compute_first(studies, jobs, update=first == "update_first")
+
+
+def _list(studies: Sequence[StudyFolder], form: FormatOptions) -> None:
+    from ctid_cli.studies.catalogue import StudyList
+
+    emit(StudyList(studies), form.form)
+
+
+def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> None:
+    """Test the claims of studies, and compare the tables of the one that has any."""
+    from ctid_cli.reporting.comparison_result import check_tables
+    from ctid_cli.reporting.study import DEFAULT_STUDY
+    from ctid_cli.studies.claims import check_claims
+
+    failed = []
+    for study in studies:
+        found = check_claims(study, out)
+        emit(found, form.form)
+        failed += [f"{study.name}: {len(found.failed)} claims do not hold"] if found.failed else []
+        if study.name == DEFAULT_STUDY:
+            comparison = check_tables([], out)
+            emit(comparison, form.form)
+            failed += [] if comparison.mismatches.empty else [comparison.verdict]
+    if failed:
+        raise MismatchError("; ".join(failed))
+
+
+def _publish(studies: Sequence[StudyFolder], out: Path) -> None:
+    """Publish studies, also those of which a claim does not hold."""
+    from ctid_cli.studies.catalogue import published_folder
+    from ctid_cli.studies.claims import check_claims
+    from ctid_cli.studies.publishing import publish
+
+    failed = []
+    for study in studies:
+        found = check_claims(study, out)
+        publish(found, out)
+        typer.echo(published_folder(study))
+        failed += [f"does not hold: {claim.experiment}, {claim.claim}" for claim in found.failed]
+    if failed:
+        raise MismatchError("\n".join(failed))
+
+
+def _compute_first(studies: Sequence[StudyFolder], jobs: int | None, *, update: bool) -> None:
+    """Compute the first data sets of studies, and compare them with those committed or commit to them."""
+    from ctid_cli.studies.first_estimates import compare, compute_first, read_first, write_first
+
+    wrong = 0
+    for study in studies:
+        begun = time.monotonic()
+        with tempfile.TemporaryDirectory() as folder:
+            found = compute_first(study, Path(folder), jobs)
+        if update:
+            write_first(study, found)
+            typer.echo(f"{study.name}: {len(found)} estimates written ({time.monotonic() - begun:.0f} s)")
+            continue
+        compared = compare(found, read_first(study))
+        verdict = f"{len(compared.wrong)} of {len(found)} estimates differ from the committed ones"
+        if not compared.wrong:
+            verdict = f"{len(found)} estimates agree with the committed ones"
+        typer.echo(f"{study.name}: {verdict} ({time.monotonic() - begun:.0f} s)")
+        for line in (*compared.wrong, *(f"largest difference: {line}" for line in compared.largest)):
+            typer.echo(f"  {line}")
+        wrong += len(compared.wrong)
+    if wrong:
+        raise MismatchError(f"{wrong} of the first estimates are not as they were committed")

@@ -1,0 +1,218 @@
+"""The result protocol: what every printed result offers, and the renderers of its sections, each written once."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from ctid_cli.canonical import plain
+from ctid_cli.reporting.layout import latex
+from ctid_cli.text import wrapped
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from ctid_cli.reporting.figures.style import Drawing
+
+#: Forms in which a result is written to stdout.
+Format = Literal["text", "json", "md", "csv", "html", "latex"]
+#: Tools that a model is exported to.
+Tool = Literal["control", "matlab", "scipy"]
+
+
+#: Width of the labels of a list in text.
+LABEL = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One part of a result: a title, sentences, a table, and a figure, each of them optional."""
+
+    title: str = ""
+    sentences: Sequence[str] = ()
+    frame: pd.DataFrame | None = None
+    #: Format of the numbers of a column, such as ``.2f``; ``.6g`` where nothing is said.
+    formats: Mapping[str, str] = field(default_factory=dict)
+    #: Sentences below the table: what its columns mean.
+    notes: Sequence[str] = ()
+    #: A figure that is still to be drawn, or an SVG file.
+    drawing: Drawing | bytes | None = None
+    caption: str = ""
+
+
+class Result(ABC):
+    """A result that a command prints and that Python users get: numbers, and how they are shown.
+
+    Subclasses are frozen dataclasses of numbers. ``content`` is the JSON of ``--format json``; all other forms are
+    rendered from ``sections``.
+    """
+
+    @abstractmethod
+    def sections(self) -> Sequence[Section]:
+        """Return what is shown, in order."""
+
+    @abstractmethod
+    def content(self) -> Any:
+        """Return the result as plain data for JSON."""
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the main table of the result."""
+        return next(section.frame for section in self.sections() if section.frame is not None)
+
+    def plot(self) -> Figure:
+        """Draw the main figure of the result."""
+        from ctid_cli.reporting.figures.style import Drawing
+
+        return next(each.drawing.figure() for each in self.sections() if isinstance(each.drawing, Drawing))
+
+    def summary(self) -> str:
+        """Return the result as text."""
+        return self.write("text")
+
+    def write(self, form: Format = "text") -> str:
+        """Return the result in one of the forms."""
+        if form == "json":
+            return json.dumps(plain(self.content()), indent=1, allow_nan=False)
+        if form == "csv":
+            frame = self.to_frame().copy()
+            for name, values in frame.select_dtypes("object").items():
+                held = values.map(lambda value: isinstance(value, list | dict)).astype(bool)
+                frame[name] = values.mask(held, values[held].map(json.dumps))
+            return str(frame.to_csv(index=_is_named(frame), lineterminator="\n")).rstrip("\n")
+        return RENDERERS[form](self.sections())
+
+    def _repr_html_(self) -> str:
+        return self.write("html")
+
+
+def pairs(rows: Iterable[Sequence[str]]) -> pd.DataFrame:
+    """Return labels and texts as a table without titles, which is rendered as a list."""
+    import pandas as pd
+
+    return pd.DataFrame(rows, columns=["", ""])
+
+
+def cell(value: Any, form: str = ".6g") -> str:
+    """Return a cell of a table as text: a number in its format, a dash where there is none."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return format(value, form) if math.isfinite(value) else "-"
+    return "-" if value is None else str(value)
+
+
+def _is_named(frame: pd.DataFrame) -> bool:
+    return frame.index.name is not None
+
+
+def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
+    """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
+    assert section.frame is not None
+    frame = section.frame.reset_index() if _is_named(section.frame) else section.frame
+    columns, sides = [], ""
+    for name, values in frame.items():
+        form = section.formats.get(str(name), ".6g")
+        columns.append([str(name), *(cell(value, form) for value in values.tolist())])
+        sides += "r" if all(map(_is_number, columns[-1][1:])) else "l"
+    return [list(row) for row in zip(*columns, strict=True)], sides
+
+
+def _is_number(text: str) -> bool:
+    return text in ("", "-") or text[0].isdigit() or (text[0] in "-+[±" and text[1:2].isdigit())
+
+
+def render_text(sections: Iterable[Section]) -> str:
+    """Render sections as text, wrapped at the width of a page, tables with aligned columns."""
+    blocks = []
+    for section in sections:
+        parts = [section.title] if section.title else []
+        parts += [_paragraph(sentence) for sentence in section.sentences]
+        parts += [_text_table(*aligned_lines(section))] if section.frame is not None else []
+        parts += [_paragraph(note) for note in section.notes]
+        blocks += ["\n".join(parts)] if parts else []
+    return "\n\n".join(blocks)
+
+
+def _paragraph(sentence: str) -> str:
+    """Wrap a sentence; one that begins with a hyphen hangs, one with line ends is drawn already."""
+    return sentence if "\n" in sentence else wrapped(sentence, hanging="  " if sentence.startswith("- ") else "")
+
+
+def _text_table(lines: list[list[str]], sides: str) -> str:
+    if not any(lines[0]):
+        return "\n".join(wrapped(f"{label:{LABEL}} {text}", hanging=" " * (LABEL + 1)) for label, text in lines[1:])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    formats = [f"{'<' if side == 'l' else '>'}{width}" for side, width in zip(sides, widths, strict=True)]
+    header, *body = ("  ".join(map(format, row, formats)).rstrip() for row in lines)
+    return "\n".join([header, "-" * (sum(widths) + 2 * (len(widths) - 1)), *body])
+
+
+def render_markdown(sections: Iterable[Section]) -> str:
+    """Render sections as Markdown."""
+    blocks: list[str] = []
+    for section in sections:
+        blocks += [f"### {section.title}"] if section.title else []
+        blocks += section.sentences
+        blocks += [_markdown_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks += section.notes
+    return "\n\n".join(blocks)
+
+
+def _markdown_table(lines: list[list[str]], sides: str) -> str:
+    header, *body = ("| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in lines)
+    rule = "|" + "|".join(":--" if side == "l" else "--:" for side in sides) + "|"
+    return "\n".join([header, rule, *body])
+
+
+def render_latex(sections: Iterable[Section]) -> str:
+    """Render tables in LaTeX (booktabs), with titles and sentences as comments."""
+    blocks: list[str] = []
+    for section in sections:
+        comments = [section.title] if section.title else []
+        blocks += [f"% {line}" for text in (*comments, *section.sentences) for line in text.splitlines()]
+        blocks += [_latex_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks += [f"% {line}" for text in section.notes for line in text.splitlines()]
+    return "\n\n".join(blocks)
+
+
+def _latex_table(lines: list[list[str]], sides: str) -> str:
+    header, *body = (" & ".join(map(latex, row)) + r" \\" for row in lines)
+    rules = [f"\\begin{{tabular}}{{{sides}}}", r"\toprule", header, r"\midrule"]
+    return "\n".join([*rules, *body, r"\bottomrule", r"\end{tabular}"])
+
+
+def render_html(sections: Iterable[Section]) -> str:
+    """Render titles, sentences and tables as HTML, for a notebook."""
+    blocks: list[str] = []
+    for section in sections:
+        blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
+        blocks += [f"<p>{html.escape(sentence)}</p>" for sentence in section.sentences]
+        blocks += [html_table(section)] if section.frame is not None else []
+        blocks += [f"<p>{html.escape(note)}</p>" for note in section.notes]
+    return "\n".join(blocks)
+
+
+def html_table(section: Section, limit: int | None = None) -> str:
+    """Return the table of a section as HTML, of a long one the first rows."""
+    (header, *rows), sides = aligned_lines(section)
+    styles = [f' style="text-align: {"left" if side == "l" else "right"}"' for side in sides]
+
+    def row(tag: str, texts: Sequence[str]) -> str:
+        cells = [f"<{tag}{style}>{html.escape(text)}</{tag}>" for text, style in zip(texts, styles, strict=True)]
+        return f"<tr>{''.join(cells)}</tr>"
+
+    return "<table>" + "\n".join([row("th", header), *(row("td", texts) for texts in rows[:limit])]) + "</table>"
+
+
+RENDERERS: Mapping[str, Callable[[Iterable[Section]], str]] = {
+    "text": render_text,
+    "md": render_markdown,
+    "latex": render_latex,
+    "html": render_html,
+}

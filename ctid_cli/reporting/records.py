@@ -1,0 +1,68 @@
+"""The measured records that a result was computed from: their files, columns and units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+from ctid_cli.errors import DataError
+from ctid_cli.reporting.estimate import Units
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.table import ROLES
+from ctid_cli.text import count
+
+
+@dataclass(frozen=True)
+class Records:
+    """Records of one command, with the units that all of them share."""
+
+    measurements: Sequence[Measurement]
+    validation: Measurement | None = None
+
+    @property
+    def data(self) -> list[Record]:
+        """The records themselves."""
+        return [each.record for each in self.measurements]
+
+    @cached_property
+    def units(self) -> Units:
+        """Return the units that all records share.
+
+        Raises
+        ------
+        DataError
+            If two records have different units.
+        """
+        found: dict[str, str] = {}
+        every = [*self.measurements, *([self.validation] if self.validation else [])]
+        for role in ("time", "input", "output"):
+            for measurement in every:
+                unit = getattr(measurement, f"{role}_unit")
+                if unit is not None and found.setdefault(role, unit) != unit:
+                    where = f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}"
+                    raise DataError(f"{where}; files of one command must have the same units")
+        return Units(**found)
+
+    @property
+    def names(self) -> str:
+        """Names of the files."""
+        return ", ".join(each.record.name for each in self.measurements)
+
+    @property
+    def line(self) -> str:
+        """Files and their number of samples."""
+        return f"{self.names}: {count(sum(record.n_samples for record in self.data), 'sample')}"
+
+    @property
+    def notes(self) -> list[str]:
+        """What reading the records has shown, each once."""
+        return list(dict.fromkeys(note for each in self.measurements for note in each.notes))
+
+    def content(self) -> dict[str, Any]:
+        """Return files, columns and units for JSON."""
+        columns = {role: getattr(self.measurements[0], role) for role in ROLES}
+        files = [record.name for record in self.data]
+        return {"files": files, "columns": columns, "units": asdict(self.units)}

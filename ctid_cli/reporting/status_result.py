@@ -1,0 +1,313 @@
+"""What is stored of experiments: the results of ``ctid status``, ``verify``, ``merge`` and ``validate``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from ctid_cli.inference.monte_carlo import CellPrecision, Widest
+from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.layout import number, picked, rate
+from ctid_cli.reporting.results import out_option
+from ctid_cli.storage.columns import FAILURES
+from ctid_cli.storage.status import ExperimentStatus
+from ctid_cli.text import count
+
+if TYPE_CHECKING:
+    from ctid_cli.storage.estimates import Estimates
+    from ctid_cli.storage.merge import Merged
+    from ctid_cli.storage.verify import Verification
+
+#: Failed estimates, and data cells that are not precise enough, that texts list.
+LISTED, CELLS_LISTED = 10, 5
+#: Columns of failed estimates.
+OF_FAILURES = ("id", "estimator", "replicate", "start", "message")
+MIXED = "mixes code versions or processors"
+_STATES = {"enough": "precise enough", "open": "goes on", "at_most": "at_most reached"}
+
+
+# --- ctid status ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StatusResult(Result):
+    """How much of one experiment is done, how well its measures are known, and what went wrong."""
+
+    status: ExperimentStatus
+    out: Path
+    #: None where the estimates were not read.
+    stored: Estimates | None = None
+    precision: Sequence[CellPrecision] = ()
+
+    @property
+    def name(self) -> str:
+        """What the numbers are of: a shard has only those of its own data sets."""
+        shard = self.status.shard
+        return f"shard {shard[0]}/{shard[1]} of {self.status.experiment}" if shard else self.status.experiment
+
+    @property
+    def remark(self) -> str:
+        """Whether it is running, unfinished or mixed."""
+        status = self.status
+        running = [_running(status.running)] if status.running is not None else ["unfinished"] * bool(status.todo)
+        return "; ".join([*running, *([MIXED] if status.mixed else [])])
+
+    def sections(self) -> list[Section]:
+        """Return counts by estimator and data, precisions, outcomes, and the first failures."""
+        status = self.status
+        head = f"{self.name} in {status.folder}: {status.done} of {status.planned} estimates done"
+        sections = [Section(sentences=[head + (f" ({self.remark})" if self.remark else "")])]
+        if status.groups:
+            columns = ["estimator", "done", "planned", "failed"]
+            groups = pd.DataFrame(
+                [{**picked(each, columns[:1]), **each.swept, **picked(each, columns[1:])} for each in status.groups]
+            )
+            sections.append(Section(frame=groups))
+        sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
+        if self.stored is not None:
+            sections.append(Section(frame=self.outcomes()))
+            more = [f"and {status.failed - LISTED} more"] if status.failed > LISTED else []
+            sections += [Section(frame=self.failures(), notes=more)] if status.failed else []
+        if status.left_aside:
+            aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
+            sections.append(Section(sentences=[aside]))
+        return [*sections, Section(sentences=self._next())]
+
+    def outcomes(self) -> pd.DataFrame:
+        """Return how many estimates ended how, with the message of the first; those of failures differ."""
+        assert self.stored is not None
+        found = np.unique(self.stored.column("status"), return_index=True, return_counts=True)
+        rows = []
+        for status, first, n in zip(*(part.tolist() for part in found), strict=True):
+            failed = status.decode() in FAILURES
+            message = "" if failed else first_line(self.stored.part(first, first + 1).values("message")[0])
+            rows.append({"status": status.decode(), "estimates": n, "message": message})
+        return pd.DataFrame(rows).sort_values("estimates", ascending=False, kind="stable")
+
+    def failures(self) -> pd.DataFrame:
+        """Return the first estimates that failed."""
+        assert self.stored is not None
+        places = np.flatnonzero(self.stored.failures)[:LISTED].tolist()
+        rows = [next(self.stored.part(place, place + 1).rows(*OF_FAILURES)) for place in places]
+        frame = pd.DataFrame(rows, columns=OF_FAILURES)
+        return frame.assign(message=frame["message"].map(first_line))
+
+    def _next(self) -> list[str]:
+        """Return what to do next."""
+        status = self.status
+        name = status.folder.name if status.shard else status.experiment
+        command = f"ctid table {name}{out_option(self.out)}"
+        if status.todo and not status.running:
+            return [f"To continue, run the same `ctid run` command again; so far: {command}"]
+        return [f"Next: {command}"] if status.done else []
+
+    def content(self) -> dict[str, Any]:
+        """Return progress, outcomes and the first failures for JSON."""
+        status = self.status
+        content = asdict(status) | {"folder": str(status.folder), "todo": status.todo}
+        before, after = ("estimator", "cell"), ("planned", "done", "todo", "failed")
+        content["groups"] = [{**picked(one, before), **one.swept, **picked(one, after)} for one in status.groups]
+        if self.precision:
+            content["precision"] = [asdict(cell) for cell in self.precision]
+        if self.stored is not None:
+            content["outcomes"] = self.outcomes().to_dict("records")
+            content["failures"] = self.failures().to_dict("records")
+        return content
+
+
+@dataclass(frozen=True, eq=False)
+class Overview(Result):
+    """How much is done of every experiment in a folder."""
+
+    experiments: Sequence[StatusResult]
+    out: Path
+
+    def sections(self) -> list[Section]:
+        """Return one line for each experiment."""
+        if not self.experiments:
+            return [
+                Section(
+                    sentences=[f"There are no results in {self.out}. To make some: ctid run configs/quickstart.yaml"]
+                )
+            ]
+        return [Section(frame=self.to_frame())]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row for each experiment."""
+        counts = ("done", "planned", "failed", "left_aside")
+        rows = [{"experiment": one.name, **picked(one.status, counts), "": one.remark} for one in self.experiments]
+        return pd.DataFrame(rows, dtype=object).rename(columns={"left_aside": "set aside"})
+
+    def content(self) -> list[dict[str, Any]]:
+        """Return the status of every experiment."""
+        return [one.content() for one in self.experiments]
+
+
+def _running(progress: Mapping[str, Any]) -> str:
+    """Return who runs, since when, how far it is, and when it will have ended."""
+    if progress["pid"] is None:
+        return "running now"
+    words = [f"running now: process {progress['pid']} on {progress['host']}"]
+    if "started" in progress:
+        words.append(f"since {progress['started']}")
+    if "total" in progress:
+        words.append(f"{progress['done']} of {progress['total']} data sets")
+    if progress.get("data_sets_per_second") is not None:
+        words += [rate(progress["data_sets_per_second"]), f"to end about {progress['expected_end']}"]
+    return ", ".join(words)
+
+
+def first_line(message: str | None) -> str:
+    """Return how an estimate ended: a failure's message goes on with the places in the code that it came from."""
+    return (message or "").split("\n", 1)[0]
+
+
+# --- precision ------------------------------------------------------------------------------------------------------
+
+
+def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
+    """Return every data cell with its widest interval."""
+    rows = []
+    for cell in cells:
+        widest = (_measure(cell.widest), _width(cell.widest), _asked(cell.widest)) if cell.widest else ("-", "-", "-")
+        counts = {"data sets": cell.finished, "needed": cell.needed}
+        shown = dict(zip(("widest interval", "half-width", "asked"), widest, strict=True))
+        rows.append({**cell.swept, **counts, **shown, "": _STATES[cell.state]})
+    return pd.DataFrame(rows)
+
+
+def block_sentence(cells: Sequence[CellPrecision]) -> str:
+    """Return what a finished block has brought."""
+    more = [cell for cell in cells if cell.state == "open"]
+    text = f"{len(more)} of {len(cells)} data cells need more data sets, up to {max(c.needed for c in more)}"
+    widest = max((cell for cell in more if cell.widest), key=_excess, default=None)
+    return text if widest is None else f"{text}; widest interval: {_cell_sentence(widest)}"
+
+
+def precision_lines(cells: Sequence[CellPrecision]) -> list[str]:
+    """Return what a run has come to: how many data sets, and which data cells are not as precise as asked for."""
+    if not cells or any(cell.state == "open" for cell in cells):
+        return []
+    sizes, missed = [cell.needed for cell in cells], [cell for cell in cells if cell.state == "at_most"]
+    if not missed:
+        several = " to ".join(dict.fromkeys((str(min(sizes)), str(max(sizes)))))
+        return [f"{several} data sets in each data cell: all intervals are as narrow as asked for"]
+    lines = [f"{len(missed)} of {len(cells)} data cells ended at {max(sizes)} data sets with wider intervals:"]
+    lines += [f"  {_cell_sentence(cell)}" for cell in sorted(missed, key=_excess, reverse=True)[:CELLS_LISTED]]
+    return [*lines, f"  and {len(missed) - CELLS_LISTED} more"] if len(missed) > CELLS_LISTED else lines
+
+
+def _cell_sentence(cell: CellPrecision) -> str:
+    assert cell.widest is not None
+    options = "".join(f"{name} = {number(value)}, " for name, value in cell.swept.items())
+    return f"{options}{_measure(cell.widest)}: {_width(cell.widest)}, {_asked(cell.widest)} asked"
+
+
+def _measure(widest: Widest) -> str:
+    start = "" if widest.start == "none" else f", start {widest.start}"
+    options = "".join(f", {name} = {number(value)}" for name, value in widest.options.items())
+    of = f"rmse of {widest.parameter}" if widest.measure == "rmse" else "percentage"
+    return f"{of} ({widest.estimator}{options}{start})"
+
+
+def _width(widest: Widest) -> str:
+    return "not known" if widest.half_width is None else _with_unit(widest.half_width, widest)
+
+
+def _asked(widest: Widest) -> str:
+    return _with_unit(widest.asked, widest)
+
+
+def _with_unit(half_width: float, widest: Widest) -> str:
+    shown, unit = (100 * half_width, "%") if widest.measure == "rmse" else (half_width, "points")
+    return f"± {shown:.3g} {unit}"
+
+
+def _excess(cell: CellPrecision) -> float:
+    assert cell.widest is not None
+    return cell.widest.excess
+
+
+# --- ctid verify, merge and validate ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationResult(Result):
+    """Whether what is stored of an experiment is what was written."""
+
+    found: Verification
+    out: Path
+
+    def sections(self) -> list[Section]:
+        """Return a line for each file."""
+        verdict = "intact" if self.found.is_intact else "DAMAGED"
+        return [Section(f"{self.content()['experiment']}: {verdict}", frame=self.to_frame())]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return what was found of each file."""
+        return pd.DataFrame([asdict(finding) for finding in self.found.findings])
+
+    def content(self) -> dict[str, Any]:
+        """Return what was found for JSON."""
+        about = {"experiment": self.found.folder.relative_to(self.out).as_posix(), "folder": str(self.found.folder)}
+        return about | {"intact": self.found.is_intact, "findings": [asdict(each) for each in self.found.findings]}
+
+
+@dataclass(frozen=True, eq=False)
+class MergeResult(Result):
+    """What a merge of shards has made."""
+
+    merged: Merged
+    out: Path
+
+    def sections(self) -> list[Section]:
+        """Return counts, what is missing, and the next command."""
+        merged = self.merged
+        head = f"{merged.experiment}: {merged.stored} of {merged.planned} estimates in {merged.folder}"
+        lines = [f"{head} ({merged.new} new, from {merged.sources} folders)"]
+        lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables will say"] if merged.mixed else []
+        lines += [f"  {merged.missing}"] if merged.missing else []
+        lines.append(f"  next: ctid table {merged.experiment}{out_option(self.out)}")
+        return [Section(sentences=["\n".join(lines)])]
+
+    def content(self) -> dict[str, Any]:
+        """Return what was made for JSON."""
+        return asdict(self.merged) | {"folder": str(self.merged.folder)}
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row."""
+        return pd.DataFrame([self.content()])
+
+
+@dataclass(frozen=True, eq=False)
+class ValidationResult(Result):
+    """How much work a specification without mistakes asks for."""
+
+    file: Path
+    experiment: str
+    data_sets: int
+    data_cells: int
+    estimates: int
+    #: Most data sets of a cell, where their number follows from a precision.
+    at_most: int | None
+    warnings: Sequence[str] = ()
+
+    def sections(self) -> list[Section]:
+        """Return the counts in one sentence."""
+        counts = f"{count(self.data_sets, 'data set')} ({count(self.data_cells, 'data cell')})"
+        text = f"{self.file}: ok, {self.experiment}: {counts}, {count(self.estimates, 'estimate')}"
+        text += "" if self.at_most is None else f"; at most {self.at_most} data sets of a cell"
+        return [Section(sentences=[text])]
+
+    def content(self) -> dict[str, Any]:
+        """Return the counts for JSON."""
+        return asdict(self) | {"file": str(self.file)}
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return one row."""
+        return pd.DataFrame([self.content()])

@@ -1,0 +1,316 @@
+"""Tables of the published study, our percentages beside those of the article, and tables by name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.layout import delay_label, number, seconds
+from ctid_cli.reporting.measures import COUNTED, percentage_frame, settings_of, with_types
+from ctid_cli.reporting.results import (
+    Results,
+    differences,
+    experiments_in,
+    find_results,
+    out_option,
+    read_results,
+    shown_path,
+)
+from ctid_cli.reporting.study import DEFAULT_STUDY, Study, StudyTable, data_folder, load_study, study_contents
+from ctid_cli.reporting.surprises import surprises
+from ctid_cli.reporting.table_result import (
+    NOT_RUN,
+    RULE,
+    TIME,
+    TableResult,
+    experiment_table,
+    interval_text,
+    joined,
+    labels_of,
+    measure_table,
+    named,
+    notes_of,
+    percent_text,
+    records_of,
+    time_of,
+)
+from ctid_cli.running.plan import build_plan, current_version
+from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.folder import InUseError
+from ctid_cli.text import did_you_mean, listed
+
+#: What the table shows of every cell, one line for each.
+LINES = ("%", "95 %", "published", "time")
+
+
+def build_tables(
+    names: Sequence[str], out: Path, *, committed: bool = False, measures: Sequence[str] = ()
+) -> TableResult:
+    """Return the tables asked for; committed ones stand in for those of which nothing was run, if they may."""
+    study, tables = load_study(), []
+    if measures:
+        names = [results.experiment for results in experiments(names, out, "--measure")]
+    for name in names or [study.name]:
+        study_name, _, number = name.rpartition("/")
+        if measures:
+            results = read_results(out, name)
+            tables.append(measure_table(results, measures, [*notes_of(results, out), *surprises(results)]))
+        elif name == study.name:
+            tables += [study_table(study, k, out, committed=committed) for k in study.tables]
+        elif number.isdigit() and study_name in ("", study.name):
+            if int(number) not in study.tables:
+                raise UsageError(f"{study.name} has no table {number}; it has {', '.join(map(str, study.tables))}")
+            tables.append(study_table(study, int(number), out, committed=committed))
+        else:
+            results = _results_called(name, study, out)
+            tables.append(experiment_table(results, [*notes_of(results, out), *surprises(results)]))
+    return joined(tables)
+
+
+def experiments(names: Sequence[str], out: Path, option: str) -> list[Results]:
+    """Return the results of the experiments that an option is about."""
+    if not names:
+        raise UsageError(f"{option} needs the name of an experiment: ctid table NAME {option} …")
+    return [read_results(out, name) for name in names]
+
+
+def _results_called(name: str, study: Study, out: Path) -> Results:
+    results = find_results(out, name)
+    if results is None:
+        known = [*map(str, study.tables), study.name, *experiments_in(out)]
+        hint = did_you_mean(name, known) or "."
+        wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
+        raise UsageError(f"{wrong} Known: {', '.join(known)}")
+    return results
+
+
+def study_table(study: Study, number: int, out: Path, *, committed: bool = False) -> TableResult:
+    """Return one published table with our percentages in it, as far as its experiments were run."""
+    table = study.tables[number]
+    notes: list[str] = []
+    known: set[str] = set()
+    found: dict[str, Results] = {}
+    for name in table.experiments:
+        results, estimators, remarks = _results_of(study, name, out)
+        if results is not None:
+            found[name] = results
+        known |= estimators
+        notes += remarks
+    frame, file = study_frame(study, table, found), committed_tables() if committed and not found else None
+    if file is not None:
+        every = read_tables(file)
+        frame = every[every["table"] == number].reset_index(drop=True)
+        remark = made_by(file.parent)
+        notes.insert(0, f"these are the committed results of {shown_path(file)}" + (f", {remark}" if remark else ""))
+    published = set(table.published["method"])
+    if missing := [method for method in study.methods if known and method in published - known]:
+        which = ", ".join(missing)
+        notes.append(f"no experiment has the estimator {which} yet; its rows show the published values only")
+    options = [*dict.fromkeys(name for results in found.values() for name in results.swept("estimators"))]
+    return TableResult(records_of(frame), study_sections(study, table, frame, options), notes)
+
+
+def _results_of(study: Study, name: str, out: Path) -> tuple[Results | None, set[str], list[str]]:
+    """Return the results of one experiment, the estimators that it has or should have, and remarks."""
+    config = data_folder("configs") / study.experiments[name]["config"]
+    specification = load_spec(config).canonical()
+    command = f"ctid run {shown_path(config)}{out_option(out)}"
+    try:
+        results = find_results(out, name)
+    except InUseError as error:
+        return None, set(), [f"{name} has no stored results yet: {error}"]
+    if results is None:
+        return None, set(), [f"{name} was not run. To fill its rows:\n  {command}"]
+    estimators = results.settings["estimators"].keys() | specification["estimators"].keys()
+    departures = _departures(results, specification, set(study.fields.values()), command)
+    return results, estimators, [*departures, *notes_of(results, out)]
+
+
+def _departures(results: Results, specification: Mapping[str, Any], shown: set[str], command: str) -> Iterator[str]:
+    """Yield in what results are not those of the published specification."""
+    absent = [method for method in specification["estimators"] if method not in results.settings["estimators"]]
+    if absent:
+        which = f"the estimator {', '.join(absent)} of its specification"
+        yield f"{results.experiment} was run without {which}; to add it:\n  {command}"
+    if changed := differences(results.settings, specification, shown):
+        yield f"{results.experiment} was run with other settings than the published ones: {'; '.join(changed)}"
+
+
+# --- rows -----------------------------------------------------------------------------------------------------------
+
+
+def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -> pd.DataFrame:
+    """Return the cells of a published table, published or run, by sampling, settings and method in their order."""
+    keys, random = ["experiment", *study.fields, "method", "initial_delay"], table.initial_delays == ("random",)
+    own = [percentage_frame(found[name], table.number, study.fields) for name in table.experiments if name in found]
+    cells = [table.published]
+    if own:
+        # Estimates without a start stand in the tables of fixed and of random starts.
+        ours = pd.concat(own, ignore_index=True).drop(columns="published_percent")
+        ours = ours[ours["initial_delay"].isna() | ((ours["initial_delay"] == "random") == random)]
+        beside = ours.merge(table.published, on=keys, how="left")
+        cells = [table.published.merge(ours, on=keys, how="left"), beside[beside["published_percent"].isna()]]
+    frame = pd.concat([each for each in cells if len(each)], ignore_index=True)
+    frame["table"] = table.number
+    frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
+    first, last = ["table", "experiment", "sampling"], ["initial_delay", "method", *COUNTED]
+    others = [name for name in settings_of([frame.columns]) if name not in first]
+    return _sorted(study, with_types(frame))[[*first, *others, *last]]
+
+
+def _sorted(study: Study, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return rows by sampling, settings and method: methods with an experiment of their own stand beside the others."""
+    orders = {name: frame[name].unique().tolist() for name in ("sampling", *study.fields)}
+    orders["method"] = [*dict.fromkeys([*study.methods, *frame["method"]])]
+    places = pd.DataFrame({name: frame[name].map(order.index) for name, order in orders.items()})
+    return frame.loc[places.sort_values([*places], kind="stable").index].reset_index(drop=True)
+
+
+# --- for people -----------------------------------------------------------------------------------------------------
+
+
+def study_sections(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> list[Section]:
+    """Return a published table, all its cells together, and what its columns mean."""
+    published = f"Published: {study.published_data_sets} data sets, {study.source}."
+    foot = f"{RULE} {TIME}. {published}"
+    if startless := frame["method"][frame["initial_delay"].isna()].unique().tolist():
+        shown = "one estimate per data set, shown under every initial delay"
+        foot += f" {listed(startless)} {'was' if len(startless) == 1 else 'were'} given no initial delay: {shown}."
+    methods = frame["method"].unique()
+    legend = "; ".join(f"{name}: {study.methods[name]}" for name in methods if name in study.methods) + "."
+    pooled = pooled_frame(study, table, frame, options)
+    return [
+        Section(f"Table {table.number}. {table.title}", [f"Counted: {study.success}."]),
+        Section(frame=_lines_by_delay(frame)),
+        Section(sentences=["All cells of the table together:"], frame=pooled.drop(columns="converged")),
+        Section(notes=[foot, legend]),
+    ]
+
+
+def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return initial delays across, and of each method a line for each of ``LINES``."""
+    rows, startless = records_of(frame), frame["initial_delay"].isna()
+    labels = frame[["sampling"]].join(labels_of(frame, "method").drop(columns="initial delay", errors="ignore"))
+    place = labels.agg("\n".join, axis=1) + startless.astype(str)
+    texts = {
+        "%": [percent_text(row) if row["n"] else "-" for row in rows],
+        "95 %": [interval_text(row).strip("[]").replace(", ", "-") for row in rows],
+        "published": ["" if row["published_percent"] is None else number(row["published_percent"]) for row in rows],
+        "time": [seconds(time_of(row)) if row["n"] else "" for row in rows],
+    }
+    cells = labels.assign(n=place.map(frame["n"].groupby(place).agg(_sizes)), **texts)
+    down = [*labels, "n"]
+    order = pd.MultiIndex.from_tuples([(*one, line) for one in cells.set_index(down).index.unique() for line in LINES])
+    delays = sorted(set(frame["initial_delay"].dropna()), key=lambda delay: (isinstance(delay, str), delay))
+    across = {}
+    for delay in delays or [None]:
+        own = cells[(frame["initial_delay"] == delay) | startless].set_index(down)[list(LINES)].stack()
+        across[delay_label(delay)] = own.reindex(order)
+    lines = pd.DataFrame(across, index=order).fillna("")
+    lines = lines[(lines != "").any(axis=1)].reset_index(names=[*down, "line"])
+    # A label that the line above has already said is left out, as in a printed table.
+    repeated = lines[down].eq(lines[down].shift()).cummin(axis=1)
+    lines[down] = lines[down].mask(repeated, "")
+    return lines.rename(columns={"line": "initial delay"})
+
+
+def _sizes(counts: pd.Series) -> str:
+    """Return the least and the greatest number of data sets that were run."""
+    run = counts[counts > 0]
+    return "-".join(dict.fromkeys([str(run.min()), str(run.max())])) if len(run) else NOT_RUN
+
+
+def pooled_frame(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> pd.DataFrame:
+    """Return each method, with each combination of its swept options, over all cells of a published table.
+
+    There is no interval: cells of one row share their data sets, so their estimates are not independent trials. The
+    published percentage is the mean over the cells that have estimates, or over all cells where none has [%].
+    """
+    places = table.published[["experiment", *study.fields]].drop_duplicates()
+    samplings = places["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
+    cells = len(places.assign(experiment=samplings).drop_duplicates())
+    shown = frame.merge(places, on=[*places])
+    startless = shown["initial_delay"].isna()
+    shown = shown.assign(startless=startless)[startless | shown["initial_delay"].isin(table.initial_delays)]
+    pooled = []
+    for _, group in shown.groupby(["method", "startless", *options], sort=False, dropna=False):
+        run = group[(group["n"] > 0) & group["converged"].notna()]
+        first, n, converged = records_of(group)[0], int(run["n"].sum()), int(run["converged"].sum())
+        planned = cells * (1 if first["startless"] else len(table.initial_delays))
+        published = (group if run.empty else run)["published_percent"].astype(float).mean()
+        pooled.append(
+            {
+                "method": named(first["method"], first, options),
+                "cells": str(planned) if len(run) == planned else f"{len(run)} of {planned}",
+                "n": n,
+                "converged": converged,
+                "percent": f"{100 * converged / n:.1f}" if n else NOT_RUN,
+                "published": "" if published != published else f"{published:.1f}",
+                "time": _span(time_of(row) for row in records_of(run)),
+            }
+        )
+    return pd.DataFrame(pooled)
+
+
+def _span(times: Iterable[float | None]) -> str:
+    """Return the range of the median times of cells."""
+    known = [time for time in times if time is not None]
+    return " to ".join(dict.fromkeys(map(seconds, (min(known), max(known))))) if known else ""
+
+
+# --- committed tables -----------------------------------------------------------------------------------------------
+
+
+def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
+    """Return the file of a study's committed tables, None if there is none."""
+    folder = data_folder("results/published") / study.replace("-", "_")
+    return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
+
+
+def read_tables(file: Path) -> pd.DataFrame:
+    """Read tables that ``ctid table --format csv`` wrote."""
+    types = {"converged": "Int64", "initial_delay": "str"}
+    frame = pd.read_csv(file, dtype=types, float_precision="round_trip")
+    known = pd.to_numeric(frame["initial_delay"], errors="coerce")
+    delays = known.astype(object).where(known.notna(), frame["initial_delay"])
+    return frame.assign(initial_delay=delays.where(frame["initial_delay"].notna(), None))
+
+
+def environment_of(published: Path) -> dict[str, Any] | None:
+    """Return the commit and the sessions that made the published results in a folder; None where there are none."""
+    try:
+        content: dict[str, Any] = json.loads((published / "environment.json").read_text(encoding="utf-8"))
+    except OSError:
+        return None
+    return content
+
+
+def made_by(published: Path, study: str = DEFAULT_STUDY) -> str:
+    """Return which code computed the published results in a folder, as a participle clause; empty for the present."""
+    environment = environment_of(published)
+    if environment is None:
+        return ""
+    if all(_versions(own) <= _present(study, short) for short, own in environment["sessions"].items()):
+        return ""
+    commit = environment["commit"][:12]
+    return f"computed by an earlier version of the code or of its numerical libraries (commit {commit})"
+
+
+def _present(study: str, short: str) -> set[str]:
+    """Return the code versions that the estimates of an experiment of a study would have now."""
+    described = study_contents()[study]["experiments"].get(f"{study}/{short}")
+    if described is None:
+        return set()
+    return {current_version(build_plan(load_spec(data_folder("configs") / described["config"])))}
+
+
+def _versions(sessions: Iterable[Mapping[str, Any]]) -> set[str]:
+    """Return the code versions of runs; those of older ones were the same for all estimators."""
+    found = [session["code_version"] for session in sessions]
+    return {version for one in found for version in ([one] if isinstance(one, str) else one.values())}

@@ -1,0 +1,342 @@
+"""Tables of experiments: rows for programs, and the same side by side for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from ctid_cli.inference.intervals import UncertainValue
+from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.estimate import parameters
+from ctid_cli.reporting.layout import (
+    delay_label,
+    number,
+    percent,
+    seconds,
+    setting_text,
+    setting_title,
+    with_error,
+)
+from ctid_cli.reporting.measures import (
+    OF_FREQUENCIES,
+    Row,
+    counted_in,
+    default_measures,
+    measure_of,
+    measure_rows,
+    percentage_frame,
+    settings_of,
+)
+from ctid_cli.reporting.results import Results, out_option
+from ctid_cli.storage.manifest import is_of_signal
+
+NOT_RUN = "not run"
+RULE = "Estimates that failed count as not converged. 95 %: Wilson interval of the percentage."
+TIME = "Time: median of one estimate, of the processor where that is stored"
+SETTLING = (
+    "settling: time until the slowest tone is in the band to stay [s], from the start and after the last step; - is "
+    "never, or unknown. rms: root-mean-square error of each tone over the window [rad/s]; medians over the data sets."
+)
+#: Titles of measured frequencies that are not those of their keys.
+TITLES = {"median_settling_time": "settling", "median_settling_after_step": "after step", "false_alarms": "alarms"}
+#: What a rule of success counts, by its key.
+SUCCESS: Mapping[str, Callable[[float, str], str]] = {
+    "delay_relative_error": lambda value, _: f"delay estimate lies within {100 * value:g} % of the true delay",
+    "parameter_relative_error": lambda value, _: f"parameters all lie within {100 * value:g} % of the true ones",
+    "band": lambda value, soon: (
+        f"frequencies all come to lie within {value:g} rad/s of the true ones{soon}, to stay there"
+    ),
+    "fit_percent": lambda value, _: f"model fits to at least {value:g} %",
+}
+#: What rows of a measured record have besides the keys of every table.
+OF_RECORDS = (
+    *("id", "status", "delay", "numerator", "denominator", "standard_errors"),
+    *("fit_percent", "validation_fit_percent"),
+)
+#: Estimators, and estimates of a measured record, before a table goes on below.
+ESTIMATORS_PER_BLOCK = 2
+ESTIMATES_PER_BLOCK = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TableResult(Result):
+    """Rows of one or several tables, how they are shown, and what to know of them."""
+
+    rows: Sequence[Row]
+    shown: Sequence[Section]
+    remarks: Sequence[str] = ()
+
+    def sections(self) -> list[Section]:
+        """Return the tables for people."""
+        remarks = [f"Note: {remark}" for remark in self.remarks]
+        return [*self.shown, *([Section(notes=remarks)] if remarks else [])]
+
+    def content(self) -> list[Row]:
+        """Return the rows for JSON."""
+        return list(self.rows)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the rows, a column for each key that any of them has."""
+        return pd.DataFrame(self.rows, dtype=object)
+
+
+def joined(tables: Sequence[TableResult]) -> TableResult:
+    """Return several tables as one result."""
+    rows = [row for table in tables for row in table.rows]
+    remarks = dict.fromkeys(remark for table in tables for remark in table.remarks)
+    return TableResult(rows, [section for table in tables for section in table.shown], [*remarks])
+
+
+def records_of(frame: pd.DataFrame) -> list[Row]:
+    """Return the rows of a frame, None where there is no value."""
+    rows: Any = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return list(rows)
+
+
+# --- parts of all tables --------------------------------------------------------------------------------------------
+
+
+def labels_of(frame: pd.DataFrame, *others: str, options: Sequence[str] = ()) -> pd.DataFrame:
+    """Return as text what tells rows apart: swept fields but ``options``, starts, and other keys that any row has."""
+    keys = [key for key in settings_of([frame.columns]) if key not in options]
+    texts = {setting_title(key): [setting_text(key, value) for value in frame[key]] for key in keys if _has(frame, key)}
+    if _has(frame, "initial_delay"):
+        texts["initial delay"] = [
+            delay_label(None if _is_missing(value) else value) for value in frame["initial_delay"]
+        ]
+    texts |= {key: [number(value) for value in frame[key]] for key in others if _has(frame, key)}
+    return pd.DataFrame(texts, index=frame.index)
+
+
+def _has(frame: pd.DataFrame, key: str) -> bool:
+    return key in frame and bool(frame[key].notna().any())
+
+
+def _is_missing(value: Any) -> bool:
+    return value is None or value != value
+
+
+def side_by_side(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence[str]) -> pd.DataFrame:
+    """Return the columns ``shown`` for each value of ``across``, which is the title of the first of them."""
+    parts = [
+        own.set_index(list(down))[list(shown)].rename(columns={shown[0]: title})
+        for title, own in texts.groupby(across, sort=False)
+    ]
+    order = texts.set_index(list(down)).index.unique()
+    return pd.concat([part.reindex(order) for part in parts], axis=1).fillna("").reset_index()
+
+
+def cells_of(frame: pd.DataFrame, *, judged: bool = True) -> pd.DataFrame:
+    """Return percentages, their intervals, counts and times of rows as text; without a rule only the last two."""
+    rows = records_of(frame)
+    texts = {"%": [percent_text(row) for row in rows], "95 %": [interval_text(row) for row in rows]} if judged else {}
+    texts["n"] = [str(row["n"]) if judged or row["n"] else NOT_RUN for row in rows]
+    texts["time"] = [seconds(time_of(row)) if row["n"] else "" for row in rows]
+    return pd.DataFrame(texts, index=frame.index)
+
+
+def percent_text(row: Row) -> str:
+    """Return the percentage of a cell."""
+    return percent(row["percent"], row["n"]) if row["n"] else NOT_RUN
+
+
+def interval_text(row: Row) -> str:
+    """Return the interval of the percentage of a cell."""
+    if not row["n"]:
+        return ""
+    return "-" if row["low"] is None else f"[{percent(row['low'], row['n'])}, {percent(row['high'], row['n'])}]"
+
+
+def time_of(row: Row) -> float | None:
+    """Return the time of one estimate: that of the processor, or of the clock where only that is stored."""
+    time: float | None = row["median_cpu_seconds"]
+    return row["median_seconds"] if time is None else time
+
+
+def notes_of(results: Results, out: Any) -> list[str]:
+    """Return what to know of the results themselves."""
+    notes = []
+    if results.failed:
+        command = f"ctid status {results.experiment}{out_option(out)}"
+        notes.append(f"{results.failed} estimates failed; to see why: {command}")
+    if results.stored.mixed:
+        notes.append(f"{results.experiment} mixes results of different code versions or processors (--allow-mixed)")
+    return notes
+
+
+# --- an experiment --------------------------------------------------------------------------------------------------
+
+
+def experiment_table(results: Results, remarks: Sequence[str] = ()) -> TableResult:
+    """Return the table of one experiment: percentages, measures, or the estimates of a measured record."""
+    if results.settings.get("data") is None and (names := default_measures(results)):
+        return measure_table(results, names, remarks)
+    frame = percentage_frame(results)
+    if results.settings.get("data") is not None:
+        return TableResult(_with_estimates(results, frame), _record_sections(results), remarks)
+    head = Section(results.experiment, [f"Counted: {success_sentence(results.settings)}."])
+    cells = cells_of(frame, judged=bool(results.settings.get("success")))
+    rule = f"{RULE} " if results.settings.get("success") else ""
+    if is_of_signal(results.manifest):
+        measured = [key for key in map(str, frame) if key.startswith(OF_FREQUENCIES)]
+        texts = {title_of(key): [number(value, 3) for value in frame[key]] for key in measured}
+        table = labels_of(frame, "method").join(cells.drop(columns="time")).assign(**texts, time=cells["time"])
+        alarms = " alarms: false ones, in all data sets together." if "false_alarms" in frame else ""
+        shown = [Section(frame=table), Section(notes=[f"{rule}{SETTLING}{alarms} {TIME}."])]
+    else:
+        tables = [Section(frame=table) for table in _by_estimator(results, frame, cells)]
+        shown = [*tables, Section(notes=[f"{rule}{TIME}."])]
+    return TableResult(records_of(frame), [head, *shown], remarks)
+
+
+def title_of(key: str) -> str:
+    """Return the title of measured frequencies."""
+    return TITLES.get(key, key.removeprefix("median_").replace("_", " "))
+
+
+def success_sentence(settings: Mapping[str, Any]) -> str:
+    """Return what the percentages of an experiment count."""
+    rule = settings.get("success") or {}
+    soon = f" within {rule['by']:g} s" if rule.get("by") is not None else ""
+    parts = [sentence(rule[key], soon) for key, sentence in SUCCESS.items() if rule.get(key) is not None]
+    if not parts:
+        return "nothing, the specification has no success rule"
+    return "percent of the data sets whose " + " and whose ".join(parts)
+
+
+def _by_estimator(results: Results, frame: pd.DataFrame, cells: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return percentages, settings of the data and starts down, estimators with their options across."""
+    options = results.swept("estimators")
+    labels = labels_of(frame, options=options)
+    labels = labels if len(labels.columns) else labels.assign(experiment=results.experiment)
+    names = [named(row["method"], row, options) for row in records_of(frame)]
+    texts = labels.join(cells).assign(title=[f"{name}: {cells.columns[0]}" for name in names])
+    return [
+        side_by_side(texts[texts["title"].isin(some)], [*labels], "title", [*cells])
+        for some in _blocks(texts["title"].unique().tolist(), ESTIMATORS_PER_BLOCK)
+    ]
+
+
+def named(name: str, row: Mapping[str, Any], options: Sequence[str]) -> str:
+    """Return the name of an estimator with the values of its swept options."""
+    return ", ".join([name, *(f"{key} {number(row[key])}" for key in options if row[key] is not None)])
+
+
+def _blocks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
+    return [items[k : k + size] for k in range(0, len(items), size)]
+
+
+# --- measures -------------------------------------------------------------------------------------------------------
+
+
+def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str] = ()) -> TableResult:
+    """Return measures by name, those of parameters in one table, those of estimates in another, failures in a third."""
+    rows = measure_rows(results, names)
+    frame = pd.DataFrame(rows, dtype=object)
+    tables: dict[str, list[str]] = {}
+    for name in dict.fromkeys(names):
+        source = measure_of(name, results).source
+        kind = source if source in ("errors", "status") else "estimates"
+        tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
+    shown = [Section(frame=_measured(results, frame[frame["measure"].isin(own)])) for own in tables.values()]
+    told = {name.partition(":")[0]: measure_of(name, results).meaning for name in names}
+    meanings = "; ".join(f"{name}: {meaning}" for name, meaning in told.items())
+    foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
+    if frame["without_value"].any():
+        foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
+    return TableResult(rows, [Section(results.experiment), *shown, Section(notes=[foot])], remarks)
+
+
+def _measured(results: Results, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return swept fields, starts, estimators and parameters down, measures across."""
+    labels = labels_of(frame, "method", "parameter")
+    rows, place = records_of(frame), labels.agg("\n".join, axis=1)
+    counted = pd.Series([counted_in(row) for row in rows], index=frame.index)
+    # What most measures count; a measure of fewer estimates has its number beside it.
+    most = counted.groupby(place).transform("max")
+    first = (
+        frame.assign(most=counted == most).sort_values("most", ascending=False, kind="stable").groupby(place).first()
+    )
+    counts = {"n": most.astype(str), "failed": place.map(first["failed"]).astype(str)}
+    if frame["without_value"].any():
+        counts["no value"] = place.map(first["without_value"]).astype(str)
+    texts = labels.assign(
+        **counts,
+        title=[_title(results, name) for name in frame["measure"]],
+        cell=[_cell(row, n, total) for row, n, total in zip(rows, counted, most, strict=True)],
+    )
+    table = side_by_side(texts, [*labels, *counts], "title", ["cell"])
+    table = table[[*labels, *texts["title"].unique(), *counts]]
+    return table.rename(columns={"parameter": "status"}) if "failures" in frame["measure"].values else table
+
+
+def _title(results: Results, name: str) -> str:
+    """Return a measure with its unit; one in the unit of its parameter has none."""
+    measure = measure_of(name, results)
+    of_parameter = measure.source == "errors" and measure.unit != "%"
+    return name if of_parameter or measure.unit == "-" else f"{name} [{measure.unit}]"
+
+
+def _cell(row: Row, n: int, most: int) -> str:
+    """Return a value with its Monte Carlo error or interval; its number of estimates where others have more."""
+    if row["value"] is None:
+        return "-"
+    own = "" if n == most else f" (n {n})"
+    if row["unit"] == "%" and row["low"] is not None and row["high"] is not None:
+        return f"{row['value']:.1f} [{row['low']:.1f}, {row['high']:.1f}]{own}"
+    return (number(row["value"], 4) if row["error"] is None else with_error(row["value"], row["error"])) + own
+
+
+# --- a measured record ----------------------------------------------------------------------------------------------
+
+
+def _with_estimates(results: Results, frame: pd.DataFrame) -> list[Row]:
+    """Return the rows of a measured record with its estimates."""
+    keys = ["estimator", "initial_delay", *settings_of([frame.columns])]
+    estimates = {tuple(item.get(key) for key in keys): item for item in reversed(list(results.rows))}
+    rows = []
+    for row in records_of(frame):
+        estimate = estimates.get(tuple({**row, "estimator": row["method"]}[key] for key in keys), {})
+        rows.append(row | {key: estimate.get(key) for key in OF_RECORDS})
+    return rows
+
+
+def _record_sections(results: Results) -> list[Section]:
+    """Return the estimates of a measured record across, parameters with standard errors and measures of fit down."""
+    bounds = {item["name"]: item["content"].get("delay_bounds") for item in results.manifest["estimators"]}
+    rows = list(results.rows)
+    fits = {"fit, estimation part": "fit_percent"}
+    if any(item.get("validation_fit_percent") is not None for item in rows):
+        fits["fit, validation part"] = "validation_fit_percent"
+    sections = [Section(results.experiment)]
+    for block in _blocks(rows, ESTIMATES_PER_BLOCK):
+        found = [parameters(row, bounds.get(row["estimator"])) for row in block]
+        names = dict.fromkeys((one.name, one.unit) for own in found for one in own)
+        columns = {}
+        for row, own in zip(block, found, strict=True):
+            known = {(one.name, one.unit): _with_error(one) for one in own}
+            texts = [row["id"], row["status"], *(known.get(name, "-") for name in names)]
+            texts += [number(row.get(key), 4) for key in fits.values()]
+            title = f"{row['estimator']}, start {start_text(row['start'])}"
+            columns[title] = [*texts, seconds(row.get("cpu_seconds") or row.get("seconds"))]
+        lines = [("id", ""), ("status", ""), *names, *((title, "%") for title in fits), ("time", "")]
+        sections.append(Section(frame=pd.DataFrame(lines, columns=["", "unit"]).assign(**columns)))
+    foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
+    return [*sections, Section(notes=[foot])]
+
+
+def _with_error(item: UncertainValue) -> str:
+    known = math.isfinite(item.standard_error)
+    return with_error(item.estimate, item.standard_error) if known else f"{number(item.estimate)} ({item.status})"
+
+
+def start_text(label: str) -> str:
+    """Return the label of a start, with its unit where it is a delay."""
+    try:
+        return f"{float(label):g} s"
+    except ValueError:
+        return label

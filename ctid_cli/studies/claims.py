@@ -1,0 +1,125 @@
+"""Claims of a study: what must hold of its results, with the number that decides."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ctid_cli.reporting.document import Result, Section
+from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part, published_folder, read_study
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One thing that must hold; ``holds`` is None for what is only reported."""
+
+    claim: str
+    measured: str
+    required: str = ""
+    holds: bool | None = None
+    #: Experiments whose results decide, filled in where claims are collected.
+    experiment: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """Return the last column of a table of claims."""
+        return {True: "yes", False: "NO", None: ""}[self.holds]
+
+
+def within(claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = "") -> Claim:
+    """Return the claim that a number lies in an interval; None stands for what never came."""
+    number = math.inf if value is None else float(value)
+    if math.isinf(low):
+        required = f"at most {high:g}"
+    else:
+        required = f"at least {low:g}" if math.isinf(high) else f"{low:.5g} to {high:.5g}"
+    return Claim(claim, shown or f"{number:.4g}", required, low <= number <= high)
+
+
+def near(claim: str, value: float | None, target: float, tolerance: float) -> Claim:
+    """Return the claim that a number lies around another one."""
+    return within(claim, value, target - tolerance, target + tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedClaims(Result):
+    """The claims of a study, tested on its results."""
+
+    results: StudyResults
+    claims: Sequence[Claim]
+
+    @property
+    def failed(self) -> list[Claim]:
+        """Claims that do not hold."""
+        return [claim for claim in self.claims if claim.holds is False]
+
+    @property
+    def counted(self) -> str:
+        """How many of the claims hold."""
+        tested = [claim.holds for claim in self.claims if claim.holds is not None]
+        return f"{sum(tested)} of {len(tested)} hold"
+
+    @property
+    def changed(self) -> list[Claim]:
+        """Claims of which published results said otherwise, as they were published."""
+        published = {(claim.experiment, claim.claim): claim for claim in read_claims(self.results.study)}
+        pairs = [(claim, published.get((claim.experiment, claim.claim))) for claim in self.claims]
+        return [before for claim, before in pairs if before is not None and before.holds != claim.holds]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a row for each claim."""
+        return _frame(self.claims)
+
+    def content(self) -> dict[str, Any]:
+        """Return the claims for JSON."""
+        return {"study": self.results.study.name, "claims": [asdict(claim) for claim in self.claims]}
+
+    def sections(self) -> list[Section]:
+        """Return the claims, and those that changed since they were published."""
+        shown = [Section(self.results.study.name, frame=self.to_frame(), notes=[self.counted])]
+        if self.changed:
+            shown.append(Section("When they were published:", frame=_frame(self.changed)))
+        return shown
+
+
+def _frame(claims: Sequence[Claim]) -> pd.DataFrame:
+    import pandas as pd
+
+    columns = ("experiment", "claim", "measured", "required")
+    rows = [{**{name: getattr(claim, name) for name in columns}, "holds": claim.verdict} for claim in claims]
+    return pd.DataFrame(rows, columns=[*columns, "holds"])
+
+
+def check_claims(study: StudyFolder, out: Path) -> CheckedClaims:
+    """Test all claims of a study on the results in a folder; an experiment that was not run is a claim that fails."""
+    found = read_study(study, out)
+    missing = [short for short in map(last_part, study.configs) if short not in found]
+    claims = [Claim("was run", "no", "yes", False, short) for short in missing]
+    for function, calls in study.claims.items():
+        state = getattr(study.module("claims"), function)
+        for shorts in calls:
+            if not set(shorts) & set(missing):
+                made = state(*(found[short] for short in shorts))
+                claims += (replace(claim, experiment=" and ".join(shorts)) for claim in made)
+    return CheckedClaims(found, claims)
+
+
+def read_claims(study: StudyFolder) -> list[Claim]:
+    """Read the published claims of a study; none where it was never published."""
+    file = published_folder(study) / "claims.csv"
+    if not file.is_file():
+        return []
+    with file.open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    verdicts = {"yes": True, "NO": False}
+    return [
+        Claim(row["claim"], row["measured"], row["required"], verdicts.get(row["holds"]), row["experiment"])
+        for row in rows
+    ]

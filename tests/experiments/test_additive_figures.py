@@ -1,0 +1,244 @@
+"""Figures of the study of additive models: what is drawn is what was computed or found."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import UsageError
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
+from experiments.additive import frequency_plot
+from experiments.additive.parameter_plot import bias_svg, coverage_svg, labelled, mse_svg, symbol
+from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
+
+STUDY = find_study("additive")
+additive = STUDY.module("figures")
+METHODS = {"additive": "the sum", "srivc": "the fraction"}
+ONE = {"additive": "the sum"}
+NAMES = ["g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0"]
+
+
+@pytest.fixture
+def rows(tmp_path):
+    results = ideal_results(plan_of(TWO_MODES, tmp_path), tmp_path, bias={"srivc": {"g2_b0": 5.0}})
+    return parameter_errors(parameter_estimates(results))
+
+
+def content(axes):
+    return [(line.get_xdata(), line.get_ydata()) for line in axes.lines]
+
+
+def points_of(axes):
+    """Lines that are a single marker."""
+    return [(line, *line.get_data()) for line in axes.lines if len(line.get_xdata()) == 1]
+
+
+def legend_of(figure):
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def test_figure_2_is_the_sum_of_its_submodels(drawn):
+    additive.figure_2()
+    above, below = drawn[0].axes
+    assert legend_of(drawn[0]) == ["submodel 1", "submodel 2", "submodel 3", "submodel 4", "system"]
+    frequencies, magnitude = content(above)[-1]
+    system = STUDY.plan("open-loop").data_cells[0].source.system
+    response = unfactored(system).frequency_response(frequencies)
+    assert magnitude == pytest.approx(20 * np.log10(np.abs(response)), abs=1e-6)
+    (_, phase), *others = content(below)
+    assert not others
+    assert phase == pytest.approx(np.rad2deg(np.unwrap(np.angle(response))), abs=1e-6)
+    # The static gains in dB, and resonances where the printed poles are.
+    assert [values[0] for _, values in content(above)] == pytest.approx(
+        20 * np.log10([3, 0.4, 0.2, 0.05, 3.65]), abs=0.15
+    )
+    peaks = frequencies[1:-1][(np.diff(magnitude)[:-1] > 0) & (np.diff(magnitude)[1:] < 0)]
+    assert peaks == pytest.approx([1.39, 3.16, 5.77, 9.99], rel=0.04)
+
+
+def test_figure_2_is_drawn_the_same_every_time():
+    assert additive.figure_2() == additive.figure_2()
+
+
+def test_figure_6_says_that_it_is_simulated_and_ends_at_the_truth(drawn):
+    additive.figure_6()
+    assert "SIMULATED" in drawn[0].get_suptitle()
+    assert "no measured data" in drawn[0].get_suptitle()
+    assert "CONVERGED" in drawn[0].get_suptitle()
+    labels = legend_of(drawn[0])
+    assert labels == [
+        "non-parametric estimate, every 0.5 Hz",
+        "start of the iterations",
+        "true simulated system",
+        "estimate",
+    ]
+    measured, start, true, estimate = content(drawn[0].axes[0])
+    grid = np.linspace(1, 400, 500)
+    on_grid = [np.interp(grid, *curve) for curve in (start, true, estimate)]
+    assert np.median(np.abs(on_grid[2] - on_grid[1])) < 0.01
+    assert np.abs(on_grid[0] - on_grid[1]).max() > 20
+    assert measured[0] == pytest.approx(0.5 * np.arange(1, 1001))
+    assert np.median(np.abs(measured[1] - np.interp(measured[0], *true))) < 0.5
+
+
+def test_every_resonance_is_drawn(drawn):
+    plan = STUDY.plan("flexible-beam")
+    model = plan.data_cells[0].source.system
+    frequencies = frequency_plot.dense_frequencies(model, 1.0, 3000.0)
+    assert (np.diff(frequencies) > 0).all()
+    assert frequencies[0] >= 1.0
+    assert frequencies[-1] <= 3000.0
+    for submodel in model.submodels:
+        w0 = submodel.natural_frequency
+        exact = np.abs(submodel.frequency_response(w0 * np.linspace(0.999, 1.001, 20001))).max()
+        assert np.abs(submodel.frequency_response(frequencies)).max() == pytest.approx(exact, rel=1e-3)
+
+
+def test_phases_are_followed_or_interrupted(drawn):
+    frequencies = np.linspace(1, 10, 200)
+    curve = frequency_plot.Response("delay", frequencies, np.exp(-1j * frequencies))
+    for unwrap in (True, False):
+        frequency_plot.response_svg([curve], "title", "Hz", unwrap=unwrap)
+    (_, followed), (_, wrapped) = (content(figure.axes[1])[0] for figure in drawn)
+    assert followed == pytest.approx(-np.rad2deg(frequencies))
+    assert np.isnan(wrapped).sum() == 2
+    kept = np.isfinite(wrapped)
+    assert wrapped[kept] == pytest.approx(((followed + 180) % 360 - 180)[kept])
+
+
+def test_a_response_without_a_model_knows_the_hold():
+    rng = np.random.default_rng(1)
+    h, count = 0.01, 20000
+    t = h * np.arange(count)
+    system = TransferFunction([30.0], [1.0, 8.0, 30.0])
+    u = HeldSignal(t, rng.standard_normal(count))
+    record = Record(t, simulate(system, u, t), u)
+    frequencies, response = additive.empirical_response(record, 0.5, 60.0)
+    assert np.diff(frequencies) == pytest.approx(2 * np.pi / (count * h))
+    assert frequencies[0] >= 0.5
+    assert frequencies[-1] <= 60.0
+    # Half an interval of delay that the hold brings is 0.3 rad at the upper end. Images beyond half the sampling
+    # frequency are left, and what happened before the window.
+    error = np.abs(response - system.frequency_response(frequencies)) / np.abs(system.frequency_response(frequencies))
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.9) < 0.05
+
+
+@pytest.mark.parametrize("parameters", [NAMES, NAMES[2:3]])
+def test_errors_are_drawn_with_their_theory(drawn, rows, parameters):
+    mse_svg(rows, METHODS, parameters, 2, "Some title")
+    panels = [axes for axes in drawn[0].axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in panels] == [symbol(name) for name in parameters]
+    assert drawn[0].get_suptitle() == "Some title (40 data sets a point)"
+    for axes, parameter in zip(panels, parameters, strict=True):
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        curves = content(axes)
+        for method, (theory, points) in zip(METHODS, zip(curves[::2], curves[1::2], strict=True), strict=True):
+            own = [row for row in rows if (row.estimator, row.parameter) == (method, parameter)]
+            assert points[0].tolist() == theory[0].tolist() == [1000, 4000]
+            assert points[1].tolist() == [row.mse for row in own]
+            assert theory[1] == pytest.approx([row.theory / row.samples for row in own])
+    colours = [line.get_color() for line in panels[0].lines]
+    markers = [line.get_marker() for line in panels[0].lines[1::2]]
+    assert colours[0] == colours[1] != colours[2] == colours[3]
+    assert len(set(markers)) == 2
+    assert legend_of(drawn[0]) == ["the sum", "the fraction"]
+
+
+def test_biases_are_drawn_against_what_chance_allows(drawn, rows):
+    some = [row for row in rows if row.samples == 1000]
+    bias_svg(some, METHODS, NAMES, "Biases")
+    (axes,) = drawn[0].axes
+    ends = {(round(-float(y[0])), line.get_marker()): float(x[0]) for line, x, y in points_of(axes)}
+    assert ends == {
+        (NAMES.index(row.parameter), {"additive": "o", "srivc": "s"}[row.estimator]): row.bias_per_deviation
+        for row in some
+    }
+    assert ends[5, "s"] == pytest.approx(5.0, abs=1.2)
+    (band,) = axes.patches
+    assert band.get_width() == pytest.approx(2 * 3.3 / np.sqrt(40))
+    assert [text.get_text() for text in axes.get_yticklabels()] == [symbol(name) for name in NAMES]
+    assert drawn[0].get_suptitle() == "Biases (40 data sets)"
+
+
+def test_coverage_is_drawn_with_its_interval(drawn, tmp_path):
+    plan = plan_of(TWO_MODES.replace("[1000, 4000]", "4000").replace("runs: 40", "runs: 200"), tmp_path)
+    rows = parameter_errors(parameter_estimates(ideal_results(plan, tmp_path, width={"srivc": 0.4})))
+    coverage_svg([("first", rows, METHODS), ("second", rows[:6], ONE)], "Coverage")
+    first, second = drawn[0].axes
+    for axes, methods in ((first, METHODS), (second, ONE)):
+        assert len(axes.containers) == len(methods)
+        for container, method in zip(axes.containers, methods, strict=True):
+            own = [row for row in rows if row.estimator == method]
+            line, _, (bars,) = container
+            assert line.get_ydata().tolist() == [row.coverage for row in own]
+            ends = [segment[:, 1].tolist() for segment in bars.get_segments()]
+            assert ends == [pytest.approx([row.low, row.high]) for row in own]
+            right = (np.abs(line.get_ydata() - 95) < 8).all()
+            assert right == (method == "additive")
+    band = first.patches[0]
+    assert band.get_height() == pytest.approx(200 * 1.959964 * np.sqrt(0.95 * 0.05 / 200), rel=1e-6)
+
+
+def test_labels_count_what_is_not_as_it_should_be(rows):
+    assert labelled("additive", "the sum", rows) == "the sum"
+    wrong = [type(row)(**vars(row) | {"not_converged": 2, "failed": 1, "counted": row.runs - 1}) for row in rows]
+    assert labelled("srivc", "the fraction", wrong) == "the fraction (6 of 80 not converged, 2 without a value)"
+
+
+@pytest.mark.parametrize("number", ["3", "4", "coloured", "coverage"])
+def test_figures_of_results_draw_every_estimator_of_their_experiments(number, drawn, tmp_path):
+    found, expected = [], set()
+    for short in STUDY.figures[number]:
+        plan = STUDY.plan(short, ["monte_carlo.runs=4"])
+        found.append(ideal_results(plan, tmp_path))
+        expected |= {part.name for part in plan.estimators}
+    methods = {
+        "3": additive.OPEN_LOOP,
+        "4": additive.CLOSED_LOOP,
+        "coloured": additive.COLOURED,
+        "coverage": additive.COVERAGE_OPEN_LOOP | additive.COVERAGE_CLOSED_LOOP,
+    }[number]
+    assert set(methods) == expected
+    getattr(additive, f"figure_{number}")(*found)
+    count = {"3": 4, "4": 6, "coloured": 1, "coverage": 2}[number]
+    assert len(drawn[0].axes) == count
+    assert all(axes.lines or axes.containers for axes in drawn[0].axes)
+
+
+def test_results_that_are_missing_are_named_before_anything_is_drawn(tmp_path, monkeypatch):
+    figures = find_figures(["additive"])
+    assert [figure.number for figure in figures] == ["2", "3", "4", "6", "coloured", "coverage"]
+    assert str(figures[-1].place) == "additive_figures/figure_coverage.svg"
+    out = tmp_path / "my results"
+    command = (
+        "run first: ctid run configs/additive/open_loop.yaml configs/additive/closed_loop.yaml "
+        "configs/additive/closed_loop_coloured.yaml configs/additive/coverage_open_loop.yaml "
+        rf"configs/additive/coverage_closed_loop.yaml --out '{out}'"
+    )
+    with pytest.raises(UsageError) as refused:
+        require_results(figures, out)
+    assert str(refused.value).endswith(command)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match=r"run first: ctid run configs/additive/open_loop\.yaml$"):
+        figures[1].svg(Path("results"))
+    require_results([figures[0], figures[3], *find_figures(["2"])], out)
+
+
+def test_names_of_figures():
+    assert [name for name, study in all_studies().items() if study.figures] == [
+        "additive",
+        "finite-time-frequency",
+        "useful-redundancy",
+    ]
+    with pytest.raises(UsageError, match=r"additive has no figure 9; it has 2, 3, 4, 6, coloured, coverage$"):
+        find_figures(["additive/9"])
+    with pytest.raises(UsageError, match=r"'additive/colored' is neither.*did you mean 'additive/coloured'\?"):
+        find_figures(["additive/colored"])

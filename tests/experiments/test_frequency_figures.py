@@ -1,0 +1,144 @@
+"""Figures of the study of finite-time frequency estimation: what is drawn is what was found."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctid_cli.errors import UsageError
+from ctid_cli.reporting.results import read_results
+from ctid_cli.studies.catalogue import find_figures, require_results
+from experiments.finite_time_frequency import error_plot
+from experiments.finite_time_frequency.error_plot import Curve, Group, Row, errors_svg
+from tests.reporting.frequency_results import STUDY, run_here
+
+figures = STUDY.module("figures")
+NAMES = ("two-tones", "harmonic", "random", "step")
+#: A slow clock and short records; the step must come before their end.
+SHORT = ("sampling.interval=0.01", "sampling.duration=33", "success.window=[28, 33]", "monte_carlo.runs=2")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    for name in NAMES:
+        run_here(name, folder, SHORT)
+    return folder
+
+
+def lines_of(axes, style):
+    """Curves of a look, told by their width."""
+    return [line for line in axes.lines if line.get_linewidth() == style["linewidth"]]
+
+
+def legend_texts(legend):
+    return [text.get_text() for text in legend.get_texts()]
+
+
+@pytest.mark.parametrize("number", STUDY.figures)
+def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, drawn):
+    (item,) = find_figures([f"finite-time-frequency/{number}"])
+    item.svg(out)
+    (figure,) = drawn
+    readings = 2 if number == "4" else 1
+    panels = np.array(figure.axes).reshape(2 * readings, 3)
+    assert [axes.get_title(loc="left") for axes in panels[0]] == list(figures.GROUPS)
+    for axes, labels in zip(panels[-1], figures.GROUPS.values(), strict=True):
+        assert legend_texts(axes.get_legend()) == list(labels.values())
+        assert axes.get_xlabel() == "time [s]"
+        assert axes.get_yscale() == "log"
+        assert axes.get_xlim() == (0.0, 33.0)
+    for row, axes in zip(panels[:, 0], ("frequency [rad/s]", "larger error [rad/s]") * readings, strict=True):
+        assert row.get_ylabel().endswith(axes)
+    common = legend_texts(figure.legends[0])
+    assert "true frequencies" in common
+    assert any("invalid" in text for text in common)
+    assert ("nonlinear least squares, whole record" in common) is (number in "23")
+
+
+def test_lines_are_the_tracks_of_the_first_data_set_and_thick_where_valid(out, drawn):
+    results = read_results(out, "finite-time-frequency/step")
+    figures.figure_4(results)
+    plan = STUDY.plan("step", SHORT)
+    panels = np.array(drawn[0].axes).reshape(4, 3)
+    for k, reading in enumerate(("jump", "continuous")):
+        (cell,) = (cell for cell in plan.data_cells if cell.swept["phase_at_steps"] == reading)
+        for column, names in enumerate(figures.GROUPS.values()):
+            above, below = panels[2 * k : 2 * k + 2, column]
+            for place, name in enumerate(names):
+                (part,) = (part for part in plan.estimators if part.name == name)
+                track = part.estimator.prepare(cell.dataset(0).record).fit().track
+                t, omega, valid = track.t[::10], track.frequencies[::10], track.valid[::10]
+                truth = np.where((t >= 30 - 1e-9)[:, None], [2.0, 3.0], [1.8, 3.2])
+                for tone in (0, 1):
+                    thin = lines_of(above, error_plot.FAINT)[2 * place + tone]
+                    firm = lines_of(above, error_plot.FIRM)[2 * place + tone]
+                    assert np.array_equal(thin.get_ydata(), omega[:, tone], equal_nan=True)
+                    assert np.array_equal(firm.get_ydata(), np.where(valid, omega[:, tone], np.nan), equal_nan=True)
+                error = np.maximum(np.abs(omega - truth).max(axis=1), 1e-16)
+                assert lines_of(below, error_plot.FAINT)[place].get_ydata() == pytest.approx(error, nan_ok=True)
+            true = [line.get_ydata() for line in lines_of(above, error_plot.TRUTH)]
+            assert np.column_stack(true) == pytest.approx(truth)
+    # Exact in finite time before the step, and only the estimators with a short memory again within 3 s after it.
+    finite, gradient = lines_of(panels[1, 0], error_plot.FAINT)
+    window, restarting, _ = lines_of(panels[1, 1], error_plot.FAINT)
+    at = np.searchsorted(finite.get_xdata(), 20.0)
+    assert finite.get_ydata()[at] < 1e-12 < 1e-9 < gradient.get_ydata()[at]
+    assert restarting.get_ydata()[-1] < 1e-9
+    assert min(finite.get_ydata()[-1], gradient.get_ydata()[-1], window.get_ydata()[-1]) > 1e-3
+
+
+def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):
+    for number, end in (("1", 0.66), ("2", 4.74), ("3", 3.2), ("4", 3.6)):
+        (item,) = find_figures([f"finite-time-frequency/{number}"])
+        item.svg(out)
+        (band,) = drawn[-1].axes[3].patches
+        assert (band.get_x(), band.get_width()) == pytest.approx((0.0, end))
+
+
+def test_the_reference_is_the_worse_tone_over_all_data_sets(out, drawn):
+    results = read_results(out, "finite-time-frequency/random")
+    figures.figure_3(results)
+    errors = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
+    assert len(errors) == 2
+    expected = max(np.sqrt(np.mean([e[f"rms_{k}"] ** 2 for e in errors])) for k in (1, 2))
+    for axes in drawn[0].axes[3:]:
+        (line,) = lines_of(axes, error_plot.WHOLE)
+        assert line.get_ydata() == pytest.approx([expected] * 2)
+
+
+def test_an_svg_file_is_the_same_every_time():
+    t = np.arange(5.0)
+    curve = Curve("one", t, np.full((5, 1), 2.0), np.full((5, 1), 2.0), t > 1)
+    assert curve.error.tolist() == [1e-16] * 5
+    row = Row("", [Group("group", [curve])], 5.0, 1.0)
+    once, again = (errors_svg([row], (1.0, 3.0), (1e-17, 1.0), "title") for _ in range(2))
+    assert once == again
+    assert once.startswith(b"<?xml")
+    assert once != errors_svg([replace(row, reference=0.1)], (1.0, 3.0), (1e-17, 1.0), "title")
+
+
+def test_missing_results_name_the_command(tmp_path, monkeypatch):
+    drawn = find_figures(["finite-time-frequency"])
+    assert [figure.number for figure in drawn] == ["1", "2", "3", "4"]
+    assert drawn[0].place == Path("finite_time_frequency_figures/figure_1.svg")
+    monkeypatch.chdir(tmp_path)
+    command = " ".join(f"configs/finite_time_frequency/{name.replace('-', '_')}.yaml" for name in NAMES)
+    with pytest.raises(UsageError, match=rf"run first: ctid run {command}$"):
+        require_results(drawn, Path("results"))
+    with pytest.raises(UsageError, match=r"run first: ctid run configs/finite_time_frequency/harmonic\.yaml$"):
+        drawn[1].svg(Path("results"))
+
+
+def test_figures_are_those_of_the_specifications():
+    for name in NAMES:
+        parts = {part.name: part.estimator.options for part in STUDY.plan(name).estimators}
+        shown = {estimator for labels in figures.GROUPS.values() for estimator in labels}
+        assert shown == {estimator for estimator, options in parts.items() if not options.whole_record}
+        derived = {
+            part for part, options in parts.items() if "derived, not the published algorithm" in type(options).__doc__
+        }
+        assert derived == set(figures.GROUPS[figures.DERIVED])
+    assert figures.DERIVED == "derived, not the published algorithm"
+    assert figures.DRAWN_INTERVAL == 0.1
