@@ -81,7 +81,7 @@ class Result(ABC):
             return json.dumps(plain(self.content()), indent=1, allow_nan=False)
         if form == "csv":
             frame = self.to_frame().copy()
-            for name, values in frame.select_dtypes("object").items():
+            for name, values in frame.select_dtypes(["object", "str"]).items():
                 held = values.map(lambda value: isinstance(value, list | dict)).astype(bool)
                 frame[name] = values.mask(held, values[held].map(json.dumps))
             return str(frame.to_csv(index=_is_named(frame), lineterminator="\n")).rstrip("\n")

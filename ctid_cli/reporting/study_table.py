@@ -30,7 +30,6 @@ from ctid_cli.reporting.table_result import (
     TIME,
     TableResult,
     experiment_table,
-    interval_text,
     joined,
     labels_of,
     measure_table,
@@ -200,7 +199,7 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
     place = labels.agg("\n".join, axis=1) + startless.astype(str)
     texts = {
         "%": [percent_text(row) if row["n"] else "-" for row in rows],
-        "95 %": [interval_text(row).strip("[]").replace(", ", "-") for row in rows],
+        "95 %": ["" if row["low"] is None else f"{row['low']:.0f}-{row['high']:.0f}" for row in rows],
         "published": ["" if row["published_percent"] is None else number(row["published_percent"]) for row in rows],
         "time": [seconds(time_of(row)) if row["n"] else "" for row in rows],
     }

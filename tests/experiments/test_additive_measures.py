@@ -1,8 +1,5 @@
 """Errors of parameters: every number against another route, and who counts and who does not."""
 
-import json
-import re
-
 import numpy as np
 import pytest
 
@@ -11,13 +8,11 @@ from ctid_cli.inference.bounds import limiting_accuracy
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.reporting.expected_accuracy import long_record_variances
-from ctid_cli.reporting.parameter_errors import mse_ratio, parameter_errors, parameter_estimates
-from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
+from experiments.additive.measures import errors_of, estimates_of, mse_ratio
 from tests.reporting.ideal_results import TWO_MODES, estimate, ideal_results, plan_of, results_of
-from tests.storage.made_results import MadeResults
 
 NAMES = ("g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0")
 TRUTH = np.array([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
@@ -42,22 +37,9 @@ def variances_of(plan, cell=0):
     return {name: variances for name, variances in of_cell.items() if variances is not None}
 
 
-def test_groups_follow_the_specification(plan, tmp_path):
-    groups = parameter_estimates(ideal_results(plan, tmp_path))
-    assert [(g.estimator, g.samples) for g in groups] == [
-        (name, samples) for name in ("additive", "srivc") for samples in (1000, 4000)
-    ]
-    for group in groups:
-        assert group.names == NAMES
-        assert group.truth == pytest.approx(TRUTH)
-        assert (group.runs, group.failed, group.not_converged) == (40, 0, 0)
-        assert group.replicates.tolist() == [*range(40)]
-        assert group.settings == {}
-
-
 def test_mean_square_bias_and_scatter(plan, tmp_path):
     results = ideal_results(plan, tmp_path, bias={"srivc": {"g2_a2": 3.0}})
-    rows = {(r.estimator, r.samples, r.parameter): r for r in parameter_errors(parameter_estimates(results))}
+    rows = {(r.estimator, r.samples, r.parameter): r for r in errors_of(results)}
     assert len(rows) == 2 * 2 * 6
     for (estimator, samples, parameter), row in rows.items():
         found = [
@@ -94,22 +76,14 @@ def test_who_counts_and_who_does_not(plan, tmp_path):
         estimate(good | {"g1_a1": None}),
         estimate(good),
     ]
-    groups = parameter_estimates(results_of(plan, {("additive", 4000): found}, tmp_path))
+    results = results_of(plan, {("additive", 4000): found}, tmp_path)
+    groups = estimates_of(results)
     assert len(groups) == 1
     assert (groups[0].runs, groups[0].failed, groups[0].not_converged) == (7, 1, 2)
-    for row in parameter_errors(groups):
+    for row in errors_of(results):
         assert (row.runs, row.failed, row.not_converged, row.counted) == (7, 1, 2, 3)
         assert row.mse == pytest.approx((2 * 0.01**2 + 1.0) / 3)
         assert (row.with_error, row.covered, row.coverage, row.error_ratio) == (0, 0, None, None)
-
-
-def test_nothing_counts(plan, tmp_path):
-    found = {("srivc", 1000): [estimate(None, status="FAILED")] * 2}
-    for row in parameter_errors(parameter_estimates(results_of(plan, found, tmp_path))):
-        assert (row.failed, row.counted) == (2, 0)
-        numbers = (row.mse, row.n_mse, row.ratio, row.ratio_error, row.bias, row.deviation, row.bias_per_deviation)
-        assert set(numbers) == {None}
-        assert row.theory > 0
 
 
 def test_coverage_counts_intervals_and_what_has_none_is_not_covered(plan, tmp_path):
@@ -120,25 +94,9 @@ def test_coverage_counts_intervals_and_what_has_none_is_not_covered(plan, tmp_pa
         estimate(named(TRUTH + 0.19601), width),
         estimate(named(TRUTH), dict.fromkeys(NAMES)),
     ]
-    for row in parameter_errors(parameter_estimates(results_of(plan, {("additive", 1000): found}, tmp_path))):
+    for row in errors_of(results_of(plan, {("additive", 1000): found}, tmp_path)):
         assert (row.counted, row.with_error, row.covered, row.coverage) == (4, 3, 2, 50.0)
         assert (row.low, row.high) == pytest.approx([100 * end for end in wilson_interval(2, 4)])
-
-
-def test_settings_of_an_estimator_keep_their_estimates_apart(tmp_path):
-    text = TWO_MODES.replace("zeros: 2}", "zeros: 2, max_iterations: [5, 50]}")
-    groups = parameter_estimates(ideal_results(plan_of(text, tmp_path), tmp_path))
-    assert [(g.estimator, g.settings.get("max_iterations"), g.samples) for g in groups] == [
-        *(("additive", None, n) for n in (1000, 4000)),
-        *(("srivc", most, n) for most in (5, 50) for n in (1000, 4000)),
-    ]
-    assert all(group.runs == 40 for group in groups)
-    assert parameter_errors(groups)[-1].settings["max_iterations"] == 50
-
-
-def test_data_without_true_parameters_are_refused(tmp_path, make_results, estimate):
-    with pytest.raises(UsageError, match=r"case1-regular: errors of parameters need data that are simulated.*additive"):
-        parameter_estimates(make_results({(5.0, "0.0"): [estimate(8.0)]}))
 
 
 def test_a_ratio_is_that_of_pairs(plan, tmp_path):
@@ -150,87 +108,58 @@ def test_a_ratio_is_that_of_pairs(plan, tmp_path):
     # One that lacks a parameter has no value at all: every parameter counts the same data sets.
     partial = next(key for key in stored if key.replicate == 5 and key.estimator_hash == plan.estimators[0].hash)
     stored[partial] = estimate(stored[partial]["parameters"] | {"g1_a1": None})
-    groups = {(g.estimator, g.samples): g for g in parameter_estimates(results)}
+    groups = {(g.estimator, g.samples): g for g in estimates_of(results)}
     one, other = groups["srivc", 1000], groups["additive", 1000]
-    ratio = mse_ratio([one], [other], "g2_b0")
+    ratio, pairs = mse_ratio([one], [other], "g2_b0")
     kept = [k for k in range(40) if k not in (3, 5)]
     squares = np.array([(g.values[kept, 5] - 1.0) ** 2 for g in (one, other)])
-    assert (ratio.pairs, ratio.samples) == (38, (1000,))
-    assert ratio.ratio == pytest.approx(squares[0].sum() / squares[1].sum())
+    assert pairs == 38
+    assert ratio.value == pytest.approx(squares[0].sum() / squares[1].sum())
     without = [np.delete(squares, k, axis=1) for k in range(38)]
     ratios = np.array([left[0].sum() / left[1].sum() for left in without])
-    assert ratio.standard_error == pytest.approx(np.sqrt(37 * np.var(ratios)))
-    back = mse_ratio([other], [one], "g2_b0")
-    assert back.ratio == pytest.approx(1 / ratio.ratio)
-    assert mse_ratio([one], [one], "g2_b0").standard_error == pytest.approx(0.0, abs=1e-12)
+    assert ratio.error == pytest.approx(np.sqrt(37 * np.var(ratios)))
+    back, _ = mse_ratio([other], [one], "g2_b0")
+    assert back.value == pytest.approx(1 / ratio.value)
+    assert mse_ratio([one], [one], "g2_b0")[0].error == pytest.approx(0.0, abs=1e-12)
 
 
 def test_several_lengths_are_one_trial_of_each_data_set(plan, tmp_path):
     results = ideal_results(plan, tmp_path)
     del results.stored.results[next(key for key in results.stored.results if key.replicate == 0)]
-    groups = {(g.estimator, g.samples): g for g in parameter_estimates(results)}
+    groups = {(g.estimator, g.samples): g for g in estimates_of(results)}
     assert sorted(group.runs for group in groups.values()) == [39, 40, 40, 40]
     one, other = ([groups[name, n] for n in (1000, 4000)] for name in ("srivc", "additive"))
-    ratio = mse_ratio(one, other, "g1_a2")
+    ratio, pairs = mse_ratio(one, other, "g1_a2")
     # Without the data set that one of them lacks at one of the lengths.
     sums = [sum(g.samples * (g.values[-39:, 1] - 0.25) ** 2 for g in side) for side in (one, other)]
-    assert ratio.ratio == pytest.approx(sums[0].sum() / sums[1].sum())
-    assert (ratio.pairs, ratio.samples) == (39, (1000, 4000))
+    assert ratio.value == pytest.approx(sums[0].sum() / sums[1].sum())
+    assert pairs == 39
     # The same record twice is no more than once.
-    assert mse_ratio(one[:1] * 2, other[:1] * 2, "g1_a2").standard_error == pytest.approx(
-        mse_ratio(one[:1], other[:1], "g1_a2").standard_error
-    )
+    twice, _ = mse_ratio(one[:1] * 2, other[:1] * 2, "g1_a2")
+    assert twice.error == pytest.approx(mse_ratio(one[:1], other[:1], "g1_a2")[0].error)
 
 
 def test_the_jackknife_knows_how_far_a_ratio_scatters(tmp_path):
     plan = plan_of(TWO_MODES.replace("samples: [1000, 4000]", "samples: 1000"), tmp_path)
     ratios = []
     for seed in range(60):
-        groups = parameter_estimates(ideal_results(plan, tmp_path, seed=seed))
-        ratios.append(mse_ratio([groups[1]], [groups[0]], "g1_a2"))
-    scatter = np.std([ratio.ratio for ratio in ratios], ddof=1)
-    assert np.mean([ratio.standard_error for ratio in ratios]) == pytest.approx(scatter, rel=0.3)
+        groups = estimates_of(ideal_results(plan, tmp_path, seed=seed))
+        ratios.append(mse_ratio([groups[1]], [groups[0]], "g1_a2")[0])
+    scatter = np.std([ratio.value for ratio in ratios], ddof=1)
+    assert np.mean([ratio.error for ratio in ratios]) == pytest.approx(scatter, rel=0.3)
 
 
 def test_ratios_that_make_no_sense_are_refused(plan, tmp_path):
-    groups = parameter_estimates(ideal_results(plan, tmp_path))
+    groups = estimates_of(ideal_results(plan, tmp_path))
     with pytest.raises(ValueError, match="same numbers of samples"):
         mse_ratio(groups[:1], groups[3:], "g1_a1")
     with pytest.raises(ValueError, match="same numbers of samples"):
         mse_ratio([], [], "g1_a1")
     with pytest.raises(UsageError, match=r"no parameter 'g3_a1'; it has g1_a1, "):
         mse_ratio(groups[:1], groups[2:3], "g3_a1")
-    one = parameter_estimates(results_of(plan, {("additive", 1000): [estimate(named(TRUTH))]}, tmp_path))
+    one = estimates_of(results_of(plan, {("additive", 1000): [estimate(named(TRUTH))]}, tmp_path))
     with pytest.raises(UsageError, match="additive and additive have 1 estimates on the same data sets, too few"):
         mse_ratio(one, one, "g1_a1")
-
-
-def test_results_on_disk_give_the_same_errors(plan, tmp_path):
-    from ctid_cli.reporting.results import read_results
-    from tests.storage.made_results import export_image
-
-    results = ideal_results(plan, tmp_path)
-    folder = tmp_path / "two-modes"
-    folder.mkdir()
-    image = export_image(results.manifest, results.stored.origins, results.stored.results)
-    (folder / "runs.h5").write_bytes(image)
-    again = read_results(tmp_path, "two-modes")
-    assert isinstance(again, Results)
-    assert parameter_errors(parameter_estimates(again)) == parameter_errors(parameter_estimates(results))
-
-
-def test_theory_is_found_for_results_of_an_earlier_version(plan, tmp_path):
-    results = ideal_results(plan, tmp_path)
-    before = parameter_errors(parameter_estimates(results))
-    # Hashes that no specification has today.
-    manifest = json.loads(re.sub(r'"hash": "(\w+)"', r'"hash": "old \1"', json.dumps(results.manifest)))
-    stored = {
-        key._replace(data_hash=f"old {key.data_hash}", estimator_hash=f"old {key.estimator_hash}"): value
-        for key, value in results.stored.results.items()
-    }
-    older = Results(tmp_path, MadeResults(manifest, stored))
-    assert parameter_errors(parameter_estimates(older)) == before
-    assert all(row.theory is not None for row in before)
 
 
 def test_theory_is_that_of_each_estimators_own_form(plan):
