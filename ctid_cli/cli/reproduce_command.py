@@ -94,11 +94,12 @@ def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> No
     """Test the claims of studies, and compare the tables of the one that has any."""
     from ctid_cli.reporting.comparison_result import check_tables
     from ctid_cli.reporting.study import DEFAULT_STUDY
+    from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.claims import check_claims
 
     failed = []
     for study in studies:
-        found = check_claims(study, out)
+        found = check_claims(read_study(study, out))
         emit(found, form.form)
         failed += [f"{study.name}: {len(found.failed)} claims do not hold"] if found.failed else []
         if study.name == DEFAULT_STUDY:
@@ -111,13 +112,13 @@ def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> No
 
 def _publish(studies: Sequence[StudyFolder], out: Path) -> None:
     """Publish studies, also those of which a claim does not hold."""
-    from ctid_cli.studies.catalogue import published_folder
+    from ctid_cli.studies.catalogue import published_folder, read_study
     from ctid_cli.studies.claims import check_claims
     from ctid_cli.studies.publishing import publish
 
     failed = []
     for study in studies:
-        found = check_claims(study, out)
+        found = check_claims(read_study(study, out))
         publish(found, out)
         typer.echo(published_folder(study))
         failed += [f"does not hold: {claim.experiment}, {claim.claim}" for claim in found.failed]

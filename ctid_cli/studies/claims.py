@@ -6,11 +6,10 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.document import Result, Section
-from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part, published_folder, read_study
+from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part, published_folder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -97,9 +96,9 @@ def _frame(claims: Sequence[Claim]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, "holds"])
 
 
-def check_claims(study: StudyFolder, out: Path) -> CheckedClaims:
-    """Test all claims of a study on the results in a folder; an experiment that was not run is a claim that fails."""
-    found = read_study(study, out)
+def check_claims(found: StudyResults) -> CheckedClaims:
+    """Test all claims of a study on its results; an experiment that was not run is a claim that fails."""
+    study = found.study
     missing = [short for short in map(last_part, study.configs) if short not in found]
     claims = [Claim("was run", "no", "yes", False, short) for short in missing]
     for function, calls in study.claims.items():

@@ -45,7 +45,7 @@ def study_page(study: StudyFolder, out: Path) -> str:
     own = set(study.configs) <= set(experiments_in(out))
     if own:
         texts = {name: text for name, text in published_texts(read_study(study, out)).items() if name.endswith(".md")}
-        claims = list(check_claims(study, out).sections())
+        claims = list(check_claims(read_study(study, out)).sections())
         origin = [f"Results in {out.name}: {', '.join(study.configs)}."]
     else:
         texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}

@@ -9,11 +9,11 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.parameter_errors import parameter_errors, parameter_estimates
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
 from experiments.additive import frequency_plot
+from experiments.additive.measures import errors_of
 from experiments.additive.parameter_plot import bias_svg, coverage_svg, labelled, mse_svg, symbol
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
@@ -27,7 +27,7 @@ NAMES = ["g1_a1", "g1_a2", "g1_b0", "g2_a1", "g2_a2", "g2_b0"]
 @pytest.fixture
 def rows(tmp_path):
     results = ideal_results(plan_of(TWO_MODES, tmp_path), tmp_path, bias={"srivc": {"g2_b0": 5.0}})
-    return parameter_errors(parameter_estimates(results))
+    return errors_of(results)
 
 
 def content(axes):
@@ -170,7 +170,7 @@ def test_biases_are_drawn_against_what_chance_allows(drawn, rows):
 
 def test_coverage_is_drawn_with_its_interval(drawn, tmp_path):
     plan = plan_of(TWO_MODES.replace("[1000, 4000]", "4000").replace("runs: 40", "runs: 200"), tmp_path)
-    rows = parameter_errors(parameter_estimates(ideal_results(plan, tmp_path, width={"srivc": 0.4})))
+    rows = errors_of(ideal_results(plan, tmp_path, width={"srivc": 0.4}))
     coverage_svg([("first", rows, METHODS), ("second", rows[:6], ONE)], "Coverage")
     first, second = drawn[0].axes
     for axes, methods in ((first, METHODS), (second, ONE)):

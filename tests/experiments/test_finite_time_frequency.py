@@ -5,10 +5,12 @@ import csv
 import numpy as np
 import pytest
 
+from ctid_cli import DremFiniteTime, DremGradient
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import read_study
-from ctid_cli.studies.publishing import evaluate, published_texts
+from ctid_cli.studies.claims import check_claims
+from ctid_cli.studies.publishing import published_texts
 from tests.experiments import frequency_acceptance as acceptance
 from tests.reporting.frequency_results import STUDY, run_here
 
@@ -100,7 +102,7 @@ def one(rows, **wanted):
 def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = list(measured.settling(study["two-tones"]))
     y = acceptance.signal("A", 0.01, 60.0)
-    for name, kind in (("finite_time", acceptance.DremFiniteTime), ("gradient", acceptance.DremGradient)):
+    for name, kind in (("finite_time", DremFiniteTime), ("gradient", DremGradient)):
         track = acceptance.drem(kind, "A").track(y, 0.01)
         row = one(rows, estimator=name)
         for band in measured.BANDS:
@@ -170,7 +172,7 @@ def test_the_monte_carlo_error_is_that_of_normal_errors():
 
 
 def test_claims_are_judged_on_stored_runs(study, monkeypatch):
-    checks = evaluate(study)
+    checks = check_claims(study).claims
     by_experiment = {name: [c for c in checks if c.experiment == name] for name in study.experiments}
     assert {name: len(found) for name, found in by_experiment.items()} == {
         "two-tones": 8, "harmonic": 3, "random": 1, "step": 10, "recovery": 6, "recovery-in-noise": 6, "efficiency": 5,

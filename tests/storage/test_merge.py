@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ctid_cli.errors import DamageError, RefusedError, UsageError
-from ctid_cli.reporting.overview import overview_text, status_text
+from ctid_cli.reporting.status_result import Overview, StatusResult
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.journal import open_journal, read_journal
@@ -65,8 +65,9 @@ def test_shards_merged_in_any_order_are_one_run(whole: Path, parts: list[Path], 
 def test_a_shard_counts_its_own_estimates(parts: list[Path]) -> None:
     status = experiment_status(parts[1])
     assert (status.planned, status.done, status.left_aside) == (12, 12, 0)
-    assert "shard 2/3 of toys" in overview_text([status])
-    assert status_text(status, [], parts[1].parent).startswith(f"shard 2/3 of toys in {parts[1]}: 12 of 12")
+    result = StatusResult(status, parts[1].parent)
+    assert "shard 2/3 of toys" in Overview([result], parts[1].parent).summary()
+    assert result.summary().startswith(f"shard 2/3 of toys in {parts[1]}: 12 of 12")
     assert len(read_estimates(parts[1])) == 12
 
 
