@@ -39,6 +39,8 @@ class Section:
     frame: pd.DataFrame | None = None
     #: Format of the numbers of a column, such as ``.2f``; ``.6g`` where nothing is said.
     formats: Mapping[str, str] = field(default_factory=dict)
+    #: Lines that are never wrapped, because they hold paths or commands.
+    lines: Sequence[str] = ()
     #: Sentences below the table: what its columns mean.
     notes: Sequence[str] = ()
     #: A figure that is still to be drawn, or an SVG file.
@@ -132,7 +134,7 @@ def render_text(sections: Iterable[Section]) -> str:
     blocks = []
     for section in sections:
         parts = [section.title] if section.title else []
-        parts += [_paragraph(sentence) for sentence in section.sentences]
+        parts += [*(_paragraph(sentence) for sentence in section.sentences), *section.lines]
         parts += [_text_table(*aligned_lines(section))] if section.frame is not None else []
         parts += [_paragraph(note) for note in section.notes]
         blocks += ["\n".join(parts)] if parts else []
@@ -158,7 +160,7 @@ def render_markdown(sections: Iterable[Section]) -> str:
     blocks: list[str] = []
     for section in sections:
         blocks += [f"### {section.title}"] if section.title else []
-        blocks += section.sentences
+        blocks += [*section.sentences, *section.lines]
         blocks += [_markdown_table(*aligned_lines(section))] if section.frame is not None else []
         blocks += section.notes
     return "\n\n".join(blocks)
@@ -192,7 +194,7 @@ def render_html(sections: Iterable[Section]) -> str:
     blocks: list[str] = []
     for section in sections:
         blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
-        blocks += [f"<p>{html.escape(sentence)}</p>" for sentence in section.sentences]
+        blocks += [f"<p>{html.escape(sentence)}</p>" for sentence in (*section.sentences, *section.lines)]
         blocks += [html_table(section)] if section.frame is not None else []
         blocks += [f"<p>{html.escape(note)}</p>" for note in section.notes]
     return "\n".join(blocks)

@@ -302,7 +302,7 @@ class ValidationResult(Result):
         counts = f"{count(self.data_sets, 'data set')} ({count(self.data_cells, 'data cell')})"
         text = f"{self.file}: ok, {self.experiment}: {counts}, {count(self.estimates, 'estimate')}"
         text += "" if self.at_most is None else f"; at most {self.at_most} data sets of a cell"
-        return [Section(sentences=[text])]
+        return [Section(lines=[text])]
 
     def content(self) -> dict[str, Any]:
         """Return the counts for JSON."""

@@ -222,7 +222,7 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
 def _sizes(counts: pd.Series) -> str:
     """Return the least and the greatest number of data sets that were run."""
     run = counts[counts > 0]
-    return "-".join(dict.fromkeys([str(run.min()), str(run.max())])) if len(run) else NOT_RUN
+    return "-".join(dict.fromkeys([str(run.min()), str(run.max())])) if len(run) else "0"
 
 
 def pooled_frame(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> pd.DataFrame:

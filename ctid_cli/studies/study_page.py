@@ -21,13 +21,7 @@ CLAIMS = "claims.md"
 
 
 def page_of(name: str, out: Path) -> tuple[str, Path]:
-    """Return the page of an experiment or a study, and where it usually goes.
-
-    Raises
-    ------
-    UsageError
-        If there are no results of an experiment, and no study, of this name.
-    """
+    """Return the page of an experiment or a study, and where it usually goes."""
     known, studies = experiments_in(out), all_studies()
     if name in known:
         results = read_results(out, name)

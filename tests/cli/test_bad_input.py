@@ -183,8 +183,7 @@ def test_slow_sampling_is_a_warning(tiny, ctid):
         ("run",),
         ("run", "x.yaml", "--jobs", "0"),
         ("run", "x.yaml", "--runs", "some"),
-        ("table", "--format", "html"),
-        ("export",),
+        ("table", "--format", "word"),
         ("shwo", "abc"),
     ],
 )
@@ -201,14 +200,16 @@ def test_usage(ctid, arguments, tmp_path, monkeypatch):
         ("run", "x.yaml", "--jobs", "2", "-j", "3"),
         ("table", "--format", "md", "--format=md"),
         ("check", "x.csv", "--time", "a", "--time", "b"),
-        ("check", "filters", "--bandwidth", "1", "--largest-error", "2", "--bandwidth", "1"),
+        ("track", "x.csv", "--tones", "1", "--tones", "2"),
     ],
 )
 def test_an_option_that_would_keep_its_last_value_only(ctid, arguments):
     assert re.search(r"^Error: --\w+ is given twice\.$", ctid(*arguments, code=2).stderr, re.MULTILINE)
 
 
-@pytest.mark.parametrize("arguments", [("show", "ffff"), ("export", "tiny"), ("status", "tiny"), ("table", "9")])
+@pytest.mark.parametrize(
+    "arguments", [("export", "--id", "ff"), ("export", "tiny"), ("status", "tiny"), ("table", "9")]
+)
 def test_what_does_not_exist(ctid, arguments, tmp_path):
     ctid(*arguments, "--out", tmp_path / "nothing", code=2)
     assert list(tmp_path.iterdir()) == []

@@ -67,7 +67,7 @@ def test_a_window_and_a_hold(ctid, rig):
 def test_a_matlab_file(ctid, tmp_path, arrays):
     path = tmp_path / "rig.mat"
     scipy.io.savemat(path, dict(zip(("t", "u", "y"), arrays, strict=True)))
-    assert "2000 samples in 199.9 s (time 't', input 'u', output 'y')" in ctid("check", path).stdout
+    assert "2000 samples in 199.9 s (time 't', input 'u', output 'y')" in " ".join(ctid("check", path).stdout.split())
 
 
 def test_a_record_that_shows_nothing(ctid, tmp_path, monkeypatch, snapshot):

@@ -12,7 +12,7 @@ import pytest
 
 from ctid_cli.inference import monte_carlo
 
-COMMANDS = ["init", "run", "status", "table", "show", "export", "validate", "schema"]
+COMMANDS = ["init", "run", "status", "table", "export", "reproduce", "compare", "accuracy", "validate", "schema"]
 
 
 def test_help_names_every_command(ctid):
@@ -25,7 +25,7 @@ def test_help_names_every_command(ctid):
 def test_every_command_explains_itself_and_its_options(ctid, command):
     text = ctid(command, "--help").stdout
     assert text.startswith(f"Usage: root {command}") or f" {command} " in text.splitlines()[0]
-    if command not in ("init", "validate", "schema"):
+    if command not in ("init", "validate", "schema", "accuracy"):
         assert "--out DIR" in text
     for line in text.splitlines():
         option = re.match(r"^  (-\w, )?--[\w-]+(  +(\S.*))?$", line)
@@ -44,18 +44,6 @@ def test_help_imports_nothing_slow():
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "slow = {'numpy', 'scipy', 'pandas', 'numba', 'h5py', 'joblib', 'pydantic', 'rich'} & set(sys.modules)\n"
-        "assert not slow, slow"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
-
-
-def test_show_imports_nothing_that_it_does_not_need(tmp_path):
-    code = (
-        "import sys; from ctid_cli.cli.main import app\n"
-        f"try: app(['show', '', '--out', {str(tmp_path)!r}])\n"
-        "except SystemExit: pass\n"
-        "import ctid_cli.reporting.detail, ctid_cli.storage.export\n"
-        "slow = {'scipy', 'pandas', 'numba', 'joblib', 'rich'} & set(sys.modules)\n"
         "assert not slow, slow"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
@@ -155,12 +143,12 @@ def test_the_table_of_an_experiment(ctid, done):
 
 
 def test_an_unexpected_error_is_one_line_and_a_file(ctid, done, monkeypatch):
-    from ctid_cli.reporting import tables
+    from ctid_cli.reporting import study_table
 
     def broken(*_, **__):
         raise ZeroDivisionError("nobody expected this")
 
-    monkeypatch.setattr(tables, "build_tables", broken)
+    monkeypatch.setattr(study_table, "build_tables", broken)
     message = ctid("table", "tiny", "--out", done, code=1).stderr
     assert message.count("\n") == 1
     file = re.search(r"report it with (\S+)$", message.strip()).group(1)
@@ -172,12 +160,12 @@ def test_an_unexpected_error_is_one_line_and_a_file(ctid, done, monkeypatch):
 
 
 def test_ctrl_c_outside_a_run(ctid, done, monkeypatch):
-    from ctid_cli.reporting import tables
+    from ctid_cli.reporting import study_table
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tables, "build_tables", interrupted)
+    monkeypatch.setattr(study_table, "build_tables", interrupted)
     ctid("table", "tiny", "--out", done, code=130)
 
 

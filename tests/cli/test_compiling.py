@@ -15,7 +15,7 @@ from ctid_cli.cli._compiling import ANNOUNCEMENT, CompilationNotice
 from ctid_cli.cli.main import app
 
 #: Commands that show, move or describe files, and need not load Numba.
-STORED = {"status", "show", "export", "verify", "merge", "init", "study list", "study publish"}
+STORED = {"status", "export", "verify", "merge", "init"}
 
 
 class Clock:

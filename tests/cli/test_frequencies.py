@@ -99,27 +99,19 @@ def test_table_for_people(ctid, beat):
     assert markdown.count("\n|") == 2 + 8
 
 
-def test_show_lists_the_measures_with_units(ctid, beat, estimates):
+def test_an_estimate_has_its_measures_with_units(ctid, beat, estimates):
     row = next(row for row in estimates if row["estimator"] == "finite")
-    text = ctid("show", row["id"], "--out", beat).stdout
-    for part in ("VALID", "omega_1", "settling_after_step_2", "rad/s", "valid_share", "half_width", "--history"):
+    text = ctid("export", "--id", row["id"], "--out", beat).stdout
+    for part in ("VALID", "omega_1", "settling_after_step_2", "rad/s", "valid_share", "half_width"):
         assert part in text
     # The message of an estimate may speak of the delays of its estimator.
     assert not re.search(r"^delay\b", text, re.MULTILINE)
     for part in ("fit_percent", "condition number", "start none", "every iteration"):
         assert part not in text
     assert re.search(r"^omega_2 +" + re.escape(f"{row['measures']['omega_2']:.8g}"), text, re.MULTILINE)
-    content = json.loads(ctid("show", row["id"], "--json", "--out", beat).stdout)
+    content = json.loads(ctid("export", "--id", row["id"], "--json", "--out", beat).stdout)
     assert content["measures"] == row["measures"]
     assert content["data"]["signal"]["tones"][1]["frequency"] == 3.0
-
-
-@pytest.mark.parametrize("name", ["restarting", "whole"])
-def test_show_makes_an_estimate_again(ctid, beat, estimates, name):
-    row = next(row for row in estimates if row["estimator"] == name)
-    assert "the same frequencies to the last digit" in ctid("show", row["id"], "--history", "--out", beat).stdout
-    content = json.loads(ctid("show", row["id"], "--history", "--json", "--out", beat).stdout)
-    assert (content["difference"], content["history"]) == (0.0, [])
 
 
 def test_status_counts_kinds_of_estimates(ctid, beat):

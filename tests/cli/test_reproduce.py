@@ -97,7 +97,7 @@ def test_run_runs_every_specification(ctid, tmp_path, monkeypatch):
     assert [file.name for file in call["configs"]] == [
         config.partition("/")[2] for config in find_study("coverage").configs.values()
     ]
-    assert (call["runs"], call["jobs"], call["out"]) == (3, 1, tmp_path)
+    assert (call["runs"], call["jobs"], call["place"].out) == (3, 1, tmp_path)
 
 
 # First estimates -----------------------------------------------------------------------------------------

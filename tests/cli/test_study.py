@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from ctid_cli.reporting.comparison_result import check_tables
 from ctid_cli.reporting.study import load_study
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
@@ -50,7 +51,7 @@ def test_one_data_set_fills_its_cells(ctid, out, case, sampling, tables):
     text = ctid("table", *tables, "--out", out).stdout
     assert "other settings than the published ones" not in text
     # Neither the committed tables nor the paper are contradicted.
-    ctid("table", "--check", *tables, "--out", out)
+    assert check_tables(tables, out).mismatches.empty
     assert max(map(len, text.split("Estimates that failed")[0].splitlines())) <= 100
 
 
@@ -104,60 +105,6 @@ def test_a_method_without_a_start_stands_in_both_tables_with_the_same_numbers(ct
         assert max(map(len, text.split("Estimates that failed")[0].splitlines())) <= 100
 
 
-def test_the_same_tables_agree_and_others_do_not(ctid, profiled, tmp_path):
-    reference = tmp_path / "reference.csv"
-    reference.write_text(ctid("table", "1", "--format", "csv", "--out", profiled).stdout, encoding="utf-8")
-    check = ("table", "--check", "--reference", reference, "--out", profiled)
-    content = json.loads(ctid(*check, "1", "--format", "json").stdout)
-    assert (content["agrees"], content["compared"], content["identical"]) == (True, 2, 2)
-    # the start does not matter to the method without one: table 2 has its cell as well
-    content = json.loads(ctid(*check, "2", "--format", "json").stdout)
-    assert (content["compared"], content["not_in_reference"]) == (1, 1)
-    text = ctid(*check).stdout
-    assert text.startswith("No difference beyond sampling error in 2 comparisons: 2 cells with")
-
-    with reference.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    for row in rows:
-        if row["method"] == "delay_profile":
-            row |= {"n": 100, "converged": 100, "percent": 100.0}
-    with reference.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    done = ctid(*check, code=7)
-    assert "1 of 2 comparisons differs by more than sampling error explains" in done.stderr
-    (line,) = [line for line in done.stdout.splitlines() if "none" in line and "delay_profile" in line]
-    assert line.split()[:5] == ["1", "regular", "15", "dB", "none"]
-    assert line.split()[-5:-1] == ["0", "2", "100", "100"]
-    content = json.loads(ctid(*check, "--format", "json", code=7).stdout)
-    assert [cell["method"] for cell in content["cells"] if cell["mismatch"]] == ["delay_profile"]
-
-
-def test_a_check_without_anything_to_compare_says_what_to_do(ctid, profiled, tmp_path):
-    message = ctid("table", "--check", "3", "--out", profiled, code=2).stderr
-    assert "none of these cells was run" in message
-    assert "ctid run" in message
-    other = tmp_path / "other.csv"
-    header, first = ctid("table", "3", "--format", "csv", "--out", profiled).stdout.splitlines()[:2]
-    other.write_text(f"{header}\n{first}\n", encoding="utf-8")
-    message = ctid("table", "--check", "1", "--reference", other, "--out", profiled, code=2).stderr
-    assert f"{other} has none of their cells" in message
-    assert "--format csv >" in message
-    assert "--check" in ctid("table", "1", "--reference", other, "--out", profiled, code=2).stderr
-    assert (
-        "cannot be read" in ctid("table", "--check", "--reference", tmp_path / "no", "--out", profiled, code=2).stderr
-    )
-
-
-def test_any_experiment_can_be_checked_against_its_own_table(ctid, done, tmp_path):
-    reference = tmp_path / "tiny.csv"
-    reference.write_text(ctid("table", "tiny", "--format", "csv", "--out", done).stdout, encoding="utf-8")
-    text = ctid("table", "tiny", "--check", "--reference", reference, "--out", done).stdout
-    assert "6 cells with" in text
-    assert "6 of them with the same counts" in " ".join(text.split())
-
-
 def test_what_is_published_lists_every_failure(ctid, profiled):
     study = find_study("useful-redundancy")
     found = read_study(study, profiled)
@@ -171,7 +118,7 @@ def test_what_is_published_lists_every_failure(ctid, profiled):
         ("delay_profile", "15.0", "", "1"),
     ]
     for row in failures:
-        shown = json.loads(ctid("show", row["id"], "--json", "--out", profiled).stdout)
+        shown = json.loads(ctid("export", "--id", row["id"], "--json", "--out", profiled).stdout)
         assert (shown["delay"], shown["status"]) == (float(row["delay"]), row["status"])
         assert (shown["replicate"], shown["seed"]) == (int(row["replicate"]), int(row["seed"]))
 

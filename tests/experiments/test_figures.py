@@ -11,7 +11,6 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.filtering.filter_set import FilterSet, check_filters, extrema, ideal_cost
 from ctid_cli.reporting.figures.style import STRIPES, outline, ramp, spread
-from ctid_cli.studies import catalogue
 from ctid_cli.studies.catalogue import find_figures, find_study
 from experiments.useful_redundancy.search_plot import costs_svg, landscape, trajectory_svg
 
@@ -212,12 +211,6 @@ def test_settings_are_the_published_ones(case, poles, zeros, bandwidth, filters,
     assert 10 * np.log10(np.var(data_set.record.noise_free) / np.var(noise)) == pytest.approx(15.0, abs=0.5)
     quiet = useful_redundancy.published_search(case, False)[1]
     assert np.array_equal(quiet.record.y, data_set.record.noise_free)
-
-
-def test_without_specifications_the_message_says_so(monkeypatch, tmp_path):
-    monkeypatch.setattr(catalogue, "data_folder", lambda name: tmp_path)
-    with pytest.raises(UsageError, match=r"case1_regular\.yaml is not in an installed package; run"):
-        useful_redundancy.published_search(CASE_1, True)
 
 
 def test_names_of_figures():
