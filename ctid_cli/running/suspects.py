@@ -70,7 +70,7 @@ class Course:
         while not self._stopping() and not (self._exhausted and not self._again):
             self._vain += 1
             yield from self._round()
-            if self._vain >= PATIENCE and not self._exhausted:
+            if self._vain >= PATIENCE and (self._again or not self._exhausted):
                 self.hopeless = True
                 self.hindrance = self._reason or self._workers.trouble
                 return

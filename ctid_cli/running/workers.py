@@ -411,7 +411,8 @@ class LocalWorkers(Workers):
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
         if self._limits.wall_seconds is not None:
             for _, record, seconds in self._seconds():
-                if seconds > self._limits.wall_seconds * 1.5 + GRACE:
+                # What it imports before its first estimate counts for none.
+                if seconds > self._limits.wall_seconds * 1.5 + GRACE and _remains(record, "").begun:
                     _late(record).write_bytes(b"killed")
                     _kill(record)
 
