@@ -108,7 +108,13 @@ CALLABLES = dict(public_callables())
 def test_docstring_names_exactly_the_arguments(name):
     text = inspect.getdoc(CALLABLES[name]) or ""
     assert text, f"{name} has no docstring"
-    assert sorted(documented(text)) == sorted(expected(CALLABLES[name]))
+    if "options are those of :class:`" in text:
+        # Options that several estimators share are documented once, in their bases.
+        shared = {option for base in CALLABLES[name].__mro__ for option in documented(inspect.getdoc(base) or "")}
+        assert shared >= set(expected(CALLABLES[name]))
+        assert set(documented(text)) <= set(expected(CALLABLES[name]))
+    else:
+        assert sorted(documented(text)) == sorted(expected(CALLABLES[name]))
 
 
 def test_the_check_sees_what_is_missing_and_what_is_too_much():
@@ -140,6 +146,7 @@ def test_the_public_surface_is_small_and_shown():
 
 def test_internal_docstrings_do_not_repeat_signatures():
     sections = re.compile(r"^ *(Parameters|Returns|Yields|Raises|Attributes)\n *-{3,}", re.MULTILINE)
-    found = dict(internal_docstrings())
+    bases = {base.__qualname__ for member in CALLABLES.values() for base in getattr(member, "__mro__", ())}
+    found = {name: text for name, text in internal_docstrings() if name.rpartition(".")[2] not in bases}
     assert len(found) > 500
     assert [name for name, text in found.items() if sections.search(text)] == []

@@ -5,6 +5,7 @@ import csv
 import numpy as np
 import pytest
 
+from ctid_cli import DremFiniteTime, DremGradient
 from ctid_cli.reporting.study import data_folder
 from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import read_study
@@ -100,7 +101,7 @@ def one(rows, **wanted):
 def test_settling_times_are_those_of_a_direct_simulation(study):
     rows = list(measured.settling(study["two-tones"]))
     y = acceptance.signal("A", 0.01, 60.0)
-    for name, kind in (("finite_time", acceptance.DremFiniteTime), ("gradient", acceptance.DremGradient)):
+    for name, kind in (("finite_time", DremFiniteTime), ("gradient", DremGradient)):
         track = acceptance.drem(kind, "A").track(y, 0.01)
         row = one(rows, estimator=name)
         for band in measured.BANDS:
