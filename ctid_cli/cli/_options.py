@@ -40,10 +40,11 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapper(*values: Any, **given: Any) -> None:
-        for name in groups.keys() - given.keys():
-            group = groups[name]
-            known = {option.name for option in fields(group)} & given.keys()
-            given[name] = group(**{option: given.pop(option) for option in known})
+        for name, group in groups.items():
+            # Who calls a command from Python may give the whole group.
+            if not isinstance(given.get(name), group):
+                known = {option.name for option in fields(group)} & given.keys()
+                given[name] = group(**{option: given.pop(option) for option in known})
         command(*values, **given)
 
     as_options = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
