@@ -458,9 +458,7 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     """Return the scale of a loss other than squares, and the samples that count for little."""
     kind, times = weighting.kind, weighting.outlier_times(records, fit.used)
     scales = ", ".join(number(loss.scale, 3) for loss in weighting.losses)
-    text = (
-        f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error; "
-    )
+    text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error"
     total = sum(each.size for each in times)
     samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
     if not total:

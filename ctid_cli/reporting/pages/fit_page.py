@@ -27,6 +27,8 @@ from ctid_cli.reporting.pages.question import formula
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import count
 
+#: What stands in the place of warnings.
+FINE = "Nothing that was tested speaks against this model: the search ended well, and the residuals pass their tests."
 #: Digits of the coefficients in the equation.
 DIGITS = 5
 #: Frequencies at which a model is drawn.
@@ -35,16 +37,12 @@ POINTS = 500
 
 def fit_page(result: FitResult, content: Mapping[str, Any]) -> str:
     """Return the page as HTML, of a fit and what its file says."""
-    fitted, fine = (
-        result.fitted,
-        "Nothing that was tested speaks against this model: the search ended well, the residuals ",
-    )
-    model = fitted.fit.model
+    fitted, model = result.fitted, result.fitted.fit.model
     terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
     equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
     quality = Section("How good it is", frame=pairs(result.quality()))
     chapters = [
-        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [fine])]),
+        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [FINE])]),
         Chapter("Data", [result.data(), Section(frame=pairs(result.settings()))]),
         Chapter("Model", [Section(sentences=[equation]), result.parameters(), result.derived(), quality]),
         *_figures(fitted, result.records.measurements, result.records.validation, result.units),
