@@ -18,8 +18,9 @@ from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.fit_result import FitResult, derived_of, parameters_of
-from ctid_cli.reporting.identification_plot import identification_drawing
+from ctid_cli.reporting.fit_content import derived_of, parameters_of
+from ctid_cli.reporting.fit_plot import identification_drawing
+from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement

@@ -12,16 +12,16 @@ from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_fr
 from ctid_cli.reporting.citations import bibtex
 from ctid_cli.reporting.document import Section, pairs
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.fit_drawings import (
+from ctid_cli.reporting.fit_plot import MOST_DRAWN, Kind, identification_drawing
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.model_plot import (
     bode_drawing,
     delay_drawing,
     poles_drawing,
     step_drawing,
     validation_drawing,
 )
-from ctid_cli.reporting.fit_result import FitResult
-from ctid_cli.reporting.identification_plot import MOST_DRAWN, Kind, identification_drawing
-from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.pages.page import Chapter, citation, provenance, shown, write_page
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.signals.measurement import Measurement
@@ -87,10 +87,10 @@ def _figures(
 
     more = len(measurements) - MOST_DRAWN
     output = [part("overlay", "Measured and simulated.")]
-    judged = result.validation
-    if judged is not None and validation is not None:
-        caption = f"The same on {judged.name}, from which nothing was estimated but the initial state and the offset."
-        output.append(Section(drawing=validation_drawing(judged, validation, units), caption=caption))
+    outcome = result.validation
+    if outcome is not None and validation is not None:
+        caption = f"The same on {outcome.name}, from which nothing was estimated but the initial state and the offset."
+        output.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
     output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
     yield Chapter("Output", output)
     residuals = [part("residuals", "Residuals.")]
