@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -157,14 +157,11 @@ def _fraction(asked: Asked) -> Options:
     from ctid_cli.estimators.delay_profile import DelayProfile
 
     assert asked.model.poles is not None
-    treatment: dict[str, Any] = {
-        "initial_state": asked.treatment.initial_state,
-        "offset": asked.treatment.offset,
-        "loss": asked.treatment.loss,
-    }
     return DelayProfile(
         *(asked.model.poles, asked.model.zeros or 0, asked.delay),
-        **treatment,
+        initial_state=asked.treatment.initial_state,
+        offset=asked.treatment.offset,
+        loss=asked.treatment.loss,
         nested=True,
         fixed=_fixed(asked.model.fix),
         integrators=asked.model.integrators,

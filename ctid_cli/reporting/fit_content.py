@@ -48,7 +48,7 @@ def fit_content(fitted: Identification, records: Records) -> dict[str, Any]:
         "box": fit.box and _box_object(fit.box, fit.held_poles),
         "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
         "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
-        "modes": _modes(fitted, units),
+        "modes": _modes(fit, units),
         "warnings": fitted.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
         "derived": [picked(row, DERIVED_KEYS) for row in derived_of(fitted, units)],
@@ -140,28 +140,16 @@ def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
     }
 
 
-def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:
-    """Natural frequency and damping of every real pole and every pair."""
-    additive = additive_of(result.fit)
-    rows = {row.name: row.estimate for row in result.derived if additive is None}
-    modes: list[dict[str, float | None]] = []
-    for k in range(1, result.fit.model.order + 1):
-        if f"damping_{k}" in rows:
-            frequency, damping = rows[f"natural_frequency_{k}"], rows[f"damping_{k}"]
-        elif f"pole_{k}" in rows:
-            frequency, damping = abs(rows[f"pole_{k}"]), float(-np.sign(rows[f"pole_{k}"]))
-        else:
-            break
-        modes.append(_mode(frequency, damping, units))
-    if additive is not None:
-        poles = [pole for pole in additive.poles.tolist() if pole.imag >= 0]
-        return [_mode(abs(pole), -pole.real / abs(pole) if pole else None, units) for pole in poles]
-    return modes
-
-
-def _mode(frequency: float, damping: float | None, units: Units) -> dict[str, float | None]:
-    hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
-    return {"frequency_hz": hertz, "damping": damping}
+def _modes(fit: MeasuredFit, units: Units) -> list[dict[str, float | None]]:
+    """Natural frequency and damping of every real pole and every pair; an integrator has no damping."""
+    poles = [pole for pole in (additive_of(fit) or fit.model).poles.tolist() if pole.imag >= 0]
+    return [
+        {
+            "frequency_hz": None if units.seconds is None else abs(pole) / (2 * np.pi * units.seconds),
+            "damping": -pole.real / abs(pole) if pole else None,
+        }
+        for pole in poles
+    ]
 
 
 def _validation_object(outcome: Validation, validation: Measurement | None) -> dict[str, Any]:
