@@ -1,4 +1,4 @@
-"""From the options of ``ctid fit`` that say what the model is to the estimator of it."""
+"""Options of ``ctid fit`` and ``ctid order`` that say what the model is, and the estimator that they ask for."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -25,31 +25,50 @@ ModelForm = Literal["fraction", "additive"]
 
 
 @dataclass(frozen=True)
-class ModelOptions:
+class DelayOptions:
+    """Range of the delay, and poles at the origin."""
+
+    delay: Annotated[
+        str | None,
+        typer.Option(
+            "--delay",
+            metavar="LOW:HIGH|VALUE",
+            help="Range or value [time unit]; else 0, of an order search as ctid check says.",
+        ),
+    ] = None
+    integrators: Annotated[
+        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
+    ] = 0
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Range of the delay, a known one twice; None where it is not given."""
+        return None if self.delay is None else delay_bounds(self.delay)
+
+
+@dataclass(frozen=True)
+class StateOptions:
+    """Treatment of the initial state and of offsets."""
+
+    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest"
+    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none"
+
+
+@dataclass(frozen=True)
+class ModelOptions(DelayOptions):
     """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
     poles: Annotated[
         int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
     ] = None
     zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles.")] = None
-    delay: Annotated[
-        str | None, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; 0.")
-    ] = None
     model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction"
     terms: Annotated[
         str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
     ] = None
-    integrators: Annotated[
-        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
-    ] = 0
     fix: Annotated[
         list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
     ] = None
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """Range of the delay, a known one twice; None where it is not given."""
-        return None if self.delay is None else delay_bounds(self.delay)
 
     @property
     def open(self) -> bool:
@@ -100,11 +119,9 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class TreatmentOptions:
+class TreatmentOptions(StateOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
-    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest"
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none"
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares"
     hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto"
 
@@ -140,14 +157,11 @@ def _fraction(asked: Asked) -> Options:
     from ctid_cli.estimators.delay_profile import DelayProfile
 
     assert asked.model.poles is not None
-    treatment: dict[str, Any] = {
-        "initial_state": asked.treatment.initial_state,
-        "offset": asked.treatment.offset,
-        "loss": asked.treatment.loss,
-    }
     return DelayProfile(
         *(asked.model.poles, asked.model.zeros or 0, asked.delay),
-        **treatment,
+        initial_state=asked.treatment.initial_state,
+        offset=asked.treatment.offset,
+        loss=asked.treatment.loss,
         nested=True,
         fixed=_fixed(asked.model.fix),
         integrators=asked.model.integrators,

@@ -16,7 +16,7 @@ from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, outline, plain
-from ctid_cli.reporting.identification_plot import curve
+from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.table import split_header

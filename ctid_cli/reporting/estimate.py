@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.inference.intervals import NORMAL, UncertainValue
-from ctid_cli.reporting.layout import Table, number
 from ctid_cli.signals.sampled_signal import SECONDS
 
 if TYPE_CHECKING:
@@ -135,17 +134,6 @@ def parameter_frame(found: Iterable[UncertainValue]) -> pd.DataFrame:
     names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
     titles = ["parameter", *PARAMETER_FORMATS, "unit", "status"]
     return pd.DataFrame([[getattr(item, name) for name in names] for item in found], columns=titles)
-
-
-def parameter_table(found: Iterable[UncertainValue]) -> Table:
-    """Parameters as a table."""
-    header = ["parameter", "estimate", "standard error", "relative %", "95 % low", "95 % high", "unit", "status"]
-    digits = {"estimate": 6, "standard_error": 3, "relative_percent": 2, "low": 5, "high": 5}
-    rows = [
-        [item.name, *(number(getattr(item, name), size) for name, size in digits.items()), item.unit, item.status]
-        for item in found
-    ]
-    return Table(header, rows, "lrrrrrll")
 
 
 def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,30 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ctid_cli.canonical import plain
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.intervals import BIASED, UncertainValue
+from ctid_cli.inference.intervals import BIASED
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.document import Result, Section, pairs
 from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_frame, parameter_object
 from ctid_cli.reporting.figures.style import Drawing
-from ctid_cli.reporting.identification_plot import identification_drawing
-from ctid_cli.reporting.layout import number, picked
+from ctid_cli.reporting.fit_content import additive_of, derived_of, fit_content, parameters_of
+from ctid_cli.reporting.fit_plot import identification_drawing
+from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
 from ctid_cli.signals.measurement import Measurement
@@ -38,9 +37,6 @@ from ctid_cli.written_files import write_file
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
 R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
-
-DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
-TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
 #: The input between its samples.
 HOLDS: dict[Hold, str] = {
@@ -178,107 +174,9 @@ class FitResult(Result):
         measurements, validation = self.records.measurements, self.records.validation
         return fit_text(self.fitted, self.content(), measurements, validation, folder, command)
 
-    # --- JSON --------------------------------------------------------------------------------------
-
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
-        fit, options, criteria = self.fitted.fit, self.fitted.options, self.fitted.criteria
-        profile, validation, additive = fit.profile, self.fitted.validation, additive_of(fit)
-        measurements, units = self.records.measurements, self.units
-        numerator = [item.estimate for item in self.fitted.estimates if item.name.startswith("b")]
-        content = {
-            "model": {
-                "numerator": numerator or fit.model.numerator,
-                "denominator": fit.model.denominator,
-                "delay": fit.model.delay,
-                **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
-            },
-            "parameters": [parameter_object(item) for item in parameters_of(self.fitted, units)],
-            **picked(fit, ("fit_percent", "r2", "cost")),
-            "loss": _loss_object(fit, self.records.data),
-            "status": fit.status.name,
-            "message": fit.status.value,
-            "starts": fit.starts and fit.starts._asdict(),
-            "poles_at_infinity": fit.poles_at_infinity,
-            "box": fit.box and _box_object(fit.box, fit.held_poles),
-            "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
-            "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
-            "modes": _modes(self.fitted, units),
-            "warnings": self.fitted.warnings,
-            "notes": [note for measurement in measurements for note in measurement.notes],
-            "derived": [picked(row, DERIVED_KEYS) for row in derived_of(self.fitted, units)],
-            "answer": picked(self.fitted.answer, ("seen", "p_value", "explained", "by_chance")),
-            "covariance": _covariance_object(self.fitted),
-            "delay_interval": "profile likelihood" if self.fitted.delay_interval is not None else "quadratic",
-            "criteria": {
-                **picked(criteria, ("aic", "aicc", "bic", "fpe")),
-                "yic": self.fitted.yic,
-                "r_t_squared": self.fitted.r_t_squared,
-                "samples": criteria.count,
-                "parameters": criteria.parameters,
-            },
-            "condition_number": fit.condition_number,
-            "iterations": fit.iterations,
-            "residual_tests": [picked(test, TEST_KEYS) for test in self.fitted.tests],
-            "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
-            "validation": validation and _validation_object(validation, self.records.validation),
-            "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
-            "units": asdict(units),
-            "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
-        }
-        return dict(plain(content))
-
-
-def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
-    """Parameters with the units of the records."""
-    additive = additive_of(result.fit)
-    if additive is not None:
-        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
-    poles, zeros = result.fit.model.order, result.options.zeros
-    return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
-
-
-def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
-    """The submodels of a fit, None of a fit of one transfer function."""
-    return fit.additive if isinstance(fit, SubmodelsFit) else None
-
-
-def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
-    """Unit of a parameter of a sum, or of a coefficient of its free response."""
-    if name.startswith("g"):
-        return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
-    if name == "delay":
-        return units.time
-    # c_k p^k/(p^l A) on an impulse.
-    power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
-    times = units.time if power == 1 else f"{units.time}^{power}"
-    return units.output if power == 0 else f"{units.output}*{times}"
-
-
-def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
-    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
-    names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
-    found = []
-    for row in result.derived:
-        if row.unit != "Hz":
-            found.append(replace(row, unit=names.get(row.unit, row.unit)))
-        elif (seconds := units.seconds) is not None:
-            scaled = {name: getattr(row, name) / seconds for name in ("estimate", "standard_error", "low", "high")}
-            found.append(replace(row, **scaled))
-    return found
-
-
-def _covariance_object(result: Identification) -> dict[str, Any]:
-    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
-    return {
-        "kind": uncertainty.kind,
-        "names": result.fit.parameter_names,
-        "values": uncertainty.covariance,
-        "effective_samples": uncertainty.effective_count,
-        "degrees_of_freedom": uncertainty.degrees_of_freedom if uncertainty.kind in ("white", "robust") else None,
-        "reason": BIASED if uncertainty.kind == "biased" else None,
-        "bootstrap_draws": 0 if draws is None else len(draws.errors),
-    }
+        return fit_content(self.fitted, self.records)
 
 
 def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
@@ -321,20 +219,6 @@ def _iteration(
         yield "loop", f"{text}; instruments from the noise-free loop"
     if isinstance(result.fit, SubmodelsFit):
         yield "start", result.fit.start_method
-
-
-def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
-    """Return the set of models in which the estimate is the best, null for no bound, and the bounds that poles met."""
-    return {
-        "poles": (box.slowest, box.fastest),
-        "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
-        "damping": box.least_damping,
-        "delay": box.delays,
-        "met": [
-            {"limit": name, "what": limit.what, "value": value, "meaning": limit.meaning, "reason": limit.reason}
-            for name, limit, value in box.limits_met(held)
-        ],
-    }
 
 
 def _box_text(box: Box, units: Units) -> str:
@@ -394,73 +278,11 @@ def _form(fit: MeasuredFit) -> str:
     return "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
 
 
-def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:
-    """Natural frequency and damping of every real pole and every pair."""
-    additive = additive_of(result.fit)
-    rows = {row.name: row.estimate for row in result.derived if additive is None}
-    modes: list[dict[str, float | None]] = []
-    for k in range(1, result.fit.model.order + 1):
-        if f"damping_{k}" in rows:
-            frequency, damping = rows[f"natural_frequency_{k}"], rows[f"damping_{k}"]
-        elif f"pole_{k}" in rows:
-            frequency, damping = abs(rows[f"pole_{k}"]), float(-np.sign(rows[f"pole_{k}"]))
-        else:
-            break
-        modes.append(_mode(frequency, damping, units))
-    if additive is not None:
-        poles = [pole for pole in additive.poles.tolist() if pole.imag >= 0]
-        return [_mode(abs(pole), -pole.real / abs(pole) if pole else None, units) for pole in poles]
-    return modes
-
-
-def _mode(frequency: float, damping: float | None, units: Units) -> dict[str, float | None]:
-    hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
-    return {"frequency_hz": hertz, "damping": damping}
-
-
-def _validation_object(judged: Validation, validation: Measurement | None) -> dict[str, Any]:
-    return {
-        "file": judged.name,
-        **picked(judged, ("fit_percent", "r2")),
-        "samples": judged.count,
-        "initial_state": judged.applied.initial_states[0],
-        "offset": judged.applied.offsets[0],
-        "notes": () if validation is None else validation.notes,
-    }
-
-
-def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
-    record = measurement.record
-    return {
-        "file": record.name,
-        "samples": record.n_samples,
-        "used": int(np.count_nonzero(use)),
-        "start": float(record.t[0]),
-        "stop": float(record.t[-1]),
-        "regular": record.interval is not None,
-        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
-    }
-
-
-def _loss_object(fit: MeasuredFit, records: Sequence[Record]) -> dict[str, Any]:
-    """The loss for JSON."""
-    if fit.weighting is None:
-        return {"kind": "squares", "scales": None, "outliers": [[] for _ in records], "fit_percent": None}
-    return {
-        "kind": fit.weighting.kind,
-        "scales": [loss.scale for loss in fit.weighting.losses],
-        "outliers": fit.weighting.outlier_times(records, fit.used),
-        "fit_percent": fit.weighting.fit_percent(records, fit.used, fit.residuals),
-    }
-
-
 def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:
     """Return the scale of a loss other than squares, and the samples that count for little."""
     kind, times = weighting.kind, weighting.outlier_times(records, fit.used)
     scales = ", ".join(number(loss.scale, 3) for loss in weighting.losses)
-    text = (
-        f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error; "
-    )
+    text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error"
     total = sum(each.size for each in times)
     samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
     if not total:

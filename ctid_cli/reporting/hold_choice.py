@@ -7,10 +7,10 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.hold_comparison import MOST, best_other_hold
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.inference.signal_features import input_moves
-from ctid_cli.reporting.layout import count
 from ctid_cli.reporting.order_proposal import proposed_delay
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import Hold, InitialState, Offset
+from ctid_cli.text import count
 
 #: What the holds are compared with where the number of poles is not given either.
 POLES, ZEROS = 2, 1

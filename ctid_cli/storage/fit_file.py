@@ -155,7 +155,7 @@ class StoredFit:
 def load_fit(
     path: AnyPath, record: AnyPath | Sequence[AnyPath] | None = None, validation: AnyPath | None = None
 ) -> Identification:
-    """Read a fit that ``ctid fit`` or :func:`~ctid_cli.reporting.saved_fit.save_fit` wrote.
+    """Read a fit that ``ctid fit`` or :func:`~ctid_cli.reporting.fit_result.save_fit` wrote.
 
     Parameters
     ----------

@@ -58,6 +58,8 @@ def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
     for title in [*titles, "How to cite"]:
         assert title in page.text
     assert page.tags["svg"] == 8
+    assert not fitted[0].warnings
+    assert "the search ended well, and the residuals pass their tests." in page.text
     for words in ("natural_frequency_1", "95 % low", "without a model", "cost above the least", "@software{ctid"):
         assert words in page.text or words in text
     assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0

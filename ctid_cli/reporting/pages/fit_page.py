@@ -12,21 +12,23 @@ from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_fr
 from ctid_cli.reporting.citations import bibtex
 from ctid_cli.reporting.document import Section, pairs
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.fit_drawings import (
+from ctid_cli.reporting.fit_plot import MOST_DRAWN, Kind, identification_drawing
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.model_plot import (
     bode_drawing,
     delay_drawing,
     poles_drawing,
     step_drawing,
     validation_drawing,
 )
-from ctid_cli.reporting.fit_result import FitResult
-from ctid_cli.reporting.identification_plot import MOST_DRAWN, Kind, identification_drawing
-from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.pages.page import Chapter, citation, provenance, shown, write_page
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import count
 
+#: What stands in the place of warnings.
+FINE = "Nothing that was tested speaks against this model: the search ended well, and the residuals pass their tests."
 #: Digits of the coefficients in the equation.
 DIGITS = 5
 #: Frequencies at which a model is drawn.
@@ -35,16 +37,12 @@ POINTS = 500
 
 def fit_page(result: FitResult, content: Mapping[str, Any]) -> str:
     """Return the page as HTML, of a fit and what its file says."""
-    fitted, fine = (
-        result.fitted,
-        "Nothing that was tested speaks against this model: the search ended well, the residuals ",
-    )
-    model = fitted.fit.model
+    fitted, model = result.fitted, result.fitted.fit.model
     terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
     equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
     quality = Section("How good it is", frame=pairs(result.quality()))
     chapters = [
-        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [fine])]),
+        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [FINE])]),
         Chapter("Data", [result.data(), Section(frame=pairs(result.settings()))]),
         Chapter("Model", [Section(sentences=[equation]), result.parameters(), result.derived(), quality]),
         *_figures(fitted, result.records.measurements, result.records.validation, result.units),
@@ -89,10 +87,10 @@ def _figures(
 
     more = len(measurements) - MOST_DRAWN
     output = [part("overlay", "Measured and simulated.")]
-    judged = result.validation
-    if judged is not None and validation is not None:
-        caption = f"The same on {judged.name}, from which nothing was estimated but the initial state and the offset."
-        output.append(Section(drawing=validation_drawing(judged, validation, units), caption=caption))
+    outcome = result.validation
+    if outcome is not None and validation is not None:
+        caption = f"The same on {outcome.name}, from which nothing was estimated but the initial state and the offset."
+        output.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
     output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
     yield Chapter("Output", output)
     residuals = [part("residuals", "Residuals.")]

@@ -12,8 +12,8 @@ from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, plain
+from ctid_cli.reporting.fit_plot import draw_overlay, draw_profile
 from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes
-from ctid_cli.reporting.identification_plot import draw_overlay, draw_profile
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -25,12 +25,12 @@ AROUND = np.linspace(0.0, 2 * np.pi, 121)
 WIDEST_GAIN, WIDEST_PHASE = 40.0, 180.0
 
 
-def validation_drawing(judged: Validation, measurement: Measurement, units: Units) -> Drawing:
-    """Measured and simulated output of the record that the model was judged on."""
+def validation_drawing(outcome: Validation, measurement: Measurement, units: Units) -> Drawing:
+    """Measured and simulated output of the record that the model was validated on."""
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        draw_overlay(axes, measurement, judged.applied.used[0], judged.applied.residuals[0], units)
+        draw_overlay(axes, measurement, outcome.applied.used[0], outcome.applied.residuals[0], units)
         axes.margins(x=0.0)
         axes.set_xlabel(plain(measurement.label("time", units.time)))
 

@@ -1,0 +1,188 @@
+"""The numbers of a fit in the units of its records, and all of them as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.canonical import plain
+from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.estimators.measured_submodels import SubmodelsFit
+from ctid_cli.inference.intervals import BIASED, UncertainValue
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.reporting.estimate import Units, parameter_object
+from ctid_cli.reporting.layout import picked
+from ctid_cli.reporting.records import Records
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.record import Record
+
+DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
+TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
+
+
+def fit_content(fitted: Identification, records: Records) -> dict[str, Any]:
+    """Return the fit for ``fit.json`` and ``ctid fit --json``."""
+    fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
+    profile, validation, additive = fit.profile, fitted.validation, additive_of(fit)
+    measurements, units = records.measurements, records.units
+    numerator = [item.estimate for item in fitted.estimates if item.name.startswith("b")]
+    content = {
+        "model": {
+            "numerator": numerator or fit.model.numerator,
+            "denominator": fit.model.denominator,
+            "delay": fit.model.delay,
+            **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
+        },
+        "parameters": [parameter_object(item) for item in parameters_of(fitted, units)],
+        **picked(fit, ("fit_percent", "r2", "cost")),
+        "loss": _loss_object(fit, records.data),
+        "status": fit.status.name,
+        "message": fit.status.value,
+        "starts": fit.starts and fit.starts._asdict(),
+        "poles_at_infinity": fit.poles_at_infinity,
+        "box": fit.box and _box_object(fit.box, fit.held_poles),
+        "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
+        "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
+        "modes": _modes(fit, units),
+        "warnings": fitted.warnings,
+        "notes": [note for measurement in measurements for note in measurement.notes],
+        "derived": [picked(row, DERIVED_KEYS) for row in derived_of(fitted, units)],
+        "answer": picked(fitted.answer, ("seen", "p_value", "explained", "by_chance")),
+        "covariance": _covariance_object(fitted),
+        "delay_interval": "profile likelihood" if fitted.delay_interval is not None else "quadratic",
+        "criteria": {
+            **picked(criteria, ("aic", "aicc", "bic", "fpe")),
+            "yic": fitted.yic,
+            "r_t_squared": fitted.r_t_squared,
+            "samples": criteria.count,
+            "parameters": criteria.parameters,
+        },
+        "condition_number": fit.condition_number,
+        "iterations": fit.iterations,
+        "residual_tests": [picked(test, TEST_KEYS) for test in fitted.tests],
+        "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
+        "validation": validation and _validation_object(validation, records.validation),
+        "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
+        "units": asdict(units),
+        "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
+    }
+    return dict(plain(content))
+
+
+def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
+    """Parameters with the units of the records."""
+    additive = additive_of(result.fit)
+    if additive is not None:
+        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
+    poles, zeros = result.fit.model.order, result.options.zeros
+    return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
+
+
+def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
+    """The submodels of a fit, None of a fit of one transfer function."""
+    return fit.additive if isinstance(fit, SubmodelsFit) else None
+
+
+def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
+    """Unit of a parameter of a sum, or of a coefficient of its free response."""
+    if name.startswith("g"):
+        return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
+    if name == "delay":
+        return units.time
+    # c_k p^k/(p^l A) on an impulse.
+    power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
+    times = units.time if power == 1 else f"{units.time}^{power}"
+    return units.output if power == 0 else f"{units.output}*{times}"
+
+
+def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
+    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
+    names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
+    found = []
+    for row in result.derived:
+        if row.unit != "Hz":
+            found.append(replace(row, unit=names.get(row.unit, row.unit)))
+        elif (seconds := units.seconds) is not None:
+            scaled = {name: getattr(row, name) / seconds for name in ("estimate", "standard_error", "low", "high")}
+            found.append(replace(row, **scaled))
+    return found
+
+
+def _covariance_object(result: Identification) -> dict[str, Any]:
+    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
+    return {
+        "kind": uncertainty.kind,
+        "names": result.fit.parameter_names,
+        "values": uncertainty.covariance,
+        "effective_samples": uncertainty.effective_count,
+        "degrees_of_freedom": uncertainty.degrees_of_freedom if uncertainty.kind in ("white", "robust") else None,
+        "reason": BIASED if uncertainty.kind == "biased" else None,
+        "bootstrap_draws": 0 if draws is None else len(draws.errors),
+    }
+
+
+def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
+    """Return the set of models in which the estimate is the best, null for no bound, and the bounds that poles met."""
+    return {
+        "poles": (box.slowest, box.fastest),
+        "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
+        "damping": box.least_damping,
+        "delay": box.delays,
+        "met": [
+            {"limit": name, "what": limit.what, "value": value, "meaning": limit.meaning, "reason": limit.reason}
+            for name, limit, value in box.limits_met(held)
+        ],
+    }
+
+
+def _modes(fit: MeasuredFit, units: Units) -> list[dict[str, float | None]]:
+    """Natural frequency and damping of every real pole and every pair; an integrator has no damping."""
+    poles = [pole for pole in (additive_of(fit) or fit.model).poles.tolist() if pole.imag >= 0]
+    return [
+        {
+            "frequency_hz": None if units.seconds is None else abs(pole) / (2 * np.pi * units.seconds),
+            "damping": -pole.real / abs(pole) if pole else None,
+        }
+        for pole in poles
+    ]
+
+
+def _validation_object(outcome: Validation, validation: Measurement | None) -> dict[str, Any]:
+    return {
+        "file": outcome.name,
+        **picked(outcome, ("fit_percent", "r2")),
+        "samples": outcome.count,
+        "initial_state": outcome.applied.initial_states[0],
+        "offset": outcome.applied.offsets[0],
+        "notes": () if validation is None else validation.notes,
+    }
+
+
+def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
+    record = measurement.record
+    return {
+        "file": record.name,
+        "samples": record.n_samples,
+        "used": int(np.count_nonzero(use)),
+        "start": float(record.t[0]),
+        "stop": float(record.t[-1]),
+        "regular": record.interval is not None,
+        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+    }
+
+
+def _loss_object(fit: MeasuredFit, records: Sequence[Record]) -> dict[str, Any]:
+    """The loss for JSON."""
+    if fit.weighting is None:
+        return {"kind": "squares", "scales": None, "outliers": [[] for _ in records], "fit_percent": None}
+    return {
+        "kind": fit.weighting.kind,
+        "scales": [loss.scale for loss in fit.weighting.losses],
+        "outliers": fit.weighting.outlier_times(records, fit.used),
+        "fit_percent": fit.weighting.fit_percent(records, fit.used, fit.residuals),
+    }
