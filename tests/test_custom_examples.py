@@ -88,14 +88,14 @@ def test_one_estimate_is_computed_once_more_with_permission_only(out):
     assert "the same parameters to the last digit" in again
 
 
-@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("check", "accuracy")])
+@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("accuracy")])
 def test_permission(command, tmp_path, monkeypatch):
     file = EXAMPLES / "custom_study.yaml"
     place = () if command[0] != "run" else ("--out", tmp_path)
     message = ctid(*command, file, *place, code=3).stderr
     assert re.search(r"custom_study.yaml:6:21: noise.kind: names code, which would be run; .*--allow-code", message)
     answer = ctid(*command, file, *place, env={"CTID_ALLOW_CODE": "1"}).stdout
-    assert "no theory: there is no theory here" in answer if command[0] == "check" else "custom-study: " in answer
+    assert "no theory: there is no theory here" in answer if command[0] == "accuracy" else "custom-study: " in answer
     assert list(tmp_path.iterdir()) == []
 
 

@@ -26,9 +26,7 @@ class SignalOptions:
 
     time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None
-    interval: Annotated[
-        float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")
-    ] = None
+    interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None
     rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None
     start: Annotated[
         float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")

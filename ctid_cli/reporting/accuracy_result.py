@@ -83,7 +83,9 @@ class AccuracyResult(Result):
         paragraphs = [*reasons, *(_formula(formula, members) for formula, members in formulas.items())]
         if self.left_out:
             more = count(self.left_out, "further combination")
-            paragraphs.append(f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value.")
+            paragraphs.append(
+                f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value."
+            )
         return [
             Section("", [head]),
             *_tables(known),

@@ -21,7 +21,9 @@ ROWS = 12
 FORMATS = {
     **dict.fromkeys(("fit %", "by blocks %", "validation %"), ".2f"),
     **dict.fromkeys(("BIC", "AICc"), "+.1f"),
-    **{"FPE": ".5g", "YIC": ".4g", "condition": ".1e"},
+    "FPE": ".5g",
+    "YIC": ".4g",
+    "condition": ".1e",
 }
 
 
@@ -111,7 +113,8 @@ class OrderSearchResult(Result):
             **picked(each, ("cross_validated_percent", "validation_percent")),
             **picked(criteria, ("aicc", "bic")),
             "bic_above_least": criteria.bic - self.found.best.criteria.bic,
-            **{"fpe": criteria.fpe, "yic": each.yic},
+            "fpe": criteria.fpe,
+            "yic": each.yic,
             "white": each.white if each.tests else None,
             "independent": each.independent if each.tests else None,
             "condition_number": fit.condition_number,

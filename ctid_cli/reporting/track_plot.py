@@ -83,7 +83,7 @@ def _draw_frequencies(axes: Any, track: Track, t: Array, tones: list[int], colou
         room = max(MARGIN * (high - low), 1e-4 * high, 1e-12)
         axes.set_ylim(low - room, high + room)
     axes.ticklabel_format(axis="y", useOffset=False)
-    _shade(axes, t, ~valid[:, tones].any(axis=1))
+    _shade(axes, t, np.all(~valid[:, tones], axis=1))
 
 
 def _draw_amplitudes(axes: Any, track: Track, t: Array, colours: list[Any]) -> None:
@@ -99,7 +99,7 @@ def _draw_amplitudes(axes: Any, track: Track, t: Array, colours: list[Any]) -> N
         axes.set_ylim(0.0, 1.1 * float(seen.max()))
     if len(colours) > 1:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7)
-    _shade(axes, t, ~track.valid.any(axis=1))
+    _shade(axes, t, np.all(~track.valid, axis=1))
 
 
 def _draw_valid(
@@ -116,7 +116,7 @@ def _draw_valid(
     axes.plot(t, values, markevery=np.flatnonzero(lonely).tolist(), **style)
 
 
-def _shade(axes: Any, t: Array, grey: BoolArray) -> None:
+def _shade(axes: Any, t: Array, grey: Any) -> None:
     """Draw grey bands where nothing that is drawn is valid."""
     if t.size < 2:
         return
@@ -154,7 +154,7 @@ def signal_drawing(signal: SampledSignal, track: Track) -> Drawing:
 
 
 def _spectrogram(signal: SampledSignal, track: Track, top: float) -> tuple[Array, float, float]:
-    """Return levels [dB] over frequency, from 0 to `top` [Hz], and time, with the instants where that begins and ends."""
+    """Return levels [dB] over frequency, from 0 to `top` [Hz], and time, with the first and the last instant [s]."""
     from scipy.signal import spectrogram
 
     values = np.nan_to_num(without_spikes(signal.samples))

@@ -70,7 +70,13 @@ class TrackResult(Result):
             }
             for tone in summarise(track)
         ]
-        formats = {"spread [Hz]": ".2g", f"amplitude{unit}": ".4g", "from [s]": ".5g", "to [s]": ".5g", "valid %": ".4g"}
+        formats = {
+            "spread [Hz]": ".2g",
+            f"amplitude{unit}": ".4g",
+            "from [s]": ".5g",
+            "to [s]": ".5g",
+            "valid %": ".4g",
+        }
         counted = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
         note = f"Medians over the valid ones of {counted}; the spread is half the width of the central 68 %: how far a "
         note += "tone moves. A standard error (±) is that of the mean frequency."

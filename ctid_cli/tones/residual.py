@@ -24,11 +24,11 @@ class LeftOver(NamedTuple):
     unknown: BoolArray
     #: Samples in a segment of the spectra.
     size: int
+    #: Sampling interval [s].
+    interval: float
     #: Amplitude of a steady tone that would stand so high, medians over segments [signal unit].
     signal_spectrum: Array
     residual_spectrum: Array
-    #: Sampling interval [s].
-    interval: float
 
     @property
     def hertz(self) -> Array:
@@ -66,7 +66,7 @@ def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
         begins = begins[[unknown[k : k + size].mean() <= c.UNKNOWN for k in begins]]
         if begins.size:
             spectra = (median_spectrum(np.where(unknown, 0.0, each), begins, size) for each in (centred, left))
-            return LeftOver(centred, left, unknown, size, *spectra, interval)
+            return LeftOver(centred, left, unknown, size, interval, *spectra)
         size //= 2
     return None
 

@@ -201,7 +201,6 @@ def test_usage(ctid, arguments, tmp_path, monkeypatch):
         ("run", "x.yaml", "--jobs", "2", "-j", "3"),
         ("table", "--format", "md", "--format=md"),
         ("check", "x.csv", "--time", "a", "--time", "b"),
-        ("check", "filters", "--bandwidth", "1", "--largest-error", "2", "--bandwidth", "1"),
     ],
 )
 def test_an_option_that_would_keep_its_last_value_only(ctid, arguments):

@@ -119,7 +119,7 @@ def test_only_a_linear_controller_has_closed_loop_instruments_and_theory(ctid, t
     file = tmp_path / "spec.yaml"
     sections = {"loop": {"controller": RELAY}, "excitation": None, "noise": {"kind": "white", "variance": 0.01}}
     file.write_text(json.dumps(specification("one", **sections)))
-    assert "theory is given here for linear controllers" in " ".join(ctid("check", "accuracy", file).stdout.split())
+    assert "theory is given here for linear controllers" in " ".join(ctid("accuracy", file).stdout.split())
     closed = {"known": {"kind": "srivc", "poles": 1, "zeros": 0, "delay": 0.35, "instruments": "closed_loop"}}
     file.write_text(json.dumps(specification("one", **sections, estimators=closed)))
     said = ctid("validate", file, code=2).stderr

@@ -30,7 +30,7 @@ def record(tmp_path):
 def test_table_track_and_figure(ctid, record, tmp_path):
     out = tmp_path / "new"
     text = ctid("track", record, "--tones", 2, "--out", out).stdout
-    for part in ("record.csv: 3000 samples", "frequency [Hz]", "std. error", "Windows of", "track.svg"):
+    for part in ("record.csv: 3000 samples", "frequency [Hz]", "±", "Windows of", "track.svg"):
         assert part in text
     frame = pd.read_csv(out / "track.csv")
     valid = frame[frame["valid_1"] == 1]
@@ -42,7 +42,7 @@ def test_table_track_and_figure(ctid, record, tmp_path):
 
 def test_json_and_hdf5(ctid, record, tmp_path):
     out = tmp_path / "new"
-    options = ("--tones", 2, "--every", 0.05, "--json", "--format", "h5")
+    options = ("--tones", 2, "--every", 0.05, "--json", "--hdf5")
     options = (*options, "--out", out)
     done = ctid("track", record, *options)
     content = json.loads(done.stdout)

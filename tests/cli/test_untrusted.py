@@ -28,7 +28,7 @@ ROWS = "".join(f"{0.1 * k:.1f},{(-1) ** (k // 3)},{k % 5}\n" for k in range(40))
 
 #: Exit codes of the documentation but that of internal errors.
 CODES = (0, 2, 3, 4, 5, 6, 7)
-COMMANDS = ("check", "check filters", "fit", "track", "status", "table", "show", "export", "validate", "run --dry-run")
+COMMANDS = ("check", "fit", "track", "status", "table", "show", "export", "validate", "run --dry-run")
 WITH_OUT = ("status", "table", "show", "export")
 
 

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.reporting.pages.track_page import track_page
-from ctid_cli.reporting.track_report import track_object
-from ctid_cli.reporting.track_residual import spectra_of
+from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.residual import left_over
 from ctid_cli.tones.track import MissingLine, Track
 from tests.reporting.parsed_page import Page
 
@@ -38,7 +39,7 @@ def track(**known):
 
 
 def page_of(followed, name=HOSTILE):
-    content = track_object(signal(name), replace(followed, reasons=(f"A reason, {name}.",)))
+    content = plain(TrackResult(replace(followed, reasons=(f"A reason, {name}.",)), signal(name)).content())
     source = SOURCE | {"columns": {"time": None, "signal": name}}
     content |= {"ctid": "1", "command": "ctid track /far/away.csv", "checksum": "x", "record": source}
     return track_page(followed, signal(name), content)
@@ -62,7 +63,7 @@ def test_a_page_says_all_and_needs_nothing_but_itself():
     for words in (
         "19 Hz (amplitude 0.1",
         "--tones 2",
-        "std. error",
+        "standard error",
         "line that is missing",
         "@article{rife1976",
         "17.2 %",
@@ -80,10 +81,11 @@ def test_a_record_without_tones_and_one_of_unknown_phases_have_pages_too():
 
 
 def test_what_is_left_is_the_line_that_is_missing():
-    spectra = spectra_of(signal(), track())
-    peak = spectra.hertz[np.argmax(spectra.residual)]
+    record = signal()
+    spectra = left_over(record.samples, record.interval, track())
+    peak = spectra.hertz[np.argmax(spectra.residual_spectrum)]
     assert peak == pytest.approx(19.0, abs=0.2)
-    assert spectra.residual.max() == pytest.approx(0.1, rel=0.02)
-    assert spectra.signal.max() == pytest.approx(2.0, rel=0.02)
-    assert spectra.residual_rms == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.01), rel=0.03)
-    assert spectra.known > 0.95
+    assert spectra.residual_spectrum.max() == pytest.approx(0.1, rel=0.02)
+    assert spectra.signal_spectrum.max() == pytest.approx(2.0, rel=0.02)
+    assert spectra.root_mean_squares[1] == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.01), rel=0.03)
+    assert spectra.unknown.mean() < 0.05

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from ctid_cli.canonical import content_hash
+from ctid_cli.canonical import content_hash, plain
 from ctid_cli.errors import DataError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.reporting.track_report import track_object
+from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.storage.track_file import Reading, read_track, track_file_text
 from ctid_cli.tones.track import MissingLine, Track
 
@@ -32,7 +32,7 @@ def written(tmp_path):
     lines = ["t [ms],y,z", *(f"{k},{np.sin(k):.6f},1" for k in range(100))]
     record.write_text("\n".join(lines) + "\n", encoding="utf-8")
     reading = Reading(None, "y", None, 10.0, 80.0)
-    content = track_object(reading.read(record), track(), 0.5)
+    content = plain(TrackResult(track(), reading.read(record), 0.5).content())
     file = tmp_path / "track.json"
     file.write_text(track_file_text(track(), content, record, reading, tmp_path, "ctid track"), encoding="utf-8")
     return file, record

@@ -1,4 +1,4 @@
-"""``ctid check accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
+"""``ctid accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
 
 import json
 import re
@@ -69,7 +69,7 @@ def accuracy(ctid, tmp_path):
     def call(content, *arguments, text=False):
         file = tmp_path / "spec.yaml"
         file.write_text(content, encoding="utf-8")
-        done = ctid("check", "accuracy", file, *arguments, *([] if text else ["--json"]))
+        done = ctid("accuracy", file, *arguments, *([] if text else ["--json"]))
         assert all(EXPECTED.search(line) for line in done.stderr.splitlines())
         return done.stdout if text else json.loads(done.stdout)
 
@@ -351,7 +351,7 @@ def test_a_handful_of_many(accuracy):
 
 
 def test_a_measured_record_has_no_known_system(ctid, measured):
-    done = ctid("check", "accuracy", measured, code=2)
+    done = ctid("accuracy", measured, code=2)
     assert done.stdout == ""
     assert "measured-tiny is about a measured record, whose true system is not known" in done.stderr
 
@@ -359,5 +359,4 @@ def test_a_measured_record_has_no_known_system(ctid, measured):
 def test_a_wrong_file_is_reported_as_by_the_other_commands(ctid, tmp_path):
     file = tmp_path / "spec.yaml"
     file.write_text(ONE.replace("samples: 6000", "samples: 1"), encoding="utf-8")
-    assert "spec.yaml:4:" in ctid("check", "accuracy", file, code=2).stderr
-    assert "accuracy  Say how accurate the estimates" in " ".join(ctid("check", "--help").stdout.split("\n"))
+    assert "spec.yaml:4:" in ctid("accuracy", file, code=2).stderr
