@@ -1,4 +1,4 @@
-"""``ctid check accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
+"""``ctid accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
 
 import json
 import re

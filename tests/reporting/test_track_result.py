@@ -1,4 +1,4 @@
-"""The result of ctid track: its text, its files and its figure."""
+"""What is said and written about a track."""
 
 import io
 import json
@@ -8,10 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
 from ctid_cli.reporting.track_plot import track_drawing
-from ctid_cli.reporting.track_result import TrackResult
+from ctid_cli.reporting.track_result import TrackResult, flag_names
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.tones.summary import summarise
 from ctid_cli.tones.track import MissingLine, Track
@@ -29,28 +30,102 @@ def make_track(flags=None, **known):
 
 
 @pytest.fixture(scope="module")
-def signal():
+def chosen():
     t = 0.002 * np.arange(2000)
     y = 2 * np.sin(2 * np.pi * 10 * t) + 0.5 * np.sin(2 * np.pi * 30 * t)
     return SampledSignal(y, 0.002, 5.0, "string.csv", "y", "t", "s", "Pa", ("A note.",))
 
 
-@pytest.fixture(scope="module")
-def partly_valid():
+def some_invalid():
     flags = np.zeros(ROWS, np.uint16)
     flags[:10] = int(Flag.GAP)
     flags[10:12] = int(Flag.UNCERTAIN | Flag.COMPLEX_ROOTS)
-    return make_track(flags)
+    return flags
 
 
-def test_summary_is_over_valid_rows(partly_valid):
-    first, second = summarise(partly_valid)
+def coming_later():
+    """Tones of which one is there for a part, with a line left over."""
+    flags = np.zeros((ROWS, 2), np.uint16)
+    flags[:20, 1] = int(Flag.ABSENT)
+    flags[20:25, 1] = int(Flag.LINE_LEFT)
+    lines = (MissingLine(2 * np.pi * 85.0, 0.9, 0.1), MissingLine(2 * np.pi * 120.0, 0.25, 0.02))
+    track = make_track(error=np.full((ROWS, 2), 0.01), window=np.full((ROWS, 2), 0.2))
+    omega = track.omega.copy()
+    omega[:20, 1] = np.nan
+    parts = {"error": track.error, "amplitudes": track.amplitudes, "window": track.window, "missing": lines}
+    return Track.of(track.t, omega, flags, 0.1, **parts)
+
+
+@pytest.mark.parametrize(
+    "track",
+    [
+        pytest.param(make_track(some_invalid()), id="gaps"),
+        pytest.param(coming_later(), id="a tone that comes later"),
+        pytest.param(make_track(np.full(ROWS, int(Flag.UNCERTAIN), np.uint16)), id="nothing valid"),
+        pytest.param(Track.of(np.arange(3.0), np.empty((3, 0)), np.zeros(3, np.uint16), 1.0), id="no tone"),
+    ],
+)
+def test_printed(chosen, track, snapshot):
+    result = TrackResult(track, chosen)
+    assert result.summary() == snapshot
+    json.dumps(plain(result.content()), allow_nan=False)
+    assert result.drawing().saved().startswith(b"<?xml")
+
+
+def test_a_summary_is_over_valid_rows():
+    first, second = summarise(make_track(some_invalid()))
     assert first.frequency_hz == pytest.approx(np.median(HERTZ[12:, 0]))
     assert first.omega == pytest.approx(2 * np.pi * first.frequency_hz)
     low, high = np.percentile(HERTZ[12:, 0], [16, 84])
     assert first.spread_hz == pytest.approx((high - low) / 2)
     assert (second.frequency_hz, second.spread_hz, second.amplitude) == (pytest.approx(30.0), 0.0, 0.5)
     assert first.valid_percent == pytest.approx(70.0)
+    _, later = summarise(coming_later())
+    assert (later.valid_percent, later.begins, later.ends) == (75.0, pytest.approx(2.0), pytest.approx(3.9))
+
+
+def test_csv_and_hdf5_hold_the_same(chosen):
+    table = TrackResult(make_track(some_invalid()), chosen).to_frame()
+    frame = pd.read_csv(io.BytesIO(frame_bytes(table)), keep_default_na=True)
+    assert list(frame.columns) == [
+        "t",
+        *("frequency_1_hz", "frequency_error_1_hz", "omega_1", "amplitude_1", "amplitude_error_1"),
+        *("phase_1", "growth_1", "rate_1", "valid_1", "flags_1"),
+        *("frequency_2_hz", "frequency_error_2_hz", "omega_2", "amplitude_2", "amplitude_error_2"),
+        *("phase_2", "growth_2", "rate_2", "valid_2", "flags_2"),
+    ]
+    assert frame["t"].to_numpy() == pytest.approx(5.0 + 0.1 * np.arange(ROWS))
+    assert frame["frequency_1_hz"][12:].to_numpy() == pytest.approx(HERTZ[12:, 0])
+    assert frame["omega_1"][:10].isna().all()
+    assert frame["flags_2"].fillna("").tolist() == ["gap"] * 10 + ["uncertain complex_roots"] * 2 + [""] * 28
+    assert frame["valid_1"].tolist() == [0] * 12 + [1] * 28
+    with h5py.File(io.BytesIO(hdf5_bytes(table))) as store:
+        units = {name: column.attrs.get("unit") for name, column in store.items()}
+        assert (units["t"], units["omega_2"], units["frequency_1_hz"]) == ("s", "rad/s", "Hz")
+        assert (units["amplitude_1"], units["amplitude_error_2"], units["valid_1"]) == ("Pa", "Pa", None)
+        assert (units["frequency_error_1_hz"], units["phase_2"]) == ("Hz", "rad")
+        assert (units["growth_1"], units["rate_1"], units["flags_1"]) == ("1/s", "Hz/s", None)
+        assert list(store) == list(frame.columns)
+        for name in frame.columns.drop(["flags_1", "flags_2"]):
+            assert store[name][()] == pytest.approx(frame[name].to_numpy(), nan_ok=True)
+        assert store["flags_1"].asstr()[()].tolist() == frame["flags_1"].fillna("").tolist()
+
+
+def test_names_of_flags():
+    assert flag_names(np.array([int(Flag.STARTING | Flag.GAP), 0], np.uint16)).tolist() == ["starting gap", ""]
+
+
+@pytest.mark.parametrize("tones", [1, 2, 7])
+def test_figure(tones):
+    flags = some_invalid()
+    omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
+    track = Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, amplitudes=1.0 / omega)
+    one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
+    assert one == two
+    assert one.startswith(b"<?xml")
+    assert b"#e4e4e4" in one  # the shade of what is not valid
+    plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
+    assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
 
 
 def test_the_error_of_the_mean_counts_common_samples_once():
@@ -64,61 +139,6 @@ def test_the_error_of_the_mean_counts_common_samples_once():
     half = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.2)))
     assert half[1].standard_error_hz == pytest.approx(0.01 * np.sqrt(2 / ROWS))
     assert np.isnan(summarise(make_track())[0].standard_error_hz)
-
-
-@pytest.mark.parametrize("case", ["partly valid", "nothing valid", "own rows", "no tone", "missing lines"])
-def test_text(signal, partly_valid, case, snapshot):
-    flags = np.zeros((ROWS, 2), np.uint16)
-    flags[:20, 1] = int(Flag.ABSENT)
-    flags[20:25, 1] = int(Flag.LINE_LEFT)
-    omega = 2 * np.pi * HERTZ
-    omega[:20, 1] = np.nan
-    own = Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=np.full((ROWS, 2), 0.01))
-    lines = (MissingLine(2 * np.pi * 85.0, 0.9, 0.1), MissingLine(2 * np.pi * 120.0, 0.25, 0.02))
-    track = {
-        "partly valid": partly_valid,
-        "nothing valid": make_track(np.full(ROWS, int(Flag.UNCERTAIN), np.uint16)),
-        "own rows": own,
-        "no tone": Track.of(np.arange(3.0), np.empty((3, 0)), np.zeros(3, np.uint16), 1.0),
-        "missing lines": make_track(missing=lines),
-    }[case]
-    result = TrackResult(track, signal)
-    assert result.summary() == snapshot
-    assert json.loads(result.write("json"))["method"] == "tone_windows"
-    assert result.drawing().saved().startswith(b"<?xml")
-
-
-def test_csv_and_hdf5_hold_the_same(signal, partly_valid):
-    table = TrackResult(partly_valid, signal).to_frame()
-    frame = pd.read_csv(io.BytesIO(frame_bytes(table)))
-    names = ("frequency_{}_hz", "frequency_error_{}_hz", "omega_{}", "amplitude_{}", "amplitude_error_{}")
-    names += ("phase_{}", "growth_{}", "rate_{}", "valid_{}", "flags_{}")
-    assert list(frame.columns) == ["t", *(name.format(k) for k in (1, 2) for name in names)]
-    assert frame["t"].to_numpy() == pytest.approx(5.0 + 0.1 * np.arange(ROWS))
-    assert frame["frequency_1_hz"][12:].to_numpy() == pytest.approx(HERTZ[12:, 0])
-    assert frame["omega_1"][:10].isna().all()
-    assert frame["flags_2"].fillna("").tolist() == ["gap"] * 10 + ["uncertain complex_roots"] * 2 + [""] * 28
-    assert frame["valid_1"].tolist() == [0] * 12 + [1] * 28
-    with h5py.File(io.BytesIO(hdf5_bytes(table))) as store:
-        units = {name: column.attrs.get("unit") for name, column in store.items()}
-        assert list(store) == list(frame.columns)
-        for name in frame.columns.drop(["flags_1", "flags_2"]):
-            assert store[name][()] == pytest.approx(frame[name].to_numpy(), nan_ok=True)
-        assert store["flags_1"].asstr()[()].tolist() == frame["flags_1"].fillna("").tolist()
-    own = [units[name.format(1)] for name in names]
-    assert own == ["Hz", "Hz", "rad/s", "Pa", "Pa", "rad", "1/s", "Hz/s", None, None]
-
-
-@pytest.mark.parametrize("tones", [1, 2, 7])
-def test_figure(tones, partly_valid):
-    omega = 2 * np.pi * np.outer(1.0 + 0.01 * np.sin(np.arange(ROWS)), 10.0 * np.arange(1, tones + 1))
-    flags = partly_valid.flags[:, 0]
-    track = Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, error=0.01 * omega, amplitudes=1.0 / omega)
-    one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
-    assert one == two
-    assert b"#e4e4e4" in one  # the shade of what is not valid
-    plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
-    assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
 
 
 @pytest.mark.parametrize(("accuracy", "bad"), [(None, [0, 1]), (0.011, [0, 0]), (0.005, [1, 1])])
