@@ -88,12 +88,11 @@ def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
     near(content, {"g1_b0": 0.5, "g2_b0": 2.0, "g2_a1": 0.2, "g2_a2": 0.3})
     assert content["parameters"][0]["unit"] == "out/in/s"
     assert content["warnings"] == []
-
-
-def test_an_integrator_beside_poles_needs_no_other_words(ctid, tmp_path):
+    # An integrator beside poles needs no other options.
     file = record(tmp_path / "one.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
     content = fitted(ctid, file, "--poles", 1, "--integrators", 1, "--out", tmp_path)
     near(content, {"a1": 2.0, "b0": 2.0})
+    assert content["modes"][-1]["damping"] is None
 
 
 @pytest.mark.parametrize(
@@ -132,6 +131,9 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
     content = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--reference", "r")
     near(content, {"a1": 1.5, "b0": 2.0}, errors=3.0)
+    stored = load_fit(tmp_path / "fit.json")
+    assert stored.records[0].loop.controller.numerator.tolist() == [0.8, -0.7]
+    assert np.mean(stored.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
     assert not any("answers the output" in warning for warning in content["warnings"])
     ignored = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--ignore-loop")
     assert any("The loop is ignored" in note for note in ignored["notes"])
@@ -141,16 +143,6 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     # What is known to be biased has no standard error; without the loop nobody knows.
     assert all(one["standard_error"] is None for one in ignored["parameters"])
     assert "estimate is biased" in ignored["covariance"]["reason"]
-    again = load_fit(tmp_path / "fit.json")
-    assert again.records[0].n_samples == 1500
-
-
-def test_the_loop_is_stored_with_the_fit(ctid, closed, tmp_path):
-    options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
-    content = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--reference", "r")
-    again = load_fit(tmp_path / "fit.json")
-    assert again.records[0].loop.controller.numerator.tolist() == [0.8, -0.7]
-    assert np.mean(again.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
 
 
 ADDITIVE = ("--model", "additive", "--terms", "2/0")
