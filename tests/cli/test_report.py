@@ -75,7 +75,7 @@ def fitted(ctid, tmp_path):
 
 def test_the_page_of_a_fit_is_that_of_its_file(ctid, fitted):
     first = (fitted / "fit.html").read_bytes()
-    assert b"--poles 1 --delay 0.3" in first
+    assert b"--delay 0.3 --poles 1" in first
     assert b"<h1>Fit of " in first
     (fitted / "record.csv").rename(fitted / "moved.csv")
     stderr = ctid("report", fitted / "fit.json", code=2).stderr

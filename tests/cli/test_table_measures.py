@@ -41,4 +41,4 @@ def test_what_cannot_be_answered_is_said(ctid, done):
     assert "--measure needs the name of an experiment" in error("table", "--measure", "bias")
     assert "no results of 'tinny'" in error("table", "tinny", "--compare", "search,known")
     assert "fewer than 5 data sets in common" in error("table", "tiny", "--compare", "search,known")
-    assert "ask one" in error("table", "tiny", "--compare", "search,known", "--measure", "bias")
+    assert "exclude each other" in error("table", "tiny", "--compare", "search,known", "--measure", "bias")

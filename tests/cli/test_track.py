@@ -99,7 +99,7 @@ def test_missing_samples_are_flagged(ctid, tmp_path):
         (T[:5], signal()[:5], (), "too few"),
         (T, np.random.default_rng(1).standard_normal(T.size), ("--tones", "auto"), "no tone stands out"),
         (T**1.1, signal(), (), "clock is not regular"),
-        (T, signal(), ("--tones", 21), "--tones must be a number from 0 to 20, or auto"),
+        (T, signal(), ("--tones", 65), "--tones must be a number from 0 to 64, or auto"),
         (T, signal(), ("--every", -1), "--every"),
         (T, signal(), ("--window", 1000), "the longest window must be from"),
         (T, signal(), ("--rate", 0), "--rate"),
@@ -180,9 +180,9 @@ def test_a_page_is_made_of_a_track_and_its_record(ctid, record, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--tones", "many"), "--tones must be a number from 0 to 20, or auto, not 'many'"),
-        (("--tones", -1), "--tones must be a number from 0 to 20"),
-        (("--tones", 21), "--tones must be a number from 0 to 20"),
+        (("--tones", "many"), "--tones must be a number from 0 to 64, or auto, not 'many'"),
+        (("--tones", -1), "--tones must be a number from 0 to 64"),
+        (("--tones", 65), "--tones must be a number from 0 to 64"),
         (("--tones", 2, "--accuracy", 0), "--accuracy must be a positive number of hertz"),
     ],
 )
