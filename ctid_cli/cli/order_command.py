@@ -58,7 +58,7 @@ def order(
             *(records.data, *ranges, bounds),
             initial_state=initial_state,
             offset=offset,
-            validation=records.validation and records.validation.record,
+            validation=None if records.validation is None else records.validation.record,
             integrators=integrators,
         )
     except ValueError as error:

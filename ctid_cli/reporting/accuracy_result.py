@@ -184,7 +184,7 @@ def _tables(known: Sequence[Expectation]) -> Iterator[Section]:
 def _table(entries: Sequence[Expectation]) -> Section:
     """Return parameters down and numbers of samples across; the last columns are about the greatest number."""
     last = pd.DataFrame(entries[-1].parameters)
-    columns = {"parameter": last["name"], "true value": last["value"]}
+    columns: dict[str, Any] = {"parameter": last["name"], "true value": last["value"]}
     columns |= {f"N = {each.samples}": [row["standard_error"] for row in each.parameters] for each in entries}
     columns |= {"relative [%]": last["relative_percent"].astype(float), "half width": last["half_width_95"]}
     formats = {name: ".3g" for name in columns if name != "true value"}

@@ -112,7 +112,7 @@ class TrackResult(Result):
 
     def to_frame(self) -> pd.DataFrame:
         """Return the tones over time, those of one after those of another; ``attrs["units"]`` has units of columns."""
-        track, unit = self.track, self.signal and self.signal.unit
+        track, unit = self.track, self.signal.unit if self.signal else None
         columns: dict[str, NDArray[Any]] = {"t": (self.signal.start if self.signal else 0.0) + track.t}
         units: dict[str, str | None] = {"t": "s"}
         quantities: dict[str, tuple[NDArray[Any], str | None]] = {
