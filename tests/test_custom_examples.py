@@ -88,7 +88,7 @@ def test_one_estimate_is_computed_once_more_with_permission_only(out):
     assert "the same parameters to the last digit" in again
 
 
-@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("accuracy")])
+@pytest.mark.parametrize("command", [("validate",), ("run", "--dry-run"), ("accuracy",)])
 def test_permission(command, tmp_path, monkeypatch):
     file = EXAMPLES / "custom_study.yaml"
     place = () if command[0] != "run" else ("--out", tmp_path)

@@ -143,13 +143,13 @@ def test_a_track_as_text_as_a_table_and_as_a_figure():
     online = FrequencyTrack(0.1 * np.arange(40), omega, flags)
     assert "tone  frequency [Hz]" in summary(online)
     assert "amplitude" not in summary(online)
-    assert "\nWarnings:\n- 25 % of the rows are not valid.\n" in summary(online)
-    assert summary(online).splitlines()[3].split() == ["2", "30.0000", "0", "75", "%"]
+    assert "\nWarnings:\n- Tone 1 and tone 2: 25 % of the rows are not valid." in summary(online)
+    assert summary(online).splitlines()[3].split() == ["2", "30", "0", "75"]
     assert to_frame(online).shape == (40, 6)
     assert online._repr_html_().count("<tr>") == 3
     drawn = [plot(online, kind) for kind in (None, "tones", "frequencies")]
     assert drawn[0] == drawn[1] == drawn[2]
-    assert b"<!-- frequency [Hz] -->" in drawn[0]
+    assert b"<!-- tone 1 [Hz] -->" in drawn[0]
     with pytest.raises(CtidError, match=r"there is no kind of figure 'amplitudes'; there are tones, frequencies$"):
         plot(online, "amplitudes")
 
