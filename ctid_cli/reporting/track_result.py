@@ -79,7 +79,8 @@ class TrackResult(Result):
         }
         counted = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
         note = f"Medians over the valid ones of {counted}; the spread is half the width of the central 68 %: how far a "
-        note += "tone moves. A standard error (±) is that of the mean frequency."
+        note += "tone moves."
+        note += " A standard error (±) is that of the mean frequency." if np.isfinite(track.error).any() else ""
         note += " Valid is a share of the rows where the tone is there." if partly else ""
         return [Section(frame=pd.DataFrame(rows).dropna(axis=1, how="all"), formats=formats, notes=[note])]
 
