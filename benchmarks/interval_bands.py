@@ -18,7 +18,7 @@ from ctid_cli.inference.fit import Status
 from ctid_cli.inference.fitted_model import STEP, FittedModel
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.layout import Table, csv_text
+from ctid_cli.reporting.layout import csv_text, markdown_table
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.specification.load import load_spec
@@ -103,7 +103,7 @@ def markdown(lines: list[dict[str, Any]]) -> str:
         ]
         for line in lines
     ]
-    return Table(header, rows, "lllrrl").draw("md") + "\n"
+    return markdown_table(header, rows, "lllrrl") + "\n"
 
 
 def main(runs: int = 1000) -> None:

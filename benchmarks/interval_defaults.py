@@ -22,7 +22,7 @@ from ctid_cli.inference.uncertainty import UNSAFE, shifts_of_ends
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.layout import Table, csv_text
+from ctid_cli.reporting.layout import csv_text, markdown_table
 from ctid_cli.signals.excitation import Excitation, Prbs, Step
 from ctid_cli.signals.noise import ArmaNoise, Noise, WhiteNoise
 from ctid_cli.signals.sampling import RegularSampling
@@ -150,7 +150,7 @@ def markdown(lines: Sequence[Line]) -> str:
         ]
         for line in lines
     ]
-    return Table(header, rows, "lrllrlrrrr").draw("md") + "\n"
+    return markdown_table(header, rows, "lrllrlrrrr") + "\n"
 
 
 def main(runs: int = 400, seed: int = 20261124) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting.layout import latex
+from ctid_cli.reporting.layout import latex, markdown_table
 from ctid_cli.text import wrapped
 
 if TYPE_CHECKING:
@@ -161,15 +161,11 @@ def render_markdown(sections: Iterable[Section]) -> str:
     for section in sections:
         blocks += [f"### {section.title}"] if section.title else []
         blocks += [*section.sentences, *section.lines]
-        blocks += [_markdown_table(*aligned_lines(section))] if section.frame is not None else []
+        if section.frame is not None:
+            (header, *rows), sides = aligned_lines(section)
+            blocks.append(markdown_table(header, rows, sides))
         blocks += section.notes
     return "\n\n".join(blocks)
-
-
-def _markdown_table(lines: list[list[str]], sides: str) -> str:
-    header, *body = ("| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in lines)
-    rule = "|" + "|".join(":--" if side == "l" else "--:" for side in sides) + "|"
-    return "\n".join([header, rule, *body])
 
 
 def render_latex(sections: Iterable[Section]) -> str:

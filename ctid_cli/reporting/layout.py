@@ -1,89 +1,21 @@
-"""How answers look: aligned text, Markdown or LaTeX, and how numbers are written in it."""
+"""How numbers and tables are written as text."""
 
 import csv
-import html
 import io
-import itertools
 import json
 import math
-import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ctid_cli.text import count as count  # for those who draw
-from ctid_cli.text import wrapped
-
-Lines = Sequence[Sequence[str]]
 
 
-@dataclass(frozen=True)
-class Table:
-    """Texts in columns under a header, each column to the left (``l``) or to the right (``r``)."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    align: str
-
-    def draw(self, style: str = "text") -> str:
-        """Columns padded with blanks and a rule under the header, or ``md``, ``html``, or ``latex`` with booktabs."""
-        return _TABLES[style]([self.header, *self.rows], self.align)
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], sides: str) -> str:
+    """Return a table in Markdown, each column to the left (``l``) or to the right (``r``)."""
+    first, *body = ("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in (header, *rows))
+    return "\n".join([first, "|" + "|".join(":--" if side == "l" else "--:" for side in sides) + "|", *body])
 
 
-@dataclass(frozen=True)
-class Report:
-    """What a command answers: for people blocks of paragraphs and tables, for programs records."""
-
-    #: A paragraph that begins with ``### `` is a heading; what holds line ends is drawn already.
-    blocks: Sequence[Sequence[str | Table]]
-    records: Sequence[Mapping[str, Any]] = ()
-    #: Remarks, never wrapped because they hold commands.
-    notes: Sequence[str] = field(default=())
-
-    def draw(self, style: str = "text") -> str:
-        """The report for people, as text, as Markdown (``md``), or its tables in LaTeX with the rest as comments."""
-        notes = [f"Note: {note}" for note in self.notes]
-        if style == "text":
-            blocks = ["\n".join(map(_drawn, block)) for block in self.blocks if block]
-            return "\n\n".join([*blocks, "\n".join(notes)] if notes else blocks)
-        items, paragraph = [*itertools.chain(*self.blocks), *notes], _PARAGRAPHS[style]
-        return "\n\n".join(item.draw(style) if isinstance(item, Table) else paragraph(item) for item in items)
-
-
-def _text_table(lines: Lines, align: str) -> str:
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    sides = [f"{'<' if side == 'l' else '>'}{width}" for side, width in zip(align, widths, strict=True)]
-    header, *body = ("  ".join(map(format, cells, sides)).rstrip() for cells in lines)
-    return "\n".join([header, "-" * (sum(widths) + 2 * (len(widths) - 1)), *body])
-
-
-def _markdown_table(lines: Lines, align: str) -> str:
-    header, *body = ("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)
-    return "\n".join([header, "|" + "|".join(":--" if side == "l" else "--:" for side in align) + "|", *body])
-
-
-def _html_table(lines: Lines, align: str) -> str:
-    sides = ["left" if side == "l" else "right" for side in align]
-    return "<table>" + "\n".join(f"<tr>{''.join(map(_html_cell, cells, sides))}</tr>" for cells in lines) + "</table>"
-
-
-def _html_cell(text: str, side: str) -> str:
-    return f'<td style="text-align: {side}">{html.escape(text)}</td>'
-
-
-def _latex_table(lines: Lines, align: str) -> str:
-    header, *body = (" & ".join(map(latex, cells)) + r" \\" for cells in lines)
-    rules = [f"\\begin{{tabular}}{{{align}}}", r"\toprule", header, r"\midrule"]
-    return "\n".join([*rules, *body, r"\bottomrule", r"\end{tabular}"])
-
-
-#: How a table is drawn in each style, and a paragraph in those that are not plain text.
-_TABLES = {"text": _text_table, "md": _markdown_table, "html": _html_table, "latex": _latex_table}
-_PARAGRAPHS: Mapping[str, Callable[[str], str]] = {
-    "md": str,
-    "html": lambda text: f"<p>{html.escape(text.removeprefix('### '))}</p>",
-    "latex": lambda text: textwrap.indent(text.removeprefix("### "), "% "),
-}
 #: What LaTeX would read as something else.
 _LATEX = str.maketrans(
     {
@@ -99,22 +31,6 @@ _LATEX = str.maketrans(
 def latex(text: str) -> str:
     """A text for LaTeX."""
     return text.translate(_LATEX)
-
-
-def _drawn(item: str | Table) -> str:
-    if isinstance(item, Table):
-        return item.draw()
-    return item if "\n" in item else wrapped(item.removeprefix("### "))
-
-
-def write_reports(reports: Sequence[Report], style: str) -> str:
-    """Reports as ``text``, ``md``, ``latex``, ``csv`` or ``json``."""
-    records = [record for report in reports for record in report.records]
-    if style == "json":
-        return json.dumps(records, indent=1, allow_nan=False)
-    if style == "csv":
-        return csv_text(records).rstrip("\n")
-    return "\n\n\n".join(report.draw(style) for report in reports)
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> str:

@@ -219,8 +219,8 @@ class _Taken:
             others = ", ".join(key.id for key, _, _ in self._conflicts[1:NAMED])
             more = f"; {count - 1} more differ too: {others}{', …' if count > NAMED else ''}" if others else ""
             raise RefusedError(
-                f"estimate {key.id} is one thing in {one} and another in {other}; 'ctid export --id {key.id}' prints each, "
-                f"and --fresh computes one of the folders anew{more}"
+                f"estimate {key.id} is one thing in {one} and another in {other}; 'ctid export --id {key.id}' prints "
+                f"each, and --fresh computes one of the folders anew{more}"
             )
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.reporting.layout import Table, number
+from ctid_cli.reporting.layout import markdown_table, number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults, last_part
 
@@ -79,7 +79,7 @@ def convergence_table(results: Results) -> str:
         valueless = sum(int(np.isnan(group.values).any(axis=1).sum()) for group in groups)
         counts = [sum(getattr(group, name) for group in groups) for name in ("runs", "not_converged", "failed")]
         rows.append([estimator, *map(str, [*counts, valueless])])
-    return Table(["estimator", "estimates", "not converged", "failed", "without a value"], rows, "lrrrr").draw("md")
+    return markdown_table(["estimator", "estimates", "not converged", "failed", "without a value"], rows, "lrrrr")
 
 
 def error_table(results: Results) -> str:
@@ -93,7 +93,7 @@ def error_table(results: Results) -> str:
                 rows.append([estimator, str(size), *map(with_ratio, line)])
         known = {row.parameter: row.theory for row in errors_of(results) if row.estimator == estimator}
         rows.append([estimator, "theory", *(number(known.get(name), 4) for name in names)])
-    return Table(["estimator", "N", *names], rows, "lr" + "r" * len(names)).draw("md")
+    return markdown_table(["estimator", "N", *names], rows, "lr" + "r" * len(names))
 
 
 def with_ratio(row: ParameterErrors | None) -> str:
@@ -115,7 +115,7 @@ def ratio_tables(results: Results) -> list[str]:
         ]
         rows.append(["theory", *(f"{row['theory']:.3f}" for row in first)])
         header = [f"{estimator}: N", *(row["parameter"] for row in first)]
-        written.append(Table(header, rows, "r" * len(header)).draw("md"))
+        written.append(markdown_table(header, rows, "r" * len(header)))
     return written
 
 
@@ -127,7 +127,7 @@ def bias_table(results: Results) -> str:
         cells = [f"{row.bias_per_deviation or 0.0:+.2f} ({row.bias_per_error or 0.0:+.1f})" for row in own]
         rows.append([estimator, *cells])
     names = parameters(results)
-    return Table(["estimator", *names], rows, "l" + "r" * len(names)).draw("md")
+    return markdown_table(["estimator", *names], rows, "l" + "r" * len(names))
 
 
 def beam_table(results: Results) -> str:
@@ -137,7 +137,7 @@ def beam_table(results: Results) -> str:
         for row in errors_of(results)
         if row.bias is not None
     ]
-    return Table(["parameter", "true", "mean estimate", "standard deviation", "n"], rows, "lrrrr").draw("md")
+    return markdown_table(["parameter", "true", "mean estimate", "standard deviation", "n"], rows, "lrrrr")
 
 
 def coverage_table(experiments: Sequence[Results]) -> str:
@@ -150,4 +150,4 @@ def coverage_table(experiments: Sequence[Results]) -> str:
             cells = [last_part(results.experiment), formula, row.parameter, number(row.coverage, 3), interval]
             rows.append([*cells, number(row.error_ratio, 3), str(row.counted)])
     header = ["experiment", "formula", "parameter", "covered", "95 % interval", "standard error / scatter", "n"]
-    return Table(header, rows, "lllrrrr").draw("md")
+    return markdown_table(header, rows, "lllrrrr")

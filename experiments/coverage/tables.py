@@ -8,7 +8,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
-from ctid_cli.reporting.layout import Table
+from ctid_cli.reporting.layout import markdown_table
 from ctid_cli.reporting.parameter_errors import estimates_by_group
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
@@ -97,4 +97,4 @@ def markdown(found: StudyResults) -> str:
     ]
     header = ["row", "data", "formula", "parameter", "true", "coverage %", "95 % interval"]
     header += ["standard error / deviation", "bias / Monte Carlo error"]
-    return Table(header, rows, "llllrrlrr").draw("md") + "\n"
+    return markdown_table(header, rows, "llllrrlrr") + "\n"

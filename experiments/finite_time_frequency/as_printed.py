@@ -8,7 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_regression import theta_of
-from ctid_cli.reporting.layout import Table, number
+from ctid_cli.reporting.layout import markdown_table, number
 from ctid_cli.studies.catalogue import find_study
 
 from .measures import settle
@@ -28,7 +28,7 @@ HEADER = ["what is printed", "measured", "as printed", "as corrected"]
 
 def table() -> str:
     """All lines as Markdown."""
-    return Table(HEADER, list(rows()), "llrr").draw("md")
+    return markdown_table(HEADER, list(rows()), "llrr")
 
 
 def rows() -> Iterator[list[str]]:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from ctid_cli.reporting.layout import Table, number
+from ctid_cli.reporting.layout import markdown_table, number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults
 
@@ -37,7 +37,7 @@ def tables(found: StudyResults) -> str:
 
 def table(header: list[str], rows: list[list[str]]) -> str:
     """A table whose first column holds names."""
-    return Table(header, rows, "l".ljust(len(header), "r")).draw("md")
+    return markdown_table(header, rows, "l".ljust(len(header), "r"))
 
 
 def named(estimator: str) -> str:

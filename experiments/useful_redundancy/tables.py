@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.reporting.layout import Table
+from ctid_cli.reporting.layout import markdown_table
 from ctid_cli.reporting.measures import ALWAYS
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.reporting.study_table import build_tables
@@ -96,4 +96,4 @@ def searches_markdown(found: StudyResults) -> str:
         for results in found.experiments.values()
         for row in searches(results)
     ]
-    return f"{SEARCHES}\n\n{Table(header, body, 'lrlrrrrrrr').draw('md')}\n"
+    return f"{SEARCHES}\n\n{markdown_table(header, body, 'lrlrrrrrrr')}\n"
