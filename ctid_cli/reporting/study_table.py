@@ -30,7 +30,6 @@ from ctid_cli.reporting.table_result import (
     TIME,
     TableResult,
     experiment_table,
-    interval_text,
     joined,
     labels_of,
     measure_table,
@@ -200,7 +199,7 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
     place = labels.agg("\n".join, axis=1) + startless.astype(str)
     texts = {
         "%": [percent_text(row) if row["n"] else "-" for row in rows],
-        "95 %": [interval_text(row).strip("[]").replace(", ", "-") for row in rows],
+        "95 %": ["" if row["low"] is None else f"{row['low']:.0f}-{row['high']:.0f}" for row in rows],
         "published": ["" if row["published_percent"] is None else number(row["published_percent"]) for row in rows],
         "time": [seconds(time_of(row)) if row["n"] else "" for row in rows],
     }
@@ -223,7 +222,7 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
 def _sizes(counts: pd.Series) -> str:
     """Return the least and the greatest number of data sets that were run."""
     run = counts[counts > 0]
-    return "-".join(dict.fromkeys([str(run.min()), str(run.max())])) if len(run) else NOT_RUN
+    return "-".join(dict.fromkeys([str(run.min()), str(run.max())])) if len(run) else "0"
 
 
 def pooled_frame(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> pd.DataFrame:
@@ -275,11 +274,20 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
-    types = {"converged": "Int64", "initial_delay": "str"}
-    frame = pd.read_csv(file, dtype=types, float_precision="round_trip")
-    known = pd.to_numeric(frame["initial_delay"], errors="coerce")
-    delays = known.astype(object).where(known.notna(), frame["initial_delay"])
-    return frame.assign(initial_delay=delays.where(frame["initial_delay"].notna(), None))
+    texts = pd.read_csv(file, dtype="str", keep_default_na=False)
+    frame = pd.DataFrame({name: texts[name] for name in texts if name in ("experiment", "sampling", "method")})
+    for name in texts.columns.difference(frame.columns):
+        frame[name] = pd.Series([_value(text) for text in texts[name]], dtype=object)
+    counts = frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
+    return counts[texts.columns]
+
+
+def _value(text: str) -> float | str | None:
+    """Return a number of a table; an initial delay may be a word."""
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
 
 
 def environment_of(published: Path) -> dict[str, Any] | None:

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.measure_tables import measure_report
-from ctid_cli.reporting.measures import default_measures, measure_rows
-from ctid_cli.reporting.percentages import experiment_rows
+from ctid_cli.reporting.measures import default_measures, measure_rows, percentage_frame
 
 DELAYS = (8.1, 7.9, 8.4)
 
@@ -45,21 +43,9 @@ def test_a_row_says_of_what_and_of_how_many(results):
     assert units == {"a1": "(1/s)^2", "a2": "(1/s^2)^2", "b0": "(out/in/s^2)^2", "delay": "(s)^2"}
 
 
-def test_n_is_the_number_of_estimates_that_a_value_is_computed_from(make_results, estimate):
-    found = [estimate(8.0 + 0.1 * k, standard_errors={"delay": 0.1} if k < 4 else {}) for k in range(6)]
-    results = make_results({(5.0, "0.0"): [*found, estimate(None, status="FAILED")]})
-    for cell in results.manifest["data_cells"]:
-        cell["replicates"] = 7
-    text = measure_report(results, ["standard_error:delay"]).draw()
-    assert ["4", "1", "3"] in [line.split()[-3:] for line in text.splitlines()]
-    text = measure_report(results, ["bias:delay", "standard_error:delay"]).draw()
-    (line,) = (line for line in text.splitlines() if "(n 4)" in line)
-    assert line.split()[-3:] == ["6", "1", "1"]
-
-
 def test_measures_come_for_every_planned_cell_in_the_order_asked_for(results):
     rows = measure_rows(results, ["rmse", "percent"])
-    places = [tuple(row[key] for key in ("snr_db", "initial_delay")) for row in experiment_rows(results)]
+    places = [*percentage_frame(results)[["snr_db", "initial_delay"]].itertuples(index=False, name=None)]
     assert list(dict.fromkeys((row["snr_db"], row["initial_delay"]) for row in rows)) == places
     assert [row["measure"] for row in rows_of(results, "rmse", "percent")] == ["rmse"] * 4 + ["percent"]
     empty = [row for row in rows if row["initial_delay"] == "random"]
