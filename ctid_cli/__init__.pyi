@@ -51,13 +51,10 @@ from .inference.frequency_response import FrequencyResponse as FrequencyResponse
 from .inference.frequency_response import estimate_frequency_response as estimate_frequency_response
 from .inference.bounds import cramer_rao_bound as cramer_rao_bound
 
-# Results as text, as tables of pandas and as figures
-from .reporting.result_views import plot as plot, summary as summary, to_frame as to_frame
-
 # Fits as files
 from .estimators.model_comparison import ModelOnRecord as ModelOnRecord, compare as compare
 from .storage.fit_file import load_fit as load_fit
-from .reporting.saved_fit import save_fit as save_fit
+from .reporting.fit_result import save_fit as save_fit
 
 # Custom components: the classes that they derive from
 from .signals.excitation import Excitation as Excitation

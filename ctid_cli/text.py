@@ -4,6 +4,7 @@ import difflib
 import textwrap
 from collections.abc import Iterable
 from importlib import import_module
+from typing import Any
 
 #: Columns of a paragraph.
 WIDTH = 100
@@ -51,9 +52,24 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {near!r}?" if near else ""
 
 
-class ShownAsTable:
-    """A result that a notebook shows as its summary."""
+class Shown:
+    """A result that shows itself: as text, as a table of pandas, as a figure, and in a notebook."""
+
+    def summary(self) -> str:
+        """Return the result as text: the tables that the commands print."""
+        return str(self._result().summary())
+
+    def to_frame(self) -> Any:
+        """Return the main table of the result as a DataFrame: parameters of a fit, instants of a track."""
+        return self._result().to_frame()
+
+    def plot(self) -> Any:
+        """Return the main figure of the result as a Matplotlib figure."""
+        return self._result().plot()
+
+    def _result(self) -> Any:
+        # By name: results know nothing of the layer that shows them.
+        return import_module("ctid_cli.reporting.result_views").result_of(self)
 
     def _repr_html_(self) -> str:
-        # By name: results know nothing of the floor that says what is found.
-        return str(import_module("ctid_cli.reporting.result_views").html(self))
+        return str(self._result().write("html"))

@@ -58,6 +58,8 @@ InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its s
 From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
 To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
+#: Options that say where and in what form results are written, not what they are.
+_OF_OUTPUT = ("as_json", "format", "json", "out", "report", "csv", "export")
 #: Errors that are the disk's: full, over quota, read-only, or failing.
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
@@ -102,7 +104,7 @@ def given_command(context: typer.Context) -> str:
     words = context.command_path.split()
     for option in context.command.params:
         value = context.params.get(str(option.name))
-        if value == option.get_default(context) or option.name in ("as_json", "out", "report"):
+        if value == option.get_default(context) or option.name in _OF_OUTPUT:
             continue
         name = [max(option.opts, key=len)] if option.param_type_name == "option" else []
         for each in value if isinstance(value, list | tuple) else [value]:
@@ -130,12 +132,14 @@ def answer(
         typer.echo(text() + (f"\n\nWritten: {', '.join(names)}" if names else ""))
 
 
-def emit(result: Result, form: Format, written: Sequence[Path] = ()) -> None:
-    """Print a result in the form that is asked for, and name the files that were written."""
+def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:
+    """Print a result in the form that is asked for, JSON as it was stored, and name the files that were written."""
     names = list(map(str, written))
     if form == "json":
-        content = result.content()
-        typer.echo(json.dumps(plain({**content, "written": names} if names else content), allow_nan=False))
+        if stored is None:
+            content = result.content()
+            stored = json.dumps(plain({**content, "written": names} if names else content), allow_nan=False)
+        typer.echo(stored.rstrip("\n"))
         return
     typer.echo(result.write(form))
     if names and form == "text":

@@ -1,28 +1,25 @@
 """``ctid fit``."""
 
+from __future__ import annotations
+
 import json
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ctid_cli.cli._common import (
-    From,
-    InputColumn,
-    Json,
-    OutputColumn,
-    TimeColumn,
-    To,
-    given_command,
-    guarded,
-    write_files,
-)
+from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
+from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import Asked, ModelForm, check_loop, delay_bounds, estimator_of, with_loop
+from ctid_cli.cli.fit_structure import Asked, LoopOptions, ModelOptions, TreatmentOptions, estimator_of
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, LossKind, Offset
-from ctid_cli.text import wrapped
+from ctid_cli.reporting.document import Tool
+
+if TYPE_CHECKING:
+    from ctid_cli.estimators.measured_submodels import Options
+    from ctid_cli.reporting.fit_result import FitResult
+    from ctid_cli.signals.treatment import Hold
 
 
 @guarded
@@ -31,43 +28,20 @@ def fit(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
     ],
-    poles: Annotated[
-        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
+    model: ModelOptions,
+    loop: LoopOptions,
+    treatment: TreatmentOptions,
+    columns: RecordOptions,
+    form: FormatOptions,
+    validate: Annotated[
+        Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record.")
     ] = None,
-    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles.")] = None,
-    delay: Annotated[
-        str | None, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; 0.")
-    ] = None,
-    model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction",
-    terms: Annotated[
-        str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
-    ] = None,
-    integrators: Annotated[
-        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
-    ] = 0,
-    fix: Annotated[
-        list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
-    ] = None,
-    loop: Annotated[
-        Path | None, typer.Option("--loop", metavar="FILE", help="YAML with the section loop of the record.")
-    ] = None,
-    reference: Annotated[
-        str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
-    ] = None,
-    ignore_loop: Annotated[bool, typer.Option("--ignore-loop", help="Fit as if there were no loop.")] = False,
-    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest",
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none",
-    loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares",
-    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
-    time: TimeColumn = None,
-    input: InputColumn = None,
-    output: OutputColumn = None,
-    start: From = None,
-    stop: To = None,
-    validate: Annotated[Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record.")] = None,
     bootstrap: Annotated[int | None, typer.Option("--bootstrap", metavar="DRAWS", help="Bootstrap intervals.")] = None,
     report: Annotated[bool, typer.Option("--report", help="Write the page fit.html too.")] = False,
-    as_json: Json = False,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="DIR", help="Write step, Bode, simulation and residuals as CSV.")
+    ] = None,
+    export: Annotated[Tool | None, typer.Option("--export", help="Write the model as code for this tool.")] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path("."),
 ) -> None:
     """Fit a transfer function with a delay to measured records.
@@ -77,74 +51,84 @@ def fit(
     """
     from ctid_cli.estimation.common import LEAST_DRAWS
     from ctid_cli.estimators.identification import identify
-    from ctid_cli.reporting.identification_plot import identification_drawing
-    from ctid_cli.reporting.identification_report import common_units, identification_object, identification_text
-    from ctid_cli.signals.measurement import read_measurement
-    from ctid_cli.storage.fit_file import fit_text
+    from ctid_cli.reporting.fit_result import FitResult
+    from ctid_cli.reporting.records import Records
 
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
-    check_loop(loop, reference, ignore_loop)
-    read = partial(read_measurement, time=time, input=input, output=output, reference=reference)
-    bounds = None if delay is None else delay_bounds(delay)
-    said: list[str] = []
+    loop.check()
+    options, hold, choices = _chosen(files, model, loop, treatment, columns)
+    measured = [loop.applied(columns.read(file, hold, reference=loop.reference)) for file in files]
+    other = None
+    if validate is not None:
+        other = loop.applied(columns.read_whole(validate, hold, reference=loop.reference))
+    records = Records(measured, other)
+    # Units that differ are refused before anything is computed.
+    records.units  # noqa: B018
+    with FitProgress(sum(record.n_samples for record in records.data)) as progress:
+        noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
+        fitted = identify(options, records.data, None if other is None else other.record, *noise)
+    result = FitResult(fitted, records, choices)
+    written = _files(result, given_command(context), out, report=report, csv=csv, export=export)
+    refuse_overwriting([*files, *([validate] if validate else [])], written)
+    write_files(written)
+    emit(result, form.form, list(written), stored=written[out / "fit.json"].decode())
+
+
+def _chosen(
+    files: list[Path], model: ModelOptions, loop: LoopOptions, treatment: TreatmentOptions, columns: RecordOptions
+) -> tuple[Options, Hold, list[str]]:
+    """Return the estimator and the hold, with a sentence for each choice that was not the user's."""
+    from ctid_cli.reporting.hold_choice import chosen_hold
+    from ctid_cli.reporting.order_proposal import propose_structure
+    from ctid_cli.reporting.records import Records
+
+    bounds, choices = model.bounds, []
 
     def held() -> Hold:
-        """The hold that is given, or the best for one fraction in open loop."""
-        if hold != "auto":
-            return hold
-        if loop is not None or model != "fraction" or integrators:
+        """Return the hold that is given, or the best for one fraction in open loop."""
+        if treatment.hold != "auto":
+            return treatment.hold
+        if loop.loop is not None or model.model != "fraction" or model.integrators:
             return "zoh"
-        from ctid_cli.reporting.hold_choice import chosen_hold
+        shown = [columns.read(file, "zoh", reference=loop.reference).record for file in files]
+        state = treatment.initial_state, treatment.offset
+        found, why = chosen_hold(shown, model.poles, model.zeros, bounds, *state)
+        choices.extend([why] if why else [])
+        return found
 
-        shown = [read(file, start=start, stop=stop, hold="zoh").record for file in files]
-        chosen, why = chosen_hold(shown, poles, zeros, bounds, initial_state, offset)
-        said.extend([why] if why else [])
-        return chosen
-
-    if poles is None and model == "fraction" and terms is None:
-        if loop is not None or fix or integrators or loss != "squares":
+    if model.open:
+        if loop.loop is not None or model.fix or model.integrators or treatment.loss != "squares":
             raise UsageError("--poles is missing: with --loop, --fix, --integrators or --loss it must be given")
-        from ctid_cli.reporting.order_proposal import propose_structure
-
         hold = held()
-        first = [read(file, start=start, stop=stop, hold=hold) for file in files]
-        unit = common_units(first).time
-        proposal = propose_structure([item.record for item in first], zeros, bounds, initial_state, offset, unit)
-        poles, zeros, bounds, searched = proposal
-        said.append(searched)
-    taken: Hold = "zoh" if hold == "auto" else hold
-    asked = Asked(
-        *(model, terms, poles, zeros, integrators, bounds or (0.0, 0.0), fix or (), initial_state, offset, loss, taken),
-        loop=loop is not None and not ignore_loop,
-    )
+        first = Records([columns.read(file, hold, reference=loop.reference) for file in files])
+        state = treatment.initial_state, treatment.offset
+        poles, zeros, bounds, why = propose_structure(first.data, model.zeros, bounds, *state, first.units.time)
+        choices.append(why)
+        return estimator_of(Asked(replace(model, poles=poles, zeros=zeros), bounds, treatment)), hold, choices
+    asked = Asked(model, bounds or (0.0, 0.0), treatment, loop.counts)
     options = estimator_of(asked)
     if asked.iterated and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    hold = held()
-    measurements = [read(file, start=start, stop=stop, hold=hold) for file in files]
-    other = None if validate is None else read(validate, hold=hold)
-    if loop is not None:
-        measurements = [with_loop(loop, measurement, ignore_loop) for measurement in measurements]
-        other = other and with_loop(loop, other, ignore_loop)
-    units = common_units(measurements if other is None else [*measurements, other])
-    validation = None if other is None else other.record
-    with FitProgress(sum(item.record.n_samples for item in measurements)) as progress:
-        noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
-        result = identify(options, [item.record for item in measurements], validation, *noise)
-    content = identification_object(result, measurements, units, other)
-    text = fit_text(result, content, measurements, other, out, given_command(context))
-    figure = identification_drawing(result, measurements, units).saved()
-    contents = {out / "fit.json": text.encode() + b"\n", out / "fit.svg": figure}
+    return options, held(), choices
+
+
+def _files(
+    result: FitResult, command: str, out: Path, *, report: bool, csv: Path | None, export: Tool | None
+) -> dict[Path, bytes]:
+    """Return what is written, by path."""
+    from ctid_cli.reporting.column_file import frame_bytes
+    from ctid_cli.reporting.fit_tables import fit_tables, model_code
+
+    text = result.file_text(out, command)
+    contents = {out / "fit.json": text.encode() + b"\n", out / "fit.svg": result.drawing().saved()}
     if report:
         from ctid_cli.reporting.pages.fit_page import fit_page
 
-        contents[out / "fit.html"] = fit_page(result, measurements, other, json.loads(text)).encode()
-    write_files(contents)
-    if as_json:
-        typer.echo(text)
-    else:
-        for sentence in said:
-            typer.echo(wrapped(sentence) + "\n")
-        typer.echo(identification_text(result, measurements, units))
-        typer.echo(f"\nWritten: {', '.join(map(str, contents))}")
+        contents[out / "fit.html"] = fit_page(result, json.loads(text)).encode()
+    if csv is not None:
+        contents |= {csv / name: frame_bytes(frame) for name, frame in fit_tables(result).items()}
+    if export is not None:
+        name, code = model_code(result.fitted, export, result.units.time)
+        contents[out / name] = code.encode()
+    return contents

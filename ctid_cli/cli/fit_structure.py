@@ -1,14 +1,18 @@
 """From the options of ``ctid fit`` that say what the model is to the estimator of it."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
 
 from ctid_cli.cli._common import span
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import Hold, InitialState, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, InitialState, LossKind, Offset
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.common import Fixed
@@ -21,32 +25,109 @@ ModelForm = Literal["fraction", "additive"]
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the command line says of the model."""
+class ModelOptions:
+    """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
-    model: ModelForm
-    terms: str | None
-    poles: int | None
-    zeros: int | None
-    integrators: int
+    poles: Annotated[
+        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
+    ] = None
+    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles.")] = None
+    delay: Annotated[
+        str | None, typer.Option("--delay", metavar="LOW:HIGH|VALUE", help="Range or value [time unit]; 0.")
+    ] = None
+    model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction"
+    terms: Annotated[
+        str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
+    ] = None
+    integrators: Annotated[
+        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
+    ] = 0
+    fix: Annotated[
+        list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
+    ] = None
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Range of the delay, a known one twice; None where it is not given."""
+        return None if self.delay is None else delay_bounds(self.delay)
+
+    @property
+    def open(self) -> bool:
+        """Whether the degrees are to be searched."""
+        return self.poles is None and self.model == "fraction" and self.terms is None
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """The loop that a record was taken in."""
+
+    loop: Annotated[
+        Path | None, typer.Option("--loop", metavar="FILE", help="YAML with the section loop of the record.")
+    ] = None
+    reference: Annotated[
+        str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
+    ] = None
+    ignore_loop: Annotated[bool, typer.Option("--ignore-loop", help="Fit as if there were no loop.")] = False
+
+    @property
+    def counts(self) -> bool:
+        """Whether the loop is given and taken into account."""
+        return self.loop is not None and not self.ignore_loop
+
+    def check(self) -> None:
+        """Refuse half of what a loop needs."""
+        if self.loop is None and self.reference is not None:
+            raise UsageError("--reference needs the controller too; add --loop FILE with a section loop")
+        if self.loop is not None and self.reference is None and not self.ignore_loop:
+            raise UsageError(
+                "--loop needs the reference too; add --reference COLUMN, or --ignore-loop to fit without it"
+            )
+        if self.ignore_loop and self.loop is None:
+            raise UsageError("--ignore-loop has no loop to ignore; drop it")
+
+    def applied(self, measured: Measurement) -> Measurement:
+        """Return a measurement in its loop, or with a note that this is ignored."""
+        if self.loop is None:
+            return measured
+        from ctid_cli.simulation.record_loop import in_loop
+        from ctid_cli.specification.load import load_loop
+
+        options = load_loop(self.loop)
+        if self.ignore_loop:
+            note = "The loop is ignored (--ignore-loop): noise that comes back through it biases the estimate."
+            return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, note))
+        return in_loop(measured, options)
+
+
+@dataclass(frozen=True)
+class TreatmentOptions:
+    """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
+
+    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest"
+    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none"
+    loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares"
+    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the command line says of the model, with the range of its delay."""
+
+    model: ModelOptions
     delay: tuple[float, float]
-    fix: Sequence[str]
-    initial_state: InitialState
-    offset: Offset
-    loss: LossKind
-    hold: Hold
+    treatment: TreatmentOptions
     #: Whether the loop that the record was taken in is given, and counts.
     loop: bool = False
 
     @property
     def iterated(self) -> bool:
         """Whether the estimator is that of submodels, which knows the delay and takes one record."""
-        return self.model == "additive" or self.loop
+        return self.model.model == "additive" or self.loop
 
 
-def estimator_of(asked: Asked) -> "Options":
+def estimator_of(asked: Asked) -> Options:
     """The estimator; a UsageError says which options do not go together."""
-    _refuse_strangers(asked)
+    _refuse_other_form(asked)
     if asked.iterated:
         _refuse_unable(asked)
     try:
@@ -55,54 +136,60 @@ def estimator_of(asked: Asked) -> "Options":
         raise UsageError(re.sub(r"^fixed\b", "--fix", str(error))) from None
 
 
-def _fraction(asked: Asked) -> "Options":
+def _fraction(asked: Asked) -> Options:
     from ctid_cli.estimators.delay_profile import DelayProfile
 
-    assert asked.poles is not None
-    treatment: dict[str, Any] = {"initial_state": asked.initial_state, "offset": asked.offset, "loss": asked.loss}
+    assert asked.model.poles is not None
+    treatment: dict[str, Any] = {
+        "initial_state": asked.treatment.initial_state,
+        "offset": asked.treatment.offset,
+        "loss": asked.treatment.loss,
+    }
     return DelayProfile(
-        *(asked.poles, asked.zeros or 0, asked.delay),
+        *(asked.model.poles, asked.model.zeros or 0, asked.delay),
         **treatment,
         nested=True,
-        fixed=_fixed(asked.fix),
-        integrators=asked.integrators,
+        fixed=_fixed(asked.model.fix),
+        integrators=asked.model.integrators,
     )
 
 
-def _submodels(asked: Asked) -> "Options":
+def _submodels(asked: Asked) -> Options:
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.models.additive import Term
 
-    if asked.terms is None:
-        assert asked.poles is not None
-        terms: tuple[Term, ...] = (Term(asked.poles, asked.zeros or 0, asked.integrators),)
+    if asked.model.terms is None:
+        assert asked.model.poles is not None
+        terms: tuple[Term, ...] = (Term(asked.model.poles, asked.model.zeros or 0, asked.model.integrators),)
     else:
-        first, *others = _terms(asked.terms, asked.integrators)
+        first, *others = _terms(asked.model.terms, asked.model.integrators)
         terms = (first, *others)
     return MeasuredSubmodels(
         terms,
         asked.delay[0],
         "closed_loop" if asked.loop else "open_loop",
-        asked.initial_state,
-        asked.offset,
-        factored=asked.model == "additive" or asked.integrators > 0,
-        fixed=_fixed(asked.fix),
+        asked.treatment.initial_state,
+        asked.treatment.offset,
+        factored=asked.model.model == "additive" or asked.model.integrators > 0,
+        fixed=_fixed(asked.model.fix),
     )
 
 
-def _refuse_strangers(asked: Asked) -> None:
+def _refuse_other_form(asked: Asked) -> None:
     """Options of one form of the model beside those of the other."""
-    if asked.model == "additive":
-        if asked.terms is None:
+    if asked.model.model == "additive":
+        if asked.model.terms is None:
             raise UsageError(
                 "--model additive needs --terms, poles/zeros of each submodel, for example --terms 2/0,2/1"
             )
-        for name, value in (("--poles", asked.poles), ("--zeros", asked.zeros)):
+        for name, value in (("--poles", asked.model.poles), ("--zeros", asked.model.zeros)):
             if value is not None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
-    elif asked.terms is not None:
+    elif asked.model.terms is not None:
         raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
-    check_integrators(asked.integrators, asked.offset, "--initial-state" if asked.iterated else "--offset")
+    check_integrators(
+        asked.model.integrators, asked.treatment.offset, "--initial-state" if asked.iterated else "--offset"
+    )
 
 
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
@@ -127,17 +214,19 @@ def _refuse_unable(asked: Asked) -> None:
         raise UsageError(
             f"--delay {low:g}:{high:g} cannot be searched for {what}: {why}; give one value, --delay VALUE"
         )
-    if asked.loss != "squares":
-        raise UsageError(f"--loss {asked.loss} is not there for {what}: it is fitted by squares; drop --loss")
-    if asked.offset == "estimate":
+    if asked.treatment.loss != "squares":
+        raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
+    if asked.treatment.offset == "estimate":
         raise UsageError(f"--offset estimate is not there for {what}; use --offset remove")
-    if asked.loop and asked.hold != "zoh":
-        raise UsageError(f"--hold {asked.hold} does not go with --loop: a discrete controller holds its input (zoh)")
-    if asked.loop and asked.fix and asked.model == "fraction" and not asked.integrators:
+    if asked.loop and asked.treatment.hold not in ("auto", "zoh"):
+        raise UsageError(
+            f"--hold {asked.treatment.hold} does not go with --loop: a discrete controller holds its input (zoh)"
+        )
+    if asked.loop and asked.model.fix and asked.model.model == "fraction" and not asked.model.integrators:
         raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
 
 
-def _terms(text: str, integrators: int) -> "list[Term]":
+def _terms(text: str, integrators: int) -> list[Term]:
     """Terms such as ``2/0,2/1``; integrators belong to the first."""
     from ctid_cli.models.additive import Term
 
@@ -151,11 +240,11 @@ def _terms(text: str, integrators: int) -> "list[Term]":
     return [Term(*degrees, integrators * (k == 0)) for k, degrees in enumerate(found)]
 
 
-def _fixed(given: Sequence[str]) -> "tuple[Fixed, ...] | None":
+def _fixed(given: Sequence[str] | None) -> tuple[Fixed, ...] | None:
     from ctid_cli.estimation.common import Fixed
 
     found = []
-    for text in given:
+    for text in given or ():
         name, equals, value = (part.strip() for part in text.partition("="))
         if name == "delay":
             raise UsageError("--fix delay=VALUE is --delay VALUE; use that")
@@ -173,28 +262,3 @@ def delay_bounds(text: str) -> tuple[float, float]:
         return bounds
     allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
     raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
-
-
-# --- the loop ----------------------------------------------------------------------------------------
-
-
-def check_loop(loop: Path | None, reference: str | None, ignored: bool) -> None:
-    """Refuse half of what a loop needs."""
-    if loop is None and reference is not None:
-        raise UsageError("--reference needs the controller too; add --loop FILE with a section loop")
-    if loop is not None and reference is None and not ignored:
-        raise UsageError("--loop needs the reference too; add --reference COLUMN, or --ignore-loop to fit without it")
-    if ignored and loop is None:
-        raise UsageError("--ignore-loop has no loop to ignore; drop it")
-
-
-def with_loop(loop: Path, measured: "Measurement", ignored: bool) -> "Measurement":
-    """The measurement in its loop, or with a note that this is ignored."""
-    from ctid_cli.simulation.record_loop import in_loop
-    from ctid_cli.specification.load import load_loop
-
-    options = load_loop(loop)
-    if ignored:
-        note = "The loop is ignored (--ignore-loop): noise that comes back through it biases the estimate."
-        return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, note))
-    return in_loop(measured, options)

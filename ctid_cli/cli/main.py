@@ -7,12 +7,13 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._common import Command, ComputingCommand
-from ctid_cli.cli.check_commands import CheckCommand, check
+from ctid_cli.cli.accuracy_command import accuracy
+from ctid_cli.cli.check_command import check
+from ctid_cli.cli.compare_command import compare
 from ctid_cli.cli.experiment_commands import run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.init_command import init
-from ctid_cli.cli.model_commands import model
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.page_commands import figure, report
 from ctid_cli.cli.reproduce_command import reproduce
@@ -52,13 +53,12 @@ def _root(
     """
 
 
-app.command(cls=CheckCommand)(check)
 # What shows or moves stored results must not wait for Numba to be loaded.
 _STORED = (status, export, verify, merge, init)
 _RESULTS = (status, table, figure, report, export, verify)
-for _command in (fit, order, frf, track, init, run, reproduce, merge, *_RESULTS, validate, schema):
+_RECORDS = (check, fit, compare, order, frf, track)
+for _command in (*_RECORDS, init, run, reproduce, merge, *_RESULTS, validate, accuracy, schema):
     app.command(cls=Command if _command in _STORED else ComputingCommand)(_command)
-app.add_typer(model, name="model")
 
 
 def main() -> None:

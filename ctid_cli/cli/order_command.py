@@ -1,24 +1,14 @@
 """``ctid order``."""
 
 import json
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import (
-    From,
-    InputColumn,
-    InputHold,
-    Json,
-    OutputColumn,
-    TimeColumn,
-    To,
-    guarded,
-    span,
-    write_files,
-)
+from ctid_cli.canonical import plain
+from ctid_cli.cli._common import InputHold, emit, guarded, span, write_files
+from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.cli.fit_structure import check_integrators, delay_bounds
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import InitialState, Offset
@@ -29,6 +19,8 @@ def order(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
     ],
+    columns: RecordOptions,
+    form: FormatOptions,
     poles: Annotated[str, typer.Option("--poles", metavar="LOW:HIGH", help="Numbers of poles, 1 to 12.")] = "1:6",
     zeros: Annotated[str, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = "0:3",
     delay: Annotated[
@@ -39,15 +31,9 @@ def order(
     integrators: Annotated[int, typer.Option("--integrators", help="Poles at the origin besides.")] = 0,
     offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none",
     hold: InputHold = "zoh",
-    time: TimeColumn = None,
-    input: InputColumn = None,
-    output: OutputColumn = None,
-    start: From = None,
-    stop: To = None,
     validate: Annotated[
         Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record too.")
     ] = None,
-    as_json: Json = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for order.json and order.svg.")] = Path("."),
 ) -> None:
     """Say how many poles and zeros measured records ask for.
@@ -56,48 +42,32 @@ def order(
     here. Residuals that are not white are made so first, by one noise model for all. Writes order.json and order.svg.
     """
     from ctid_cli.estimators.order_search import search_orders
-    from ctid_cli.reporting.identification_report import common_units
-    from ctid_cli.reporting.order_plot import order_drawing
     from ctid_cli.reporting.order_proposal import proposed_delay
-    from ctid_cli.reporting.order_report import order_object, order_text
-    from ctid_cli.signals.measurement import read_measurement
+    from ctid_cli.reporting.order_result import OrderSearchResult
+    from ctid_cli.reporting.records import Records
 
     check_integrators(integrators, offset)
     ranges = _range("--poles", poles, int(not integrators)), _range("--zeros", zeros, 0)
-    bounds = None if delay is None else delay_bounds(delay)
-    read = partial(read_measurement, time=time, input=input, output=output, hold=hold)
-    measurements = [read(file, start=start, stop=stop) for file in files]
-    other = None if validate is None else read(validate)
-    units = common_units(measurements if other is None else [*measurements, other])
-    said = ""
+    bounds, choice = (None if delay is None else delay_bounds(delay)), ""
+    measurements = [columns.read(file, hold) for file in files]
+    records = Records(measurements, None if validate is None else columns.read_whole(validate, hold))
     if bounds is None:
-        bounds, said = proposed_delay([item.record for item in measurements], units.time)
+        bounds, choice = proposed_delay(records.data, records.units.time)
     try:
         found = search_orders(
-            [item.record for item in measurements],
-            *ranges,
-            bounds,
+            *(records.data, *ranges, bounds),
             initial_state=initial_state,
             offset=offset,
-            validation=None if other is None else other.record,
+            validation=records.validation and records.validation.record,
             integrators=integrators,
         )
     except ValueError as error:
         raise UsageError(str(error)) from None
-    data, figure = out / "order.json", out / "order.svg"
-    text = json.dumps(order_object(found, measurements, units, [data, figure]), allow_nan=False)
-    title = ", ".join(file.name for file in files)
-    write_files({data: text.encode() + b"\n", figure: order_drawing(found, title).saved()})
-    if as_json:
-        typer.echo(text)
-    else:
-        parts = [
-            order_text(found, measurements, units),
-            *([f"- {said}"] if said else []),
-            "",
-            f"Written: {data}, {figure}",
-        ]
-        typer.echo("\n".join(parts))
+    result = OrderSearchResult(found, records, choice)
+    written = [out / "order.json", out / "order.svg"]
+    content = json.dumps(plain({**result.content(), "written": list(map(str, written))}), allow_nan=False)
+    write_files({written[0]: content.encode() + b"\n", written[1]: result.drawing().saved()})
+    emit(result, form.form, written)
 
 
 def _range(name: str, text: str, least: int) -> tuple[int, int]:

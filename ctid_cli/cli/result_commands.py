@@ -8,7 +8,7 @@ import typer
 from ctid_cli.cli._common import Out, emit, guarded, write_files
 from ctid_cli.cli._options import FormatOptions
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.document import Format
+from ctid_cli.reporting.document import Format, Tool
 
 
 @guarded
@@ -95,7 +95,9 @@ def table(
 
 @guarded
 def export(
-    experiment: Annotated[str | None, typer.Argument(metavar="[EXPERIMENT]", help="Name of the experiment.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Experiment (quickstart), or a fit (fit.json).")
+    ] = None,
     id: Annotated[
         str | None, typer.Option("--id", metavar="ID", help="One estimate in full, by the first letters of its id.")
     ] = None,
@@ -103,22 +105,43 @@ def export(
         Format | None, typer.Option("--format", help="Form of the output: csv or json; of one estimate any form.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
+    tool: Annotated[Tool | None, typer.Option("--as", help="Of a fit: the tool that the model is for.")] = None,
+    pade: Annotated[
+        int | None, typer.Option("--pade", metavar="ORDER", help="With --as control: approximate the delay.")
+    ] = None,
     out: Out = Path("results"),
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
 ) -> None:
-    """Write every estimate of an experiment, one row each, or one estimate in full.
+    """Write every estimate of an experiment, one row each, one of them in full, or a fit as code for another tool.
 
     `ctid status EXPERIMENT` lists the identifiers of failed estimates.
     """
     form = "json" if json else format
-    if id is not None:
-        _export_one(experiment, id, form or "text", out, file)
-    elif experiment is None:
+    if name is not None and name.endswith(".json"):
+        _export_fit(Path(name), tool, pade, file)
+    elif tool is not None or pade is not None:
+        raise UsageError("--as and --pade are for a fit (fit.json), not for an experiment")
+    elif id is not None:
+        _export_one(name, id, form or "text", out, file)
+    elif name is None:
         raise UsageError("name an experiment, or one estimate with --id")
     elif form not in (None, "csv", "json"):
         raise UsageError(f"all estimates are written as csv or json, not as {form}; --id gives one of them in any form")
     else:
-        _export_all(experiment, form or "csv", out, file)
+        _export_all(name, form or "csv", out, file)
+
+
+def _export_fit(path: Path, tool: Tool | None, pade: int | None, file: Path | None) -> None:
+    """Write the model of a stored fit as code."""
+    from ctid_cli.reporting.fit_tables import stored_model_code
+
+    if tool is None:
+        raise UsageError(f"{path} is a fit; say which tool it is for: --as control, matlab or scipy")
+    code = stored_model_code(path, tool, pade)
+    if file is None:
+        typer.echo(code, nl=False)
+    else:
+        write_files({file: code.encode()})
 
 
 def _export_all(experiment: str, form: Format, out: Path, file: Path | None) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ctid_cli.cli._common import From, Json, TimeColumn, To, answer, given_command, guarded, write_files
+from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
+from ctid_cli.cli._options import FormatOptions
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 
@@ -18,22 +20,44 @@ if TYPE_CHECKING:
     from ctid_cli.tones.track import Track
 
 
-@guarded
-def track(
-    context: typer.Context,
-    file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
-    tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto",
-    time: TimeColumn = None,
-    signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None,
-    interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None,
-    rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None,
-    start: From = None,
-    stop: To = None,
+@dataclass(frozen=True)
+class SignalOptions:
+    """Which column and which part of a recorded signal is used, and its clock."""
+
+    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None
+    signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None
+    interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None
+    rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None
+    start: Annotated[
+        float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")
+    ] = None
+    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None
+
+    def reading(self) -> Reading:
+        """Return how the signal is read from its file."""
+        from ctid_cli.storage.track_file import Reading
+
+        if self.interval is not None and self.rate is not None:
+            raise UsageError("--interval and --rate say the same; give one of them")
+        for name, value in (("--interval", self.interval), ("--rate", self.rate)):
+            if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
+                raise UsageError(f"{name} must be a positive number, not {value:g}")
+        for name, value in (("--from", self.start), ("--to", self.stop)):
+            if value is not None and not math.isfinite(value):
+                raise UsageError(f"{name} must be an instant, not {value:g}")
+        interval = self.interval if self.rate is None else 1.0 / self.rate
+        return Reading(self.time, self.signal, interval, self.start, self.stop)
+
+
+@dataclass(frozen=True)
+class ToneOptions:
+    """How tones are followed; None where it is chosen from the record."""
+
+    tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto"
     every: Annotated[
-        float | None,
-        typer.Option("--every", metavar="SECONDS", help="One row every so often; about 1000 if not given."),
-    ] = None,
-    window: Annotated[float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows.")] = None,
+        float | None, typer.Option("--every", metavar="SECONDS", help="Time between rows; about 1000 rows by default.")
+    ] = None
+    window: Annotated[float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows.")] = None
     accuracy: Annotated[
         float | None,
         typer.Option(
@@ -41,78 +65,74 @@ def track(
             metavar="HZ",
             help="Rows with a larger standard error are not valid; .001 of the tone's frequency if not given.",
         ),
-    ] = None,
-    as_json: Json = False,
-    style: Annotated[Literal["csv", "h5"], typer.Option("--format", help="Form of the track.")] = "csv",
+    ] = None
+
+    def require_sensible(self) -> None:
+        """Refuse what no tones can be followed with."""
+        from ctid_cli.tones.constants import MOST_ASKED
+
+        for name, value in (("--every", self.every), ("--window", self.window)):
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
+        if self.accuracy is not None and not 0 < self.accuracy < math.inf:
+            raise UsageError(f"--accuracy must be a positive number of hertz, not {self.accuracy:g}")
+        if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_ASKED):
+            raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {self.tones!r}")
+
+    def follow(self, record: SampledSignal) -> Track:
+        """Return the track of a record."""
+        from ctid_cli.tones.track import track as follow
+
+        tones = None if self.tones == "auto" else int(self.tones)
+        try:
+            with RecordProgress(Path(record.file).name) as tell:
+                return follow(record, tones, self.accuracy, self.every, self.window, on_progress=tell)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+
+@guarded
+def track(
+    context: typer.Context,
+    file: Annotated[Path, typer.Argument(metavar="SIGNAL", help="Recorded signal (.csv, .mat, .wav, .flac).")],
+    part: SignalOptions,
+    options: ToneOptions,
+    form: FormatOptions,
+    hdf5: Annotated[bool, typer.Option("--hdf5", help="Write track.h5 in place of track.csv.")] = False,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
 ) -> None:
     """Follow the frequencies of a recorded sum of sinusoids.
 
     Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
     trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
-    a page of. All the rest is chosen from the record, and said.
+    a page of. All the rest is chosen from the record, and printed.
     """
-    from ctid_cli.storage.track_file import Reading
+    reading = part.reading()
+    options.require_sensible()
+    written = [out / f"track.{'h5' if hdf5 else 'csv'}", out / "track.svg", out / "track.json"]
+    refuse_overwriting([file], written)
+    record = reading.read(file)
+    _require_part(record, reading)
+    from ctid_cli.reporting.figures.style import load_matplotlib
 
-    reading = Reading(time, signal, _interval(interval, rate), start, stop)
-    for name, value in (("--from", start), ("--to", stop)):
-        if value is not None and not math.isfinite(value):
-            raise UsageError(f"{name} must be an instant, not {value:g}")
+    load_matplotlib()
+    found = options.follow(record)
     from concurrent.futures import ThreadPoolExecutor
 
-    from ctid_cli.reporting.figures.style import load_matplotlib
-    from ctid_cli.reporting.track_columns import track_bytes, track_table
-    from ctid_cli.reporting.track_plot import track_drawing
-    from ctid_cli.reporting.track_report import track_object, track_text
+    from ctid_cli.canonical import plain
+    from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
+    from ctid_cli.reporting.track_result import TrackResult
     from ctid_cli.storage.track_file import track_file_text
     from ctid_cli.tones.residual import with_lines_left
 
-    data, figure, result = out / f"track.{style}", out / "track.svg", out / "track.json"
-    if any(file.exists() and written.exists() and file.samefile(written) for written in (data, figure, result)):
-        raise UsageError(f"{file} would be overwritten by the track; write it elsewhere (--out DIR)")
-    for name, value in (("--every", every), ("--window", window)):
-        if value is not None and not 0 < value < math.inf:
-            raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
-    if accuracy is not None and not 0 < accuracy < math.inf:
-        raise UsageError(f"--accuracy must be a positive number of hertz, not {accuracy:g}")
-    record = reading.read(file)
-    _require_part(record, reading)
-    load_matplotlib()
-    found = _follow(record, Asked(_tones(tones), accuracy, every, window))
     with ThreadPoolExecutor(1) as thread:
-        drawing = track_drawing(found, record.start, record.unit, file.name)
-        drawn = thread.submit(drawing.saved)
+        drawn = thread.submit(TrackResult(found, record).drawing().saved)
         found = with_lines_left(found, record.samples, record.interval)
-    files = [data, figure, result]
-    content = track_object(record, found, accuracy)
-    text = track_file_text(found, content, file, reading, out, given_command(context))
-    table = track_bytes(track_table(found, record.start), style, record.unit)
-    write_files({data: table, figure: drawn.result(), result: text.encode() + b"\n"})
-    answer(
-        as_json,
-        lambda: content | {"written": [str(each) for each in files]},
-        lambda: f"{track_text(record, found, accuracy)}\n\nWritten: {', '.join(map(str, files))}",
-    )
-
-
-class Asked(NamedTuple):
-    """What a track is asked for; None where it is to be chosen."""
-
-    tones: int | None
-    accuracy: float | None
-    every: float | None
-    window: float | None
-
-
-def _follow(record: SampledSignal, asked: Asked) -> Track:
-    """Return the track of a record."""
-    from ctid_cli.tones.track import track as follow
-
-    try:
-        with RecordProgress(Path(record.file).name) as tell:
-            return follow(record, *asked, on_progress=tell)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
+    result = TrackResult(found, record, options.accuracy)
+    text = track_file_text(found, plain(result.content()), file, reading, out, given_command(context))
+    table = (hdf5_bytes if hdf5 else frame_bytes)(result.to_frame())
+    write_files(dict(zip(written, (table, drawn.result(), text.encode() + b"\n"), strict=True)))
+    emit(result, form.form, written)
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
@@ -123,23 +143,3 @@ def _require_part(record: SampledSignal, reading: Reading) -> None:
         end = record.start + (record.samples.size - 1) * record.interval
         part = f"--from and --to leave {record.samples.size} samples, from {record.start:.6g} to {end:.6g} s"
         raise UsageError(f"{part}; there must be {FEWEST}. Both are in the unit of the file's times")
-
-
-def _tones(text: str) -> int | None:
-    """The number of tones; None to have it chosen."""
-    from ctid_cli.tones.constants import MOST_ASKED
-
-    if text == "auto":
-        return None
-    if not text.isdecimal() or int(text) > MOST_ASKED:
-        raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {text!r}")
-    return int(text)
-
-
-def _interval(interval: float | None, rate: float | None) -> float | None:
-    if interval is not None and rate is not None:
-        raise UsageError("--interval and --rate say the same; give one of them")
-    for name, value in (("--interval", interval), ("--rate", rate)):
-        if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
-            raise UsageError(f"{name} must be a positive number, not {value:g}")
-    return interval if rate is None else 1.0 / rate

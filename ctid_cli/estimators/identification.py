@@ -32,7 +32,7 @@ from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.signals.record import Record
-from ctid_cli.text import ShownAsTable
+from ctid_cli.text import Shown
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
@@ -60,7 +60,7 @@ class Validation(DeferredFields):
 
 
 @dataclass(frozen=True, eq=False)
-class Identification(DeferredFields, FittedModel, ShownAsTable):
+class Identification(DeferredFields, FittedModel, Shown):
     """A fit, its uncertainty, and its diagnostics.
 
     Parameters

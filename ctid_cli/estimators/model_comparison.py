@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,13 +31,13 @@ class ModelOnRecord:
     rms : float
         Root mean square of the residuals [output unit].
     count : int
-        Number of samples used.
+        Number of samples used, the same of all models that are compared.
     initial_state, offset : str
-        What was done about the state before the record and a constant offset.
+        Treatment of the state before the record and of a constant offset.
     t : ndarray, shape (count,)
         Instants of the used samples [s].
     measured, simulated, residuals : ndarray, shape (count,)
-        Output, what the model answers, and the difference [output unit].
+        Output, that of the model, and the difference [output unit].
     tests : ResidualTests or None
         Auto- and cross-correlation of the residuals with what they mean; None of too few samples.
     """
@@ -61,7 +62,7 @@ def compare(
     initial_state: InitialState | None = None,
     offset: Offset | None = None,
 ) -> tuple[ModelOnRecord, ...]:
-    """Several models on one record, none of them fitted to it.
+    """Compare several models on the same samples of one record, none of them fitted to it.
 
     Parameters
     ----------
@@ -106,12 +107,23 @@ def compare(
     """
     if not fits:
         raise UsageError("there is no model to compare")
-    return tuple(_on_record(fit, record, initial_state, offset) for fit in fits)
+    applied = [_applied(fit, record, initial_state, offset) for fit in fits]
+    common = np.logical_and.reduce([each.use for each in applied])
+    return tuple(_on_record(fit, record, each, common) for fit, each in zip(fits, applied, strict=True))
 
 
-def _on_record(
-    fit: FittedModel, record: Record, initial_state: InitialState | None, offset: Offset | None
-) -> ModelOnRecord:
+class _Applied(NamedTuple):
+    """A model with its residuals and their slopes by its parameters, at the samples that it has both of."""
+
+    initial_state: InitialState
+    offset: Offset
+    use: BoolArray
+    residuals: Array
+    slopes: Array
+
+
+def _applied(fit: FittedModel, record: Record, initial_state: InitialState | None, offset: Offset | None) -> _Applied:
+    """Apply a model to a record, with the treatment that is asked for or that of its own estimation."""
     own: tuple[InitialState, Offset] = "rest", "none"
     if isinstance(fit, Identification):
         own = fit.options.initial_state, fit.options.offset
@@ -124,24 +136,28 @@ def _on_record(
     if (state, shift) == ("rest", "none"):
         use: BoolArray = record.valid & (record.t >= record.input.t[0])
         residuals = (record.y - parametric.simulated(record.input, record.t))[use]
-        psi = parametric.output_slopes(record.input, record.t)[use]
-    else:
-        applied = _treated(fit, parametric, record, state, shift)
-        use, residuals, psi = applied.used[0], applied.residuals[0], applied.sensitivities[0]
-    measured = record.y[use]
+        return _Applied(state, shift, use, residuals, parametric.output_slopes(record.input, record.t)[use])
+    found = _treated(fit, parametric, record, state, shift)
+    return _Applied(state, shift, found.used[0], found.residuals[0], found.sensitivities[0])
+
+
+def _on_record(fit: FittedModel, record: Record, applied: _Applied, common: BoolArray) -> ModelOnRecord:
+    """Return how well a model fits the samples that all models have."""
+    kept = common[applied.use]
+    residuals, slopes, measured = applied.residuals[kept], applied.slopes[kept], record.y[common]
     tests = None
     if residuals.size >= FEWEST_TESTED:
-        moving = psi[:, psi.any(axis=0)]
-        delayed = record.input.at(record.t[use] - delay)
+        moving = slopes[:, slopes.any(axis=0)]
+        delayed = record.input.at(record.t[common] - fit._estimated().parametric.model.delay)
         tests = residual_tests(residuals, delayed, sensitivities=moving if moving.size else None)
     return ModelOnRecord(
         fit_percent=fit_percent(measured, measured - residuals),
         r2=r_squared(measured, measured - residuals),
         rms=float(np.sqrt(np.mean(residuals**2))),
         count=residuals.size,
-        initial_state=state,
-        offset=shift,
-        t=record.t[use],
+        initial_state=applied.initial_state,
+        offset=applied.offset,
+        t=record.t[common],
         measured=measured,
         simulated=measured - residuals,
         residuals=residuals,

@@ -18,7 +18,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
-from ctid_cli.text import ShownAsTable
+from ctid_cli.text import Shown
 
 #: More tones than this cannot be told apart in double precision.
 MOST_TONES = 8
@@ -27,7 +27,7 @@ LARGEST_SAMPLE = 1e30
 
 
 @dataclass(frozen=True, eq=False)
-class FrequencyTrack(ShownAsTable):
+class FrequencyTrack(Shown):
     """Frequencies over time.
 
     Parameters

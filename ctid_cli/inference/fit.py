@@ -16,7 +16,7 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.text import ShownAsTable, wrapped
+from ctid_cli.text import Shown, wrapped
 
 
 class Status(Enum):
@@ -98,7 +98,7 @@ class IterationRecord:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Fit(FittedModel, ShownAsTable):
+class Fit(FittedModel, Shown):
     """An estimated model, its accuracy, and how it was reached.
 
     Parameters

@@ -15,8 +15,10 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.inference.intervals import robust_deviation
+from ctid_cli.signals.record import Record
 
 #: The losses that are not squares.
 RobustKind = Literal["huber", "tukey"]
@@ -80,6 +82,19 @@ class Weighting(DeferredFields):
     def outliers(self) -> tuple[BoolArray, ...]:
         """Which used samples of each record count for less than half under Huber's loss, for nothing under Tukey's."""
         return tuple(w < HALF if self.kind == "huber" else w == 0.0 for w in self.weights)
+
+    def outlier_times(self, records: Sequence[Record], used: Sequence[BoolArray]) -> list[Array]:
+        """Instants of the outliers of each record, of which some samples are used."""
+        return [record.t[use][out] for record, use, out in zip(records, used, self.outliers, strict=True)]
+
+    def fit_percent(self, records: Sequence[Record], used: Sequence[BoolArray], residuals: Sequence[Array]) -> float:
+        """Fit over the used samples that are no outliers, means by record [%]."""
+        squares = spread = 0.0
+        for record, use, out, r in zip(records, used, self.outliers, residuals, strict=True):
+            y = record.y[use][~out]
+            squares += float(np.sum(r[~out] ** 2))
+            spread += float(np.sum((y - y.mean()) ** 2))
+        return percent_from_r_squared(1.0 - squares / spread)
 
 
 def scale_of(errors: Array, least: float) -> float:

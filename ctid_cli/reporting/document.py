@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 #: Forms in which a result is written to stdout.
 Format = Literal["text", "json", "md", "csv", "html", "latex"]
+#: Tools that a model is exported to.
+Tool = Literal["control", "matlab", "scipy"]
+
+
+#: Width of the labels of a list in text.
+LABEL = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +91,13 @@ class Result(ABC):
         return self.write("html")
 
 
+def pairs(rows: Iterable[Sequence[str]]) -> pd.DataFrame:
+    """Return labels and texts as a table without titles, which is rendered as a list."""
+    import pandas as pd
+
+    return pd.DataFrame(rows, columns=["", ""])
+
+
 def cell(value: Any, form: str = ".6g") -> str:
     """Return a cell of a table as text: a number in its format, a dash where there is none."""
     if isinstance(value, bool):
@@ -132,6 +145,8 @@ def _paragraph(sentence: str) -> str:
 
 
 def _text_table(lines: list[list[str]], sides: str) -> str:
+    if not any(lines[0]):
+        return "\n".join(wrapped(f"{label:{LABEL}} {text}", hanging=" " * (LABEL + 1)) for label, text in lines[1:])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     formats = [f"{'<' if side == 'l' else '>'}{width}" for side, width in zip(sides, widths, strict=True)]
     header, *body = ("  ".join(map(format, row, formats)).rstrip() for row in lines)

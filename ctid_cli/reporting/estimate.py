@@ -1,15 +1,20 @@
 """One estimate: its parameters with their uncertainty, and as a row of an export."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.inference.intervals import NORMAL, UncertainValue
 from ctid_cli.reporting.layout import Table, number
 from ctid_cli.signals.sampled_signal import SECONDS
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: Keys that every estimate carries in machine-readable output, in this order.
 ESTIMATE_KEYS = (
@@ -111,6 +116,25 @@ def parameter_object(item: UncertainValue) -> dict[str, Any]:
     """A parameter for JSON."""
     names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
     return dict(plain({name: getattr(item, name) for name in names}))
+
+
+#: Formats of the numbers of a table of parameters.
+PARAMETER_FORMATS = {
+    "estimate": ".6g",
+    "standard error": ".3g",
+    "relative %": ".2g",
+    "95 % low": ".5g",
+    "95 % high": ".5g",
+}
+
+
+def parameter_frame(found: Iterable[UncertainValue]) -> pd.DataFrame:
+    """Return parameters as a table."""
+    import pandas as pd
+
+    names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
+    titles = ["parameter", *PARAMETER_FORMATS, "unit", "status"]
+    return pd.DataFrame([[getattr(item, name) for name in names] for item in found], columns=titles)
 
 
 def parameter_table(found: Iterable[UncertainValue]) -> Table:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 #: Points of an ellipse.
 AROUND = np.linspace(0.0, 2 * np.pi, 121)
-#: Bands that are wider than this would be all that is seen: so many decades of gain, so many degrees.
+#: Bands of the gain [dB] are cut at this distance from it; a wider band of the phase [degrees] says nothing.
 WIDEST_GAIN, WIDEST_PHASE = 40.0, 180.0
 
 
@@ -59,8 +59,8 @@ def draw_bode(gain: Any, phase: Any, band: FrequencyBand, label: str = "model", 
     shade["label"] = f"{100 * band.level:.3g} % band of the {label}"
     low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
     gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **shade)
-    ends = (np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper))
-    phase.fill_between(w, np.maximum(ends[0], angle - WIDEST_PHASE), np.minimum(ends[1], angle + WIDEST_PHASE), **shade)
+    lower, upper = np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper)
+    phase.fill_between(w, lower, upper, where=upper - lower <= WIDEST_PHASE, **shade)
     gain.semilogx(w, size, label=label, **style)
     phase.semilogx(w, angle, label=label, **style)
 

@@ -10,7 +10,7 @@ from ctid_cli.estimation.optimum.best_model import liveliest
 from ctid_cli.estimators.order_search import recommend_order
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.inference.response_test import AnswerTest
-from ctid_cli.reporting.order_report import spelled
+from ctid_cli.reporting.order_result import spelled
 from ctid_cli.reporting.record_findings import check_record_quality
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record

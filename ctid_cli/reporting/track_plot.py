@@ -1,21 +1,21 @@
-"""The figures of a track: frequencies over time, and amplitudes below."""
+"""Figures of a track: its tones over time, the signal with its spectrogram, and spectra of what the tones leave."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.reporting.figures.style import BAND, Drawing, plain, ramp, spread
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, outline, plain, ramp
+from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.residual import LeftOver, without_spikes
 from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-#: The figure of ``ctid track``, and its halves.
-Kind = Literal["tones", "frequencies", "amplitudes"]
+TURN = 2.0 * np.pi
 #: Up to so many tones get a panel each, which shows how far they move; more share one.
 MOST_PANELS = 5
 #: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
@@ -23,57 +23,44 @@ SHOWN_PERCENT = 98.0
 MARGIN = 0.35
 #: Amplitudes that differ by more than this factor are drawn on a logarithmic axis.
 LOGARITHMIC = 10.0
-#: The axis of the others ends at so many times the largest.
-HEADROOM = 1.1
+#: The frequency axes end at so many times the highest tone or line, or at the Nyquist frequency.
+BEYOND = 2.0
+#: A spectrogram has so many columns, of segments in which the closest tones are so many bins apart where it is long
+#: enough, shows so many decibels, and has at most so many rows.
+COLUMNS = 480
+RESOLVED_BINS = 8.0
+SHORTEST, LONGEST = 64, 2**15
+RANGE_DB = 70.0
+MOST_ROWS = 360
+#: Missing lines that have their frequency beside them, and how far the axes go below the median of what is left.
+NAMED_LINES = 8
+BELOW = 30.0
 
 
-def track_drawing(track: Track, start: float, unit: str | None, title: str, kind: Kind | None = None) -> Drawing:
-    """A figure of a track: of all that it holds where no kind is given."""
-    t, styles = start + track.t, ramp(track.omega.shape[1])[: track.omega.shape[1]]
-    panels = min(max(len(styles), 1), MOST_PANELS) if len(styles) <= MOST_PANELS else 1
-    upper = 1.15 * panels if panels > 1 else 2.6
-    alone = kind if np.isfinite(track.amplitudes).any() or kind == "amplitudes" else "frequencies"
+def track_drawing(track: Track, start: float, unit: str | None, title: str) -> Drawing:
+    """Return the figure of frequencies over time, with amplitudes below where they are known."""
+    t, count = start + track.t, track.omega.shape[1]
+    # The highest tone on top, as on a sheet of music; a tone that is never valid lies lowest.
+    order = np.argsort([-_middle(track, k) for k in range(count)], kind="stable").tolist()
+    panels = [[k] for k in order] if 0 < count <= MOST_PANELS else [order]
+    has_amplitudes = bool(np.isfinite(track.amplitudes).any())
+    height = 1.15 if len(panels) > 1 else 2.6
+    heights = [height] * len(panels) + [1.7] * has_amplitudes
 
     def draw(figure: Figure) -> None:
-        if alone == "frequencies":
-            _draw_all_frequencies(figure, figure.add_gridspec(panels, 1), track, t, styles)
-            figure.axes[-1].tick_params(labelbottom=True)
-            figure.axes[-1].set_xlabel("t [s]")
-            figure.axes[-1].margins(x=0.0)
-        elif alone == "amplitudes":
-            _draw_amplitudes(figure.add_subplot(), track, t, unit, styles)
-        else:
-            ratios = [1.0] * panels + [1.5] if panels > 1 else [2.2, 1.4]
-            grid = figure.add_gridspec(panels + 1, 1, height_ratios=ratios)
-            first = _draw_all_frequencies(figure, grid, track, t, styles)
-            _draw_amplitudes(figure.add_subplot(grid[-1], sharex=first), track, t, unit, styles)
-        figure.axes[0].set_title(plain(title), loc="left")
+        axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+        colours = [style["color"] for style in ramp(count)]
+        for panel, tones in zip(axes, panels, strict=False):
+            _draw_frequencies(panel, track, t, tones, colours)
+            panel.set_ylabel("frequency [Hz]" if len(panels) == 1 else f"tone {tones[0] + 1} [Hz]")
+        if has_amplitudes:
+            _draw_amplitudes(axes[-1], track, t, colours)
+            axes[-1].set_ylabel(f"amplitude [{plain(unit)}]" if unit else "amplitude")
+        axes[0].set_title(plain(title), loc="left")
+        axes[-1].set_xlabel("t [s]")
+        axes[-1].margins(x=0.0)
 
-    heights = {"frequencies": 1.1 + upper, "amplitudes": 3.2}
-    return Drawing(7.2, heights.get(alone or "tones", 2.8 + upper), draw)
-
-
-def _draw_all_frequencies(figure: Figure, grid: Any, track: Track, t: Array, styles: list[dict[str, Any]]) -> Any:
-    """Draw the tones into the first places of a grid, and return the first panel."""
-    tones = len(styles)
-    panels = tones if 0 < tones <= MOST_PANELS else 1
-    # The highest tone on top, as on a sheet of music; a tone that is never valid lies lowest.
-    order = np.argsort([_middle(track, k) for k in range(tones)])[::-1]
-    first: Any = None
-    for row in range(panels):
-        mine = [int(order[row])] if panels > 1 or tones == 1 else list(range(tones))
-        axes = figure.add_subplot(grid[row], sharex=first)
-        first = first or axes
-        _draw_frequencies(axes, track, t, [(k, styles[k]) for k in mine])
-        if panels > 1:
-            place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top", "fontsize": 8}
-            axes.annotate(f"tone {mine[0] + 1}", (0.995, 0.92), **place)
-        _shade(axes, t, np.all(~track.valid[:, mine], axis=1))
-    if panels > 1:
-        figure.supylabel("frequency [Hz]", fontsize=9)
-    else:
-        first.set_ylabel("frequency [Hz]")
-    return first
+    return Drawing(7.2, 1.1 + sum(heights), draw)
 
 
 def _middle(track: Track, k: int) -> float:
@@ -82,73 +69,56 @@ def _middle(track: Track, k: int) -> float:
     return float(np.median(omega)) if omega.size else 0.0
 
 
-def _draw_frequencies(axes: Any, track: Track, t: Array, lines: list[tuple[int, dict[str, Any]]]) -> None:
-    frequencies = track.omega / (2.0 * np.pi)
-    for k, style in lines:
-        valid = track.valid[:, k]
-        axes.plot(t, np.where(valid, np.nan, frequencies[:, k]), color=style["color"], linewidth=0.4, alpha=0.6)
-        draw_band(axes, t, frequencies[:, k], track.error[:, k] / (2.0 * np.pi), valid, style["color"])
-        _line(axes, t, np.where(valid, frequencies[:, k], np.nan), {**style, "linestyle": "-"})
-    which = [k for k, _ in lines]
-    _limit(axes, frequencies[:, which], track.valid[:, which])
-    axes.tick_params(labelbottom=False)
+def _draw_frequencies(axes: Any, track: Track, t: Array, tones: list[int], colours: list[Any]) -> None:
+    hertz, valid = track.omega / TURN, track.valid
+    for k in tones:
+        axes.plot(t, np.where(valid[:, k], np.nan, hertz[:, k]), color=colours[k], linewidth=0.4, alpha=0.6)
+        _draw_valid(axes, t, hertz[:, k], track.error[:, k] / TURN, valid[:, k], colours[k], "-")
+    shown = hertz[:, tones][valid[:, tones]] if valid[:, tones].any() else hertz[:, tones]
+    shown = shown[np.isfinite(shown)]
+    if shown.size:
+        # What strays may leave the axes.
+        rest = 0.5 * (100.0 - SHOWN_PERCENT)
+        low, high = np.percentile(shown, [rest, 100.0 - rest])
+        room = max(MARGIN * (high - low), 1e-4 * high, 1e-12)
+        axes.set_ylim(low - room, high + room)
     axes.ticklabel_format(axis="y", useOffset=False)
+    _shade(axes, t, ~valid[:, tones].any(axis=1))
 
 
-def draw_band(axes: Any, t: Array, values: Array, errors: Array, valid: BoolArray, color: str) -> None:
-    """A band of one standard error, where it is known."""
-    known = valid & np.isfinite(errors)
-    if known.any():
-        low, high = np.where(known, values - errors, np.nan), np.where(known, values + errors, np.nan)
-        axes.fill_between(t, low, high, color=color, alpha=0.25, linewidth=0.0)
-
-
-def _draw_amplitudes(axes: Any, track: Track, t: Array, unit: str | None, styles: list[dict[str, Any]]) -> None:
-    ends = []
-    for k, style in enumerate(styles):
-        values = np.where(track.valid[:, k], track.amplitudes[:, k], np.nan)
-        draw_band(axes, t, values, track.amplitude_error[:, k], track.valid[:, k], style["color"])
-        _line(axes, t, values, style)
-        finite = values[np.isfinite(values)]
-        ends.append(float(finite[-1]) if finite.size else np.nan)
+def _draw_amplitudes(axes: Any, track: Track, t: Array, colours: list[Any]) -> None:
+    for k, style in enumerate(ramp(len(colours))):
+        parts = track.amplitudes[:, k], track.amplitude_error[:, k], track.valid[:, k]
+        _draw_valid(axes, t, *parts, colours[k], style["linestyle"], label=str(k + 1))
     seen = track.amplitudes[track.valid]
     seen = seen[np.isfinite(seen) & (seen > 0)]
     if seen.size and np.percentile(seen, 95) > LOGARITHMIC * np.percentile(seen, 5):
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.5 * float(seen.min()))
     elif seen.size:
-        axes.set_ylim(0.0, HEADROOM * float(seen.max()))
-    axes.set(xlabel="t [s]", ylabel=f"amplitude [{plain(unit)}]" if unit else "amplitude")
-    axes.margins(x=0.0)
-    if t.size > 1:
-        axes.set_xlim(t[0], t[-1])
-    _shade(axes, t, np.all(~track.valid, axis=1))
-    if len(ends) > 1:
-        _label_ends(axes, np.array(ends))
+        axes.set_ylim(0.0, 1.1 * float(seen.max()))
+    if len(colours) > 1:
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7)
+    _shade(axes, t, ~track.valid.any(axis=1))
 
 
-def _line(axes: Any, t: Array, values: Array, style: dict[str, Any]) -> None:
+def _draw_valid(
+    axes: Any, t: Array, values: Array, errors: Array, valid: BoolArray, colour: Any, line: Any, label: str = ""
+) -> None:
+    """Draw valid values with a band of one standard error where it is known."""
+    values = np.where(valid, values, np.nan)
+    if np.isfinite(values - errors).any():
+        axes.fill_between(t, values - errors, values + errors, color=colour, alpha=0.25, linewidth=0.0)
     # A valid row between two that are not would be no line.
-    lonely = np.isfinite(values) & ~np.isfinite(np.roll(values, 1)) & ~np.isfinite(np.roll(values, -1))
-    axes.plot(t, values, linewidth=1.2, **style)
-    axes.plot(t[lonely], values[lonely], ".", color=style["color"], markersize=3)
+    known = np.isfinite(values)
+    lonely = known & ~np.roll(known, 1) & ~np.roll(known, -1)
+    style = {"color": colour, "linestyle": line, "linewidth": 1.2, "marker": ".", "markersize": 3, "label": label}
+    axes.plot(t, values, markevery=np.flatnonzero(lonely).tolist(), **style)
 
 
-def _limit(axes: Any, frequencies: Array, valid: BoolArray) -> None:
-    """Show the valid rows; what strays elsewhere may leave the axes."""
-    shown = frequencies[valid] if valid.any() else frequencies
-    shown = shown[np.isfinite(shown)]
-    if not shown.size:
-        return
-    rest = 0.5 * (100.0 - SHOWN_PERCENT)
-    low, high = np.percentile(shown, [rest, 100.0 - rest])
-    room = max(MARGIN * (high - low), 1e-4 * high, 1e-12)
-    axes.set_ylim(low - room, high + room)
-
-
-def _shade(axes: Any, t: Array, grey: Any) -> None:
-    """Grey bands where nothing that is drawn is valid."""
-    if t.size < 2 or not grey.any():
+def _shade(axes: Any, t: Array, grey: BoolArray) -> None:
+    """Draw grey bands where nothing that is drawn is valid."""
+    if t.size < 2:
         return
     half = 0.5 * float(t[1] - t[0])
     steps = np.diff(np.concatenate(([0], grey.astype(np.int8), [0])))
@@ -156,14 +126,90 @@ def _shade(axes: Any, t: Array, grey: Any) -> None:
         axes.axvspan(t[a] - half, t[b - 1] + half, color=BAND, linewidth=0.0, zorder=0)
 
 
-def _label_ends(axes: Any, ends: Array) -> None:
-    """Numbers of the tones beside the ends of their lines."""
-    low, high = axes.get_ylim()
-    log = axes.get_yscale() == "log"
-    scale = np.log if log else np.asarray
-    known = np.flatnonzero(np.isfinite(ends) & (ends > 0))
-    if not known.size:
-        return
-    places = (scale(ends[known]) - scale(low)) / (scale(high) - scale(low))
-    for k, place in zip(known, spread(places, 0.1), strict=True):
-        axes.annotate(str(k + 1), (1.008, float(place)), xycoords="axes fraction", ha="left", va="center", fontsize=8)
+def highest_shown(track: Track, interval: float) -> float:
+    """Return where the frequency axes end [Hz]."""
+    frequencies = [*track.omega[np.isfinite(track.omega)].tolist(), *(line.omega for line in track.missing)]
+    nyquist = 0.5 / interval
+    return min(nyquist, BEYOND * max(frequencies) / TURN) if frequencies else nyquist
+
+
+def signal_drawing(signal: SampledSignal, track: Track) -> Drawing:
+    """Return the figure of the signal over time, and its spectrogram."""
+
+    def draw(figure: Figure) -> None:
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.6])
+        t = signal.start + signal.interval * np.arange(signal.samples.size, dtype=np.float64)
+        upper.plot(*outline(t, signal.samples), color=DARK, linewidth=0.6)
+        upper.set_ylabel(f"{plain(signal.column)} [{plain(signal.unit)}]" if signal.unit else plain(signal.column))
+        top = highest_shown(track, signal.interval)
+        levels, first, last = _spectrogram(signal, track, top)
+        place: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": (first, last, 0.0, top)}
+        image = lower.imshow(levels, cmap="Greys", vmin=-RANGE_DB, vmax=0.0, **place)
+        lower.grid(visible=False)
+        lower.set(xlabel="t [s]", ylabel="frequency [Hz]")
+        upper.set_xlim(t[0], max(t[-1], t[0] + signal.interval))
+        figure.colorbar(image, ax=lower, label="dB below the strongest", pad=0.01)
+
+    return Drawing(8.0, 4.8, draw)
+
+
+def _spectrogram(signal: SampledSignal, track: Track, top: float) -> tuple[Array, float, float]:
+    """Return levels [dB] over frequency, from 0 to `top` [Hz], and time, with the instants where that begins and ends."""
+    from scipy.signal import spectrogram
+
+    values = np.nan_to_num(without_spikes(signal.samples))
+    size = min(_segment(values.size, signal.interval, track), values.size)
+    step = max(1, (values.size - size) // COLUMNS)
+    segments: dict[str, Any] = {"nperseg": size, "noverlap": size - step, "nfft": 2 * size}
+    hertz, t, levels = spectrogram(values, 1.0 / signal.interval, "hann", mode="magnitude", **segments)
+    levels = levels[: max(2, int(np.searchsorted(hertz, top, "right")))]
+    # Of neighbouring bins that share a row the strongest is shown.
+    together = -(-levels.shape[0] // MOST_ROWS)
+    padded = np.pad(levels, ((0, -levels.shape[0] % together), (0, 0)))
+    table = padded.reshape(-1, together, t.size).max(axis=1)
+    strongest = float(table.max()) or 1.0
+    decibels = 20.0 * np.log10(np.maximum(table / strongest, 10.0 ** (-RANGE_DB / 20.0)))
+    return decibels, signal.start + t[0], signal.start + max(t[-1], t[0] + signal.interval)
+
+
+def _segment(count: int, interval: float, track: Track) -> int:
+    """Return the samples of a segment: enough to tell the closest tones apart, not too many to see what moves."""
+    columns = [column[np.isfinite(column)] for column in track.omega.T]
+    middles = [float(np.median(column)) for column in columns if column.size]
+    apart = np.diff(np.sort([0.0, *middles, *(line.omega for line in track.missing)])) / TURN
+    apart = apart[apart > 0.0]
+    wanted = RESOLVED_BINS / (float(apart.min()) * interval) if apart.size else 256.0
+    return int(np.clip(2.0 ** np.ceil(np.log2(wanted)), SHORTEST, max(SHORTEST, min(LONGEST, count // 8))))
+
+
+def spectra_drawing(left: LeftOver, track: Track, unit: str | None) -> Drawing:
+    """Return the figure of amplitude spectra of the signal and of what the tones leave, with missing lines marked."""
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        top = highest_shown(track, left.interval)
+        shown = left.hertz <= top
+        hertz, whole, rest = left.hertz[shown], left.signal_spectrum[shown], left.residual_spectrum[shown]
+        axes.plot(*outline(hertz, whole), color=LIGHT, linewidth=0.9, label="signal")
+        axes.plot(*outline(hertz, rest), color=DARK, linewidth=0.9, label="what the tones leave")
+        axes.set_yscale("log")
+        floor, peak = float(np.median(rest[rest > 0])) if (rest > 0).any() else 1e-9, float(whole.max())
+        if peak > 0:
+            axes.set_ylim(max(floor / BELOW, 1e-9 * peak), 4.0 * peak)
+        _mark_lines(axes, track)
+        axes.set_xlim(0.0, top)
+        axes.set_xlabel("frequency [Hz]")
+        axes.set_ylabel(f"amplitude [{plain(unit)}]" if unit else "amplitude")
+        axes.legend(loc="upper right", fontsize=8)
+
+    return Drawing(8.0, 3.4, draw)
+
+
+def _mark_lines(axes: Any, track: Track) -> None:
+    points = [(line.omega / TURN, line.amplitude) for line in track.missing]
+    if points:
+        style: dict[str, Any] = {"color": MARK, "markersize": 7, "label": "line that is missing"}
+        axes.plot(*zip(*points, strict=True), "v", **style)
+    for hertz, amplitude in points[:NAMED_LINES]:
+        place = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center", "fontsize": 8, "color": MIDDLE}
+        axes.annotate(f"{hertz:.5g}", (hertz, amplitude), **place)

@@ -27,6 +27,24 @@ class LeftOver(NamedTuple):
     #: Amplitude of a steady tone that would stand so high, medians over segments [signal unit].
     signal_spectrum: Array
     residual_spectrum: Array
+    #: Sampling interval [s].
+    interval: float
+
+    @property
+    def hertz(self) -> Array:
+        """Return the frequencies of the spectra [Hz]."""
+        return np.arange(self.signal_spectrum.size) / (c.SPECTRUM_PADDING * self.segment)
+
+    @property
+    def segment(self) -> float:
+        """Length of a segment of the spectra [s]."""
+        return self.size * self.interval
+
+    @property
+    def root_mean_squares(self) -> tuple[float, float]:
+        """Return those of the signal and of what the tones leave, where all tones are known [signal unit]."""
+        signal, residual = (np.sqrt(np.mean(each[~self.unknown] ** 2)) for each in (self.signal, self.residual))
+        return float(signal), float(residual)
 
 
 def without_spikes(samples: Array) -> Array:
@@ -48,7 +66,7 @@ def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
         begins = begins[[unknown[k : k + size].mean() <= c.UNKNOWN for k in begins]]
         if begins.size:
             spectra = (median_spectrum(np.where(unknown, 0.0, each), begins, size) for each in (centred, left))
-            return LeftOver(centred, left, unknown, size, *spectra)
+            return LeftOver(centred, left, unknown, size, *spectra, interval)
         size //= 2
     return None
 

@@ -20,13 +20,10 @@ from ctid_cli import (
     Srivc,
     TransferFunction,
     identify,
-    plot,
     read_record,
     read_results,
     run_experiment,
     simulate,
-    summary,
-    to_frame,
 )
 
 SPEC = {
@@ -65,12 +62,10 @@ def test_results_are_those_of_the_commands(out, ctid):
     assert results.surprises == []
     drawn = ctid("figure", "group/study", "--kind", "box", "--out", out, "--file", out / "box.svg")
     assert (out / "box.svg").read_bytes() == results.figure("box"), drawn.stderr
-    assert plot(results, "box") == results.figure("box")
     with pytest.raises(CtidError, match=r"there is no kind of figure 'boxes'; did you mean 'box'\? there are meas"):
-        plot(results, "boxes")
-    pd.testing.assert_frame_equal(to_frame(results), results.estimates)
+        results.figure("boxes")
     printed = ctid("table", "group/study", "--out", out).stdout
-    assert summary(results).strip() == printed.strip()
+    assert results.report.draw().strip() == printed.strip()
     assert repr(results).startswith("group/study: 12 of 12 estimates by one, other, 0 failed\n  in 1 data cell")
     assert "<td" in results._repr_html_()
 
@@ -97,18 +92,15 @@ def test_a_fit_as_text_and_as_a_table():
     u = HeldSignal(t, rng.standard_normal(t.size))
     y = simulate(TransferFunction([2], [1, 1]), u, t) + 0.1 * rng.standard_normal(t.size)
     fit = Srivc(poles=1, zeros=0).fit(Record(t, y, u), None)
-    frame = to_frame(fit)
+    frame = fit.to_frame()
     assert frame["estimate"].to_dict() == fit.parameters
     assert frame["standard_error"].to_dict() == fit.standard_errors
     assert list(frame["unit"]) == ["1/s", "out/in/s"]
-    assert f"{fit.parameters['a1']:.6g}" in summary(fit)
-    assert f"fit {fit.fit_percent:.5g} % of 300 samples" in summary(fit)
+    assert f"{fit.parameters['a1']:.6g}" in fit.summary()
+    assert f"fit {fit.fit_percent:.5g} % of 300 samples" in fit.summary()
     assert fit._repr_html_().count("<tr>") == 3
-    with pytest.raises(CtidError, match=r"a single Fit does not hold the record .* plot\(identify"):
-        plot(fit)
-    for view in (summary, to_frame, plot):
-        with pytest.raises(CtidError, match="'TransferFunction' is no result; what can be shown is a fit, an identi"):
-            view(fit.model)
+    with pytest.raises(CtidError, match=r"a single Fit does not hold the record .* identify\("):
+        fit.plot()
 
 
 def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
@@ -120,20 +112,9 @@ def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
     printed = ctid("fit", tmp_path / "record.csv", "--poles", 1, "--out", tmp_path).stdout
     found = identify(DelayProfile(1, 0, (0.0, 0.0), nested=True), [read_record(tmp_path / "record.csv")])
     # The file names no units either.
-    tables = summary(found).split("\n\n")[:2]
-    assert all(table.splitlines()[2].split()[:3] == shown for table, shown in zip(tables, rows(printed), strict=True))
-    written = (tmp_path / "fit.svg").read_bytes()
-    assert len(plot(found)) == len(plot(found, "all"))
-    assert plot(found).startswith(b"<?xml")
-    parts = {kind: plot(found, kind)._repr_svg_() for kind in ("overlay", "residuals", "correlation", "profile")}
-    words = {"overlay": "simulated", "residuals": "residual [", "correlation": "lag [samples]", "profile": "delay ["}
-    for kind, word in words.items():
-        assert [other for other, svg in parts.items() if f"<!-- {word}" in svg] == [kind]
-        assert f"<!-- {word}".encode() in written
-    with pytest.raises(CtidError, match=r"there is no kind of figure 'profil'; did you mean 'profile'\? there are all"):
-        plot(found, "profil")
-    assert found._repr_html_().count("<table>") == 2
-    assert repr(plot(found, "profile")).startswith("Picture: an SVG file of ")
+    assert found.summary().split("\n\n")[2:4] == printed.split("\n\n")[3:5]
+    assert len(found.plot().axes) == 4
+    assert found._repr_html_().count("<table>") == 4
 
 
 def test_a_track_as_text_as_a_table_and_as_a_figure():
@@ -141,23 +122,14 @@ def test_a_track_as_text_as_a_table_and_as_a_figure():
     flags[:10] = int(Flag.GAP)
     omega = 2 * np.pi * np.column_stack((np.linspace(9.0, 11.0, 40), np.full(40, 30.0)))
     online = FrequencyTrack(0.1 * np.arange(40), omega, flags)
-    assert "tone  frequency [Hz]" in summary(online)
-    assert "amplitude" not in summary(online)
-    assert "\nWarnings:\n- 25 % of the rows are not valid.\n" in summary(online)
-    assert summary(online).splitlines()[3].split() == ["2", "30.0000", "0", "75", "%"]
-    assert to_frame(online).shape == (40, 6)
+    text = online.summary()
+    assert "tone  frequency [Hz]" in text
+    assert "amplitude" not in text
+    assert "\nWarnings:\n- 25 % of the rows are not valid." in text
+    assert text.splitlines()[3].split() == ["2", "30.0000", "0", "75", "%"]
+    assert online.to_frame().shape == (40, 6)
     assert online._repr_html_().count("<tr>") == 3
-    drawn = [plot(online, kind) for kind in (None, "tones", "frequencies")]
-    assert drawn[0] == drawn[1] == drawn[2]
-    assert b"<!-- frequency [Hz] -->" in drawn[0]
-    with pytest.raises(CtidError, match=r"there is no kind of figure 'amplitudes'; there are tones, frequencies$"):
-        plot(online, "amplitudes")
-
-
-def rows(printed):
-    lines = printed.splitlines()
-    heads = [next(k for k, line in enumerate(lines) if line.startswith(word)) for word in ("parameter ", "derived ")]
-    return [lines[k + 2].split()[:3] for k in heads]
+    assert "frequency [Hz]" in {axes.get_ylabel() for axes in online.plot().axes} | {online.plot().get_supylabel()}
 
 
 def test_completion_knows_the_public_names_and_no_others():

@@ -12,11 +12,11 @@ import pytest
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, identify, simulate
 from ctid_cli.estimators.identification import costs_about_delay
 from ctid_cli.reporting.citations import bibtex
-from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.identification_report import identification_object
+from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.pages.fit_page import fit_page
+from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.storage.fit_file import fit_text, read_fit
+from ctid_cli.storage.fit_file import read_fit
 from tests.reporting.parsed_page import Page
 
 HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
@@ -41,15 +41,13 @@ def fitted():
 
 
 def page_of(result, measured, other, folder):
-    units = Units("s", HOSTILE, "mm")
-    content = identification_object(result, measured, units, other)
+    found = FitResult(result, Records(measured, other))
     path = folder / "fit.json"
-    path.write_text(
-        fit_text(result, content, measured, other, folder, shlex.join(["ctid", "fit", HOSTILE, "/far/away.csv"])),
-        encoding="utf-8",
-    )
+    command = shlex.join(["ctid", "fit", HOSTILE, "/far/away.csv"])
+    path.write_text(found.file_text(folder, command), encoding="utf-8")
     stored = read_fit(path)
-    return fit_page(result, measured, other, stored.content), fit_page(stored.result, measured, other, stored.content)
+    again = FitResult(stored.result, Records(measured, other))
+    return fit_page(found, stored.content), fit_page(again, stored.content)
 
 
 def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
@@ -82,10 +80,9 @@ def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
     file.write_text("t,u,y\n", encoding="utf-8")
     moved = [replace(measured[0], path=file)]
     (tmp_path / "near").mkdir()
-    content = identification_object(result, moved, Units())
-    text = fit_text(replace(result, validation=None), content | {"validation": None}, moved, None, tmp_path / "near")
-    (tmp_path / "near" / "fit.json").write_text(text, encoding="utf-8")
-    page = fit_page(replace(result, validation=None), moved, None, read_fit(tmp_path / "near" / "fit.json").content)
+    found = FitResult(replace(result, validation=None), Records(moved))
+    (tmp_path / "near" / "fit.json").write_text(found.file_text(tmp_path / "near"), encoding="utf-8")
+    page = fit_page(found, read_fit(tmp_path / "near" / "fit.json").content)
     assert "r.csv, hold zoh" in page
     assert str(tmp_path) not in page
 

@@ -21,10 +21,10 @@ from ctid_cli import (
 )
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.identification_report import identification_object
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import read_measurement
-from ctid_cli.storage.fit_file import fit_text, read_fit
+from ctid_cli.storage.fit_file import read_fit
 
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 
@@ -102,8 +102,8 @@ def stored(fitted, tmp_path):
     file.write_text(fitted, encoding="utf-8")
     measured = [read_measurement(file, stop=25.0)]
     result = identify(DelayProfile(2, 0, (0.7, 0.7)), [measured[0].record])
-    content = identification_object(result, measured, Units("s", "V", "mm"))
-    (tmp_path / "fit.json").write_text(fit_text(result, content, measured, None, tmp_path), encoding="utf-8")
+    text = FitResult(result, Records(measured)).file_text(tmp_path)
+    (tmp_path / "fit.json").write_text(text, encoding="utf-8")
     return result, tmp_path / "fit.json"
 
 

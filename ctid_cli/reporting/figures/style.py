@@ -88,10 +88,10 @@ class Drawing(NamedTuple):
 
     def figure(self) -> Figure:
         """Draw it."""
-        from matplotlib.figure import Figure
+        from ctid_cli.reporting.figures.notebook_figure import NotebookFigure
 
         with _style():
-            figure = Figure(figsize=(self.width, self.height), layout="constrained")
+            figure = NotebookFigure(figsize=(self.width, self.height), layout="constrained")
             self.draw(figure)
         return figure
 

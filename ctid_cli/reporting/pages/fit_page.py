@@ -10,8 +10,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification, costs_about_delay
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.reporting.citations import bibtex
-from ctid_cli.reporting.document import Section
-from ctid_cli.reporting.estimate import Units, parameter_table
+from ctid_cli.reporting.document import Section, pairs
+from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.fit_drawings import (
     bode_drawing,
     delay_drawing,
@@ -19,20 +19,13 @@ from ctid_cli.reporting.fit_drawings import (
     step_drawing,
     validation_drawing,
 )
+from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.identification_plot import MOST_DRAWN, Kind, identification_drawing
-from ctid_cli.reporting.identification_report import (
-    asked_for,
-    covariance_line,
-    derived_block,
-    derived_of,
-    parameters_of,
-    quality,
-    record_line,
-)
-from ctid_cli.reporting.layout import Report, count, number
-from ctid_cli.reporting.pages.page import Chapter, citation, pairs, provenance, sections_of, shown, write_page
+from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.pages.page import Chapter, citation, provenance, shown, write_page
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.signals.measurement import Measurement
+from ctid_cli.text import count
 
 #: Digits of the coefficients in the equation.
 DIGITS = 5
@@ -40,62 +33,35 @@ DIGITS = 5
 POINTS = 500
 
 
-def fit_page(
-    result: Identification,
-    measurements: Sequence[Measurement],
-    validation: Measurement | None,
-    content: Mapping[str, Any],
-) -> str:
+def fit_page(result: FitResult, content: Mapping[str, Any]) -> str:
     """Return the page as HTML, of a fit and what its file says."""
-    units = Units(**content["units"])
-    fine = (
-        "Nothing that was tested speaks against this model: the search ended well, and the residuals pass their tests."
+    fitted, fine = (
+        result.fitted,
+        "Nothing that was tested speaks against this model: the search ended well, the residuals ",
     )
-    model = result.fit.model
+    model = fitted.fit.model
     terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
     equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
+    quality = Section("How good it is", frame=pairs(result.quality()))
     chapters = [
-        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in result.warnings] or [fine])]),
-        Chapter("Data", _data(result, measurements, units)),
-        Chapter("Model", [Section(sentences=[equation]), *_model(result, units)]),
-        *_figures(result, measurements, validation, units),
+        Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [fine])]),
+        Chapter("Data", [result.data(), Section(frame=pairs(result.settings()))]),
+        Chapter("Model", [Section(sentences=[equation]), result.parameters(), result.derived(), quality]),
+        *_figures(fitted, result.records.measurements, result.records.validation, result.units),
         Chapter("Provenance", provenance(_origin(content), content["command"])),
-        Chapter("How to cite", citation(bibtex(result))),
+        Chapter("How to cite", citation(bibtex(fitted))),
     ]
-    title = "Fit of " + ", ".join(measurement.record.name or "a record" for measurement in measurements)
-    return write_page(title, _lead(result), chapters)
+    title = "Fit of " + ", ".join(record.name or "a record" for record in result.records.data)
+    return write_page(title, _lead(fitted), chapters)
 
 
 def _lead(result: Identification) -> str:
-    fit, judged = result.fit, result.validation
-    model = f"{count(fit.model.order, 'pole')}, {count(result.options.zeros, 'zero')}"
-    beyond = f"; {number(judged.fit_percent, 4)} % on {judged.name}, which it was not made from" if judged else ""
-    return (
-        f"{model}: simulates {number(fit.fit_percent, 4)} % of {count(fit.count, 'sample')}{beyond}. {fit.status.value}"
-    )
-
-
-def _data(result: Identification, measurements: Sequence[Measurement], units: Units) -> list[Section]:
-    lines: list[str] = []
-    for measurement, use in zip(measurements, result.fit.used, strict=True):
-        lines += [record_line(measurement, int(np.count_nonzero(use)), units), *measurement.notes]
-    return [Section(sentences=lines, frame=pairs(asked_for(result, measurements, units)))]
-
-
-def _model(result: Identification, units: Units) -> list[Section]:
-    rows: list[list[str]] = []
-    for label, text in quality(result, units):
-        if not label:
-            rows[-1][1] += f"; {text}"
-        elif not label.startswith("residuals"):  # these have a chapter of their own
-            rows.append([label, text])
-    report = Report(
-        [
-            [parameter_table(parameters_of(result, units)), covariance_line(result)],
-            ["### Derived quantities", *derived_block(derived_of(result, units))],
-        ]
-    )
-    return [*sections_of(report.draw("md")), Section("How good it is", frame=pairs(rows))]
+    fit, validation = result.fit, result.validation
+    lead = f"{count(fit.model.order, 'pole')}, {count(result.options.zeros, 'zero')}: simulates "
+    lead += f"{number(fit.fit_percent, 4)} % of {count(fit.count, 'sample')}"
+    if validation is not None:
+        lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
+    return f"{lead}. {fit.status.value}"
 
 
 def _origin(content: Mapping[str, Any]) -> list[tuple[str, str]]:

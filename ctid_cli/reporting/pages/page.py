@@ -10,11 +10,10 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, NamedTuple
 
 import ctid_cli
-from ctid_cli.reporting.document import Section, aligned_lines
+from ctid_cli.reporting.document import Section, aligned_lines, pairs
 from ctid_cli.reporting.figures.style import Drawing
 
 if TYPE_CHECKING:
-    import pandas as pd
     from jinja2 import Template
     from markupsafe import Markup
 
@@ -126,13 +125,6 @@ def shown(word: str) -> str:
 def shown_command(command: str | None) -> str:
     """Return a command without folders of this machine."""
     return shlex.join(map(shown, shlex.split(command or "")))
-
-
-def pairs(rows: Iterable[Sequence[str]]) -> pd.DataFrame:
-    """Return labels and texts as a table without titles."""
-    import pandas as pd
-
-    return pd.DataFrame(rows, columns=["", ""])
 
 
 def provenance(origin: Iterable[Sequence[str]], command: str | None) -> list[Section]:

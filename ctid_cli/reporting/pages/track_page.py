@@ -6,13 +6,12 @@ from typing import Any
 
 from ctid_cli.reporting.citations import track_bibtex
 from ctid_cli.reporting.document import Section
-from ctid_cli.reporting.layout import Report, count, number
-from ctid_cli.reporting.pages.page import Chapter, citation, provenance, sections_of, shown, write_page
-from ctid_cli.reporting.track_drawings import signal_drawing, spectra_drawing
-from ctid_cli.reporting.track_plot import track_drawing
-from ctid_cli.reporting.track_report import signal_line, tones_block
-from ctid_cli.reporting.track_residual import Spectra, spectra_of
+from ctid_cli.reporting.layout import count, number
+from ctid_cli.reporting.pages.page import Chapter, citation, provenance, shown, write_page
+from ctid_cli.reporting.track_plot import signal_drawing, spectra_drawing, track_drawing
+from ctid_cli.reporting.track_result import TrackResult, signal_line
 from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.tones.residual import LeftOver, left_over
 from ctid_cli.tones.track import Track
 
 
@@ -21,14 +20,14 @@ def track_page(track: Track, signal: SampledSignal, content: Mapping[str, Any]) 
     signal = replace(signal, file=shown(signal.file))
     fine = "Nothing that was tested speaks against these tones: nearly all rows are valid, and no line is left over."
     drawn = Section(drawing=signal_drawing(signal, track), caption="The signal, and its spectrogram.")
-    tones = sections_of(Report([tones_block(track, signal.start, signal.unit)]).draw("md"))
+    tones = TrackResult(track, signal).tones()
     tones.append(Section(drawing=track_drawing(track, signal.start, signal.unit, ""), caption=_caption(track)))
     chapters = [
         Chapter("Before using it", [Section(sentences=[f"- {text}" for text in content["warnings"]] or [fine])]),
         Chapter("Data", [Section(sentences=[signal_line(signal), *signal.notes, *content["chosen"]])]),
         Chapter("Tones", tones),
         Chapter("Signal", [drawn]),
-        Chapter("What the tones leave", [_left(track, signal, spectra_of(signal, track))]),
+        Chapter("What the tones leave", [_left(track, signal, left_over(signal.samples, signal.interval, track))]),
         Chapter("Provenance", provenance(_origin(content), content["command"])),
         Chapter("How to cite", citation(track_bibtex())),
     ]
@@ -48,20 +47,21 @@ def _caption(track: Track) -> str:
     return f"Frequencies and amplitudes over time{bands}; grey where no tone that is drawn is valid."
 
 
-def _left(track: Track, signal: SampledSignal, spectra: Spectra | None) -> Section:
+def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section:
     """What the tones leave of the signal."""
-    if spectra is None:
+    if left is None:
         return Section(notes=["Nowhere are all tones known, so that nothing can be compared."])
     unit = f" {signal.unit}" if signal.unit else ""
-    share = 100.0 * (spectra.residual_rms / spectra.signal_rms) ** 2 if spectra.signal_rms else 0.0
+    whole, rest = left.root_mean_squares
+    share = 100.0 * (rest / whole) ** 2 if whole else 0.0
     notes = [
-        f"The tones leave {number(share, 3)} % of the power of the signal: {number(spectra.residual_rms, 3)}{unit} of "
-        f"{number(spectra.signal_rms, 3)}{unit} (root mean squares about the mean), compared over "
-        f"{number(100.0 * spectra.known, 3)} % of the record, where all tones are known.",
-        f"Spectra are medians over segments of {number(spectra.segment, 3)} s; a steady tone stands as high as its "
+        f"The tones leave {number(share, 3)} % of the power of the signal: {number(rest, 3)}{unit} of "
+        f"{number(whole, 3)}{unit} (root mean squares about the mean), compared over "
+        f"{number(100.0 * float(1.0 - left.unknown.mean()), 3)} % of the record, where all tones are known.",
+        f"Spectra are medians over segments of {number(left.segment, 3)} s; a steady tone stands as high as its "
         "amplitude. A line that is left beside a tone may be the tone itself, where it moves faster than its rows.",
     ]
-    drawing = spectra_drawing(spectra, track, signal.unit, signal.interval)
+    drawing = spectra_drawing(left, track, signal.unit)
     caption = "Amplitude spectra of the signal and of what the tones leave"
     caption += "; triangles mark the lines that are missing." if track.missing else "."
     return Section(notes=notes, drawing=drawing, caption=caption)

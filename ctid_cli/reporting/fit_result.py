@@ -1,0 +1,503 @@
+"""The result of ``ctid fit``: an estimated model with its uncertainty and diagnostics."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ctid_cli.canonical import plain
+from ctid_cli.errors import StorageError
+from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import BIASED, UncertainValue
+from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.reporting.document import Result, Section, pairs
+from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_frame, parameter_object
+from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.identification_plot import identification_drawing
+from ctid_cli.reporting.layout import number, picked
+from ctid_cli.reporting.records import Records
+from ctid_cli.signals.band_limited import band_limited_doubt
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Hold
+from ctid_cli.storage.fit_file import fit_text
+from ctid_cli.text import count
+from ctid_cli.written_files import write_file
+
+FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
+R2_DEFINITION = "1 - ||y - x||^2 / ||y - mean y||^2"
+
+DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
+TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
+
+#: The input between its samples.
+HOLDS: dict[Hold, str] = {
+    "zoh": "constant between its samples",
+    "foh": "straight lines between its samples",
+    "band-limited": "without power above the Nyquist frequency",
+}
+#: Treatment of the initial state and the offset, in words.
+TREATMENTS = {
+    "rest": "at rest before the record",
+    "estimate": "estimated with the model",
+    "periodic": "steady state of an input that repeats the record",
+    "none": "none",
+    "remove": "means of input and output subtracted",
+}
+#: Instants of outliers that the text names.
+MOST_NAMED = 5
+#: What a loss does to the samples that are listed, and its name.
+LITTLE = {"huber": "less than half their weight", "tukey": "no weight"}
+LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult(Result):
+    """A fit with the records that it was made from."""
+
+    fitted: Identification
+    records: Records
+    #: What was chosen where nothing was given, and why.
+    choices: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, fitted: Identification) -> FitResult:
+        """Return the result of a fit that was made in Python, whose records are in memory."""
+        other = None if fitted.validation is None else Measurement.of(fitted.validation.record)
+        return cls(fitted, Records([Measurement.of(record) for record in fitted.records], other))
+
+    @property
+    def units(self) -> Units:
+        """Units of the records."""
+        return self.records.units
+
+    def sections(self) -> list[Section]:
+        """Return records, settings, parameters, derived quantities, diagnostics and warnings."""
+        warnings = [f"- {warning}" for warning in self.fitted.warnings]
+        return [
+            *(Section(sentences=[choice]) for choice in self.choices),
+            self.data(),
+            Section(frame=pairs(self.settings())),
+            self.parameters(),
+            self.derived(),
+            Section(frame=pairs(self.quality()), drawing=self.drawing()),
+            *([Section("Warnings:", warnings)] if warnings else []),
+        ]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a row for each parameter: estimate, standard error, interval, unit and status."""
+        rows = [parameter_object(item) for item in parameters_of(self.fitted, self.units)]
+        return pd.DataFrame(rows).set_index("name")
+
+    def drawing(self) -> Drawing:
+        """Return the figure of output, residuals, their correlation, and the search over the delay."""
+        return identification_drawing(self.fitted, self.records.measurements, self.units)
+
+    # --- sections ----------------------------------------------------------------------------------
+
+    def data(self) -> Section:
+        """Return the records, and what reading them has shown."""
+        lines: list[str] = []
+        for measurement, use in zip(self.records.measurements, self.fitted.fit.used, strict=True):
+            lines += [_record_line(measurement, int(np.count_nonzero(use)), self.units), *measurement.notes]
+        return Section(sentences=lines)
+
+    def parameters(self) -> Section:
+        """Return the parameters with their uncertainty."""
+        frame = parameter_frame(parameters_of(self.fitted, self.units))
+        return Section(frame=frame, formats=PARAMETER_FORMATS, notes=[_covariance_line(self.fitted)])
+
+    def derived(self) -> Section:
+        """Return derived quantities as a table, and why some have no error."""
+        rows = derived_of(self.fitted, self.units)
+        names = ("estimate", "standard_error", "low", "high", "unit")
+        titles = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
+        frame = pd.DataFrame([(row.name, *(getattr(row, name) for name in names)) for row in rows], columns=titles)
+        reasons = list(dict.fromkeys(row.reason for row in rows if row.reason))
+        return Section(frame=frame, formats={"standard error": ".3g"}, notes=reasons)
+
+    def settings(self) -> Iterator[tuple[str, str]]:
+        """Return what was estimated, and how the records were taken."""
+        fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
+        hold, (low, high) = first.record.input.hold, options.delay_bounds
+        searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
+        yield "model", f"{_structure(options)}; delay {searched}"
+        if options.fixed:
+            yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
+        if isinstance(options, MeasuredSubmodels):
+            yield from _iteration(self.fitted, options, first)
+        yield "initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})"
+        yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
+        yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
+        if fit.weighting is not None:
+            yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
+
+    def quality(self) -> Iterator[tuple[str, str]]:
+        """Return what tells how good the fit is."""
+        fit, criteria, validation, units = self.fitted.fit, self.fitted.criteria, self.fitted.validation, self.units
+        yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
+        yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
+        yield "", "y measured, x simulated, over the samples used"
+        if validation is not None:
+            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
+            text += f"{count(validation.count, 'sample')}; initial state and offset treated in the same way"
+            yield "validation", text
+        what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
+        yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
+        sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
+        yield "AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}"
+        yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
+        yield "BIC", f"{number(criteria.bic)} = N ln cost + p ln N"
+        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)"
+        yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
+        yield "condition number", number(fit.condition_number, 3)
+        if fit.starts is not None:
+            yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
+        if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
+            yield "admissible", _box_text(fit.box, units)
+            for name, limit, value in fit.box.limits_met(fit.held_poles):
+                unit = "" if name == "least_damping" else f" rad/{units.time}"
+                yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
+        for k, test in enumerate(self.fitted.tests, start=1):
+            yield "residuals" if len(fit.residuals) == 1 else f"residuals {k}", _tested(test)
+
+    def file_text(self, folder: Path, command: str | None = None) -> str:
+        """Return the text of ``fit.json`` in a folder, from which the records are named."""
+        measurements, validation = self.records.measurements, self.records.validation
+        return fit_text(self.fitted, self.content(), measurements, validation, folder, command)
+
+    # --- JSON --------------------------------------------------------------------------------------
+
+    def content(self) -> dict[str, Any]:
+        """Return the fit for ``fit.json`` and ``ctid fit --json``."""
+        fit, options, criteria = self.fitted.fit, self.fitted.options, self.fitted.criteria
+        profile, validation, additive = fit.profile, self.fitted.validation, additive_of(fit)
+        measurements, units = self.records.measurements, self.units
+        numerator = [item.estimate for item in self.fitted.estimates if item.name.startswith("b")]
+        content = {
+            "model": {
+                "numerator": numerator or fit.model.numerator,
+                "denominator": fit.model.denominator,
+                "delay": fit.model.delay,
+                **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
+            },
+            "parameters": [parameter_object(item) for item in parameters_of(self.fitted, units)],
+            **picked(fit, ("fit_percent", "r2", "cost")),
+            "loss": _loss_object(fit, self.records.data),
+            "status": fit.status.name,
+            "message": fit.status.value,
+            "starts": fit.starts and fit.starts._asdict(),
+            "poles_at_infinity": fit.poles_at_infinity,
+            "box": fit.box and _box_object(fit.box, fit.held_poles),
+            "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
+            "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
+            "modes": _modes(self.fitted, units),
+            "warnings": self.fitted.warnings,
+            "notes": [note for measurement in measurements for note in measurement.notes],
+            "derived": [picked(row, DERIVED_KEYS) for row in derived_of(self.fitted, units)],
+            "answer": picked(self.fitted.answer, ("seen", "p_value", "explained", "by_chance")),
+            "covariance": _covariance_object(self.fitted),
+            "delay_interval": "profile likelihood" if self.fitted.delay_interval is not None else "quadratic",
+            "criteria": {
+                **picked(criteria, ("aic", "aicc", "bic", "fpe")),
+                "yic": self.fitted.yic,
+                "r_t_squared": self.fitted.r_t_squared,
+                "samples": criteria.count,
+                "parameters": criteria.parameters,
+            },
+            "condition_number": fit.condition_number,
+            "iterations": fit.iterations,
+            "residual_tests": [picked(test, TEST_KEYS) for test in self.fitted.tests],
+            "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
+            "validation": validation and _validation_object(validation, self.records.validation),
+            "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
+            "units": asdict(units),
+            "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
+        }
+        return dict(plain(content))
+
+
+def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
+    """Parameters with the units of the records."""
+    additive = additive_of(result.fit)
+    if additive is not None:
+        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
+    poles, zeros = result.fit.model.order, result.options.zeros
+    return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
+
+
+def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
+    """The submodels of a fit, None of a fit of one transfer function."""
+    return fit.additive if isinstance(fit, SubmodelsFit) else None
+
+
+def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
+    """Unit of a parameter of a sum, or of a coefficient of its free response."""
+    if name.startswith("g"):
+        return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
+    if name == "delay":
+        return units.time
+    # c_k p^k/(p^l A) on an impulse.
+    power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
+    times = units.time if power == 1 else f"{units.time}^{power}"
+    return units.output if power == 0 else f"{units.output}*{times}"
+
+
+def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
+    """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
+    names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
+    found = []
+    for row in result.derived:
+        if row.unit != "Hz":
+            found.append(replace(row, unit=names.get(row.unit, row.unit)))
+        elif (seconds := units.seconds) is not None:
+            scaled = {name: getattr(row, name) / seconds for name in ("estimate", "standard_error", "low", "high")}
+            found.append(replace(row, **scaled))
+    return found
+
+
+def _covariance_object(result: Identification) -> dict[str, Any]:
+    uncertainty, draws = result.uncertainty, result.uncertainty.bootstrap
+    return {
+        "kind": uncertainty.kind,
+        "names": result.fit.parameter_names,
+        "values": uncertainty.covariance,
+        "effective_samples": uncertainty.effective_count,
+        "degrees_of_freedom": uncertainty.degrees_of_freedom if uncertainty.kind in ("white", "robust") else None,
+        "reason": BIASED if uncertainty.kind == "biased" else None,
+        "bootstrap_draws": 0 if draws is None else len(draws.errors),
+    }
+
+
+def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
+    """What is not known of a band-limited input for want of the samples beyond the ends."""
+    signal = measurement.record.input
+    if signal.hold != "band-limited" or options.initial_state == "periodic":
+        return ""
+    doubt = band_limited_doubt(signal.t, signal.values)
+    known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {doubt.ends:.2g} {units.input}"
+    rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
+    return f", {known}{rough}"
+
+
+def _structure(options: Options) -> str:
+    """Poles and zeros, of each submodel if there are several."""
+    if isinstance(options, DelayProfile) or not options.factored:
+        integrators = options.integrators if isinstance(options, DelayProfile) else 0
+        besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
+        return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}{besides}"
+    parts = ", ".join(
+        f"{term.poles}/{term.zeros}" + f" and {count(term.integrators, 'integrator')}" * (term.integrators > 0)
+        for term in options.terms
+    )
+    what = f"sum of {len(options.terms)} submodels with" if len(options.terms) > 1 else "one submodel with"
+    return f"{what} poles/zeros {parts}"
+
+
+def _iteration(
+    result: Identification, options: MeasuredSubmodels, measurement: Measurement
+) -> Iterator[tuple[str, str]]:
+    """The loop of a record, and where the iterations started."""
+    loop = measurement.record.loop
+    if options.closed and loop is not None:
+        b, a = (
+            " ".join(f"{c:.6g}" for c in np.asarray(side))
+            for side in (loop.controller.numerator, loop.controller.denominator)
+        )
+        where = "u = C(q) (r - y)" if loop.enters == "controller" else "u = r - C(q) y"
+        text = f"{where}, r = {measurement.reference}, C = ({b})/({a}) in descending powers of q"
+        yield "loop", f"{text}; instruments from the noise-free loop"
+    if isinstance(result.fit, SubmodelsFit):
+        yield "start", result.fit.start_method
+
+
+def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
+    """Return the set of models in which the estimate is the best, null for no bound, and the bounds that poles met."""
+    return {
+        "poles": (box.slowest, box.fastest),
+        "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
+        "damping": box.least_damping,
+        "delay": box.delays,
+        "met": [
+            {"limit": name, "what": limit.what, "value": value, "meaning": limit.meaning, "reason": limit.reason}
+            for name, limit, value in box.limits_met(held)
+        ],
+    }
+
+
+def _box_text(box: Box, units: Units) -> str:
+    rate = f"rad/{units.time}"
+    swing = f", imaginary parts up to {box.imaginary:.4g} {rate}" if np.isfinite(box.imaginary) else ""
+    poles = f"poles from {box.slowest:.4g} to {box.fastest:.4g} {rate}{swing}"
+    return f"{poles}; pairs with a damping of at least {box.least_damping:g}"
+
+
+def _record_line(measurement: Measurement, used: int, units: Units) -> str:
+    """One record: its samples, clock and columns."""
+    record = measurement.record
+    part = "" if used == record.n_samples else f" ({used} used)"
+    clock = "regular clock" if record.interval is not None else "irregular clock"
+    span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
+    labels = measurement.label("input", units.input), measurement.label("output", units.output)
+    columns = f"input {labels[0]}, output {labels[1]}"
+    return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
+
+
+def _offset(result: Identification, units: Units) -> str:
+    fit, options = result.fit, result.options
+    if options.offset != "remove":
+        return TREATMENTS[options.offset]
+    pairs = zip(fit.input_offsets, fit.offsets, strict=True)
+    means = "; ".join(f"{u:.6g} {units.input}, {y:.6g} {units.output}" for u, y in pairs)
+    return f"{TREATMENTS['remove']}: {means}"
+
+
+def _covariance_line(result: Identification) -> str:
+    """What the standard errors hold for."""
+    found, asked = result.uncertainty, all(test.white for test in result.tests)
+    text = "Standard errors are those for white residuals"
+    if not result.answer.seen:
+        return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
+    if found.kind == "biased":
+        return f"{BIASED} {_form(result.fit)}"
+    if found.kind != "white":
+        text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
+    elif result.tests:
+        text += ", as the residuals pass the test"
+    if found.bootstrap is None:
+        text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
+        text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
+    else:
+        draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
+        text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
+    if result.delay_interval is not None:
+        text += ", that of the delay from the profile of the cost, which is not quadratic there"
+    return f"{text}. {_form(result.fit)}"
+
+
+def _form(fit: MeasuredFit) -> str:
+    """How coefficients are scaled and counted."""
+    if additive_of(fit) is None:
+        return "Monic denominator, descending powers."
+    return "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
+
+
+def _modes(result: Identification, units: Units) -> list[dict[str, float | None]]:
+    """Natural frequency and damping of every real pole and every pair."""
+    additive = additive_of(result.fit)
+    rows = {row.name: row.estimate for row in result.derived if additive is None}
+    modes: list[dict[str, float | None]] = []
+    for k in range(1, result.fit.model.order + 1):
+        if f"damping_{k}" in rows:
+            frequency, damping = rows[f"natural_frequency_{k}"], rows[f"damping_{k}"]
+        elif f"pole_{k}" in rows:
+            frequency, damping = abs(rows[f"pole_{k}"]), float(-np.sign(rows[f"pole_{k}"]))
+        else:
+            break
+        modes.append(_mode(frequency, damping, units))
+    if additive is not None:
+        poles = [pole for pole in additive.poles.tolist() if pole.imag >= 0]
+        return [_mode(abs(pole), -pole.real / abs(pole) if pole else None, units) for pole in poles]
+    return modes
+
+
+def _mode(frequency: float, damping: float | None, units: Units) -> dict[str, float | None]:
+    hertz = None if units.seconds is None else frequency / (2 * np.pi * units.seconds)
+    return {"frequency_hz": hertz, "damping": damping}
+
+
+def _validation_object(judged: Validation, validation: Measurement | None) -> dict[str, Any]:
+    return {
+        "file": judged.name,
+        **picked(judged, ("fit_percent", "r2")),
+        "samples": judged.count,
+        "initial_state": judged.applied.initial_states[0],
+        "offset": judged.applied.offsets[0],
+        "notes": () if validation is None else validation.notes,
+    }
+
+
+def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
+    record = measurement.record
+    return {
+        "file": record.name,
+        "samples": record.n_samples,
+        "used": int(np.count_nonzero(use)),
+        "start": float(record.t[0]),
+        "stop": float(record.t[-1]),
+        "regular": record.interval is not None,
+        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+    }
+
+
+def _loss_object(fit: MeasuredFit, records: Sequence[Record]) -> dict[str, Any]:
+    """The loss for JSON."""
+    if fit.weighting is None:
+        return {"kind": "squares", "scales": None, "outliers": [[] for _ in records], "fit_percent": None}
+    return {
+        "kind": fit.weighting.kind,
+        "scales": [loss.scale for loss in fit.weighting.losses],
+        "outliers": fit.weighting.outlier_times(records, fit.used),
+        "fit_percent": fit.weighting.fit_percent(records, fit.used, fit.residuals),
+    }
+
+
+def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:
+    """Return the scale of a loss other than squares, and the samples that count for little."""
+    kind, times = weighting.kind, weighting.outlier_times(records, fit.used)
+    scales = ", ".join(number(loss.scale, 3) for loss in weighting.losses)
+    text = (
+        f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error; "
+    )
+    total = sum(each.size for each in times)
+    samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
+    if not total:
+        return f"{text}; {samples}"
+    listed = []
+    for k, each in enumerate(times, start=1):
+        where = f" of experiment {k}" if len(records) > 1 else ""
+        some = ", ".join(f"{t:.6g}" for t in each[:MOST_NAMED]) + (", ..." if each.size > MOST_NAMED else "")
+        listed += [f"{some} {units.time}{where}"] * (each.size > 0)
+    without = number(weighting.fit_percent(records, fit.used, fit.residuals), 5)
+    return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
+
+
+def _tested(test: ResidualTests) -> str:
+    """Return the outcome of the tests of residuals; the warnings say what to do."""
+    white = "white" if test.white else "not white"
+    free = "independent of the input" if test.uncorrelated else "dependent on the input"
+    return f"{white} (p = {number(test.whiteness_p_value, 2)}), {free} (p = {number(test.cross_p_value, 2)})"
+
+
+def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:
+    """Write a fit to a file that :func:`~ctid_cli.storage.fit_file.load_fit` and ``ctid report`` read.
+
+    Parameters
+    ----------
+    result : Identification
+        The fit.
+    path : path
+        The file, such as ``fit.json``. Since records in memory have no file, their samples are in it.
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written.
+    """
+    text = FitResult.of(result).file_text(Path(path).parent)
+    try:
+        write_file(Path(path), text.encode() + b"\n")
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written: {error.strerror or error}") from error

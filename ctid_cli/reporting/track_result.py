@@ -1,0 +1,218 @@
+"""The result of ``ctid track``: the tones of a recorded signal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ctid_cli.frequency.flags import MEANINGS, Flag
+from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.layout import number, with_error
+from ctid_cli.reporting.track_plot import track_drawing
+from ctid_cli.signals.sampled_signal import SampledSignal
+from ctid_cli.text import count, listed
+from ctid_cli.tones.constants import METHOD, MOST_ASKED, USUAL_ACCURACY
+from ctid_cli.tones.summary import ToneSummary, summarise
+from ctid_cli.tones.track import MissingLine, Track
+
+#: A smaller share of valid rows is worth a warning.
+MOSTLY_VALID = 0.9
+#: Most frequent reasons for invalid rows, warnings of this kind, and missing lines that are named.
+MOST_REASONS = 3
+MOST_WARNINGS = 4
+MOST_LINES = 5
+TURN = 2.0 * math.pi
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult(Result):
+    """Tones over time, with the signal that they were found in, where it is known."""
+
+    track: Track
+    signal: SampledSignal | None = None
+    #: Largest standard error of a valid row that was asked for [Hz].
+    accuracy: float | None = None
+
+    def sections(self) -> list[Section]:
+        """Return what was read and chosen, the tones, and warnings."""
+        head = [] if self.signal is None else [signal_line(self.signal), *self.signal.notes]
+        warnings = [f"- {warning}" for warning in self.warnings()]
+        return [
+            Section("", [*head, *(f"- {reason}" for reason in self.chosen())]),
+            *self.tones(),
+            Section("Warnings:" if warnings else "", warnings),
+        ]
+
+    def tones(self) -> list[Section]:
+        """Return a table of the tones and what its numbers are; columns of which nothing is known are left out."""
+        track, signal = self.track, self.signal
+        if not track.omega.shape[1]:
+            return []
+        partly, start = not track.there.all(), signal.start if signal else 0.0
+        unit = f" [{signal.unit}]" if signal and signal.unit else ""
+        rows = [
+            {
+                "tone": tone.tone,
+                "frequency [Hz]": _with_error(tone),
+                "spread [Hz]": tone.spread_hz,
+                f"amplitude{unit}": tone.amplitude,
+                "from [s]": start + tone.begins if partly else math.nan,
+                "to [s]": start + tone.ends if partly else math.nan,
+                "valid %": tone.valid_percent,
+            }
+            for tone in summarise(track)
+        ]
+        formats = {
+            "spread [Hz]": ".2g",
+            f"amplitude{unit}": ".4g",
+            "from [s]": ".5g",
+            "to [s]": ".5g",
+            "valid %": ".4g",
+        }
+        counted = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
+        note = f"Medians over the valid ones of {counted}; the spread is half the width of the central 68 %: how far a "
+        note += "tone moves. A standard error (±) is that of the mean frequency."
+        note += " Valid is a share of the rows where the tone is there." if partly else ""
+        return [Section(frame=pd.DataFrame(rows).dropna(axis=1, how="all"), formats=formats, notes=[note])]
+
+    def drawing(self) -> Drawing:
+        """Return the figure of frequencies and amplitudes over time."""
+        signal = self.signal
+        if signal is None:
+            return track_drawing(self.track, 0.0, None, "")
+        return track_drawing(self.track, signal.start, signal.unit, Path(signal.file).name)
+
+    def plot(self) -> Any:
+        """Draw frequencies and amplitudes over time."""
+        return self.drawing().figure()
+
+    def chosen(self) -> list[str]:
+        """Return what was chosen and why, and what a standard error must not exceed where one is known."""
+        if not np.isfinite(self.track.error).any():
+            return list(self.track.reasons)
+        limit = f"{USUAL_ACCURACY:g} of the tone's frequency" if self.accuracy is None else f"{self.accuracy:g} Hz"
+        rule = f"a row is valid only if the standard error of its frequency is at most {limit} (--accuracy HZ)."
+        return [*self.track.reasons, f"Accuracy: {rule}"]
+
+    def warnings(self) -> list[str]:
+        """Return what a reader must know before believing the numbers."""
+        track = self.track
+        if not track.omega.shape[1]:
+            none = "No tone was asked for (--tones 0): there are no frequencies to report."
+            return [*track.warnings, *_missing_lines(track), none]
+        return [*track.warnings, *_missing_lines(track), *_invalid_rows(track)]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the tones over time, those of one after those of another; ``attrs["units"]`` has units of columns."""
+        track, unit = self.track, self.signal and self.signal.unit
+        columns: dict[str, NDArray[Any]] = {"t": (self.signal.start if self.signal else 0.0) + track.t}
+        units: dict[str, str | None] = {"t": "s"}
+        quantities: dict[str, tuple[NDArray[Any], str | None]] = {
+            "frequency_{}_hz": (track.omega / TURN, "Hz"),
+            "frequency_error_{}_hz": (track.error / TURN, "Hz"),
+            "omega_{}": (track.omega, "rad/s"),
+            "amplitude_{}": (track.amplitudes, unit),
+            "amplitude_error_{}": (track.amplitude_error, unit),
+            "phase_{}": (track.phase, "rad"),
+            "growth_{}": (track.growth, "1/s"),
+            "rate_{}": (track.rate / TURN, "Hz/s"),
+            "valid_{}": (track.valid, None),
+            "flags_{}": (flag_names(track.flags), None),
+        }
+        for k in range(track.omega.shape[1]):
+            columns |= {name.format(k + 1): values[:, k] for name, (values, _) in quantities.items()}
+            units |= {name.format(k + 1): unit for name, (_, unit) in quantities.items()}
+        frame = pd.DataFrame(columns)
+        frame.attrs["units"] = units
+        return frame
+
+    def content(self) -> dict[str, Any]:
+        """Return the track for JSON, without its rows."""
+        track, signal = self.track, self.signal
+        assert signal is not None
+        return {
+            "file": signal.file,
+            "signal": signal.column,
+            "unit": signal.unit,
+            "samples": int(signal.samples.size),
+            **{name: getattr(signal, name) for name in ("missing", "interval", "start")},
+            "method": METHOD,
+            "tones": [asdict(tone) for tone in summarise(track)],
+            "accuracy_hz": self.accuracy,
+            "rows": int(track.t.size),
+            "every": track.every,
+            "missing_lines": [
+                {"frequency_hz": line.omega / TURN, "share": line.share, "amplitude": line.amplitude}
+                for line in track.missing
+            ],
+            "warnings": self.warnings(),
+            "notes": signal.notes,
+            "chosen": self.chosen(),
+            "settings": track.settings,
+        }
+
+
+def flag_names(flags: NDArray[np.uint16]) -> NDArray[Any]:
+    """Return the names of the flags that are set in each of some bit fields, of the same shape."""
+    values, places = np.unique(flags, return_inverse=True)
+    names = [" ".join(str(flag.name).lower() for flag in Flag if value & flag) for value in values.tolist()]
+    return np.array(names, dtype=object)[places].reshape(flags.shape)
+
+
+def signal_line(signal: SampledSignal) -> str:
+    """Return what was read."""
+    end = signal.start + (signal.samples.size - 1) * signal.interval
+    gaps = f", {count(signal.missing, 'sample')} missing" if signal.missing else ""
+    head = f"{signal.file}: {count(signal.samples.size, 'sample')} of {signal.column!r} from {signal.start:.6g} to "
+    return head + f"{end:.6g} s, every {signal.interval:.6g} s ({1.0 / signal.interval:.6g} Hz){gaps}"
+
+
+def _with_error(tone: ToneSummary) -> str:
+    known = math.isfinite(tone.standard_error_hz)
+    return with_error(tone.frequency_hz, tone.standard_error_hz) if known else number(tone.frequency_hz)
+
+
+def _missing_lines(track: Track) -> Iterator[str]:
+    """Say which lines are left over, and what to type."""
+    lines = track.missing
+    if lines:
+        named = listed([_line_words(line) for line in lines[:MOST_LINES]])
+        more = f", and {count(len(lines) - MOST_LINES, 'more line')}" if len(lines) > MOST_LINES else ""
+        wanted = min(track.omega.shape[1] + len(lines), MOST_ASKED)
+        what, it = ("a line", "it") if len(lines) == 1 else ("lines", "them")
+        yield f"The tones leave {what} at {named}{more}; ask for {wanted} tones to follow {it} too: --tones {wanted}"
+
+
+def _line_words(line: MissingLine) -> str:
+    rows = f", in {100 * line.share:.3g} % of the rows" if np.isfinite(line.share) else ""
+    return f"{line.omega / TURN:.6g} Hz (amplitude {line.amplitude:.3g}{rows})"
+
+
+def _invalid_rows(track: Track) -> list[str]:
+    """Say how many rows are not valid, and why, once for tones with the same reasons."""
+    found: dict[str, list[str]] = {}
+    for k, (flags, there) in enumerate(zip(track.flags.T, track.there.T, strict=True)):
+        if reasons := _reasons(flags[there]):
+            found.setdefault(reasons, []).append(f"tone {k + 1}")
+    said = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
+    more = [f"{count(len(said) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
+    return said if len(said) <= MOST_WARNINGS else said[:MOST_WARNINGS] + more
+
+
+def _reasons(flags: NDArray[np.uint16]) -> str:
+    """Return the share of rows that are not valid with the most frequent reasons; empty where nearly all are."""
+    share = float(np.mean(flags == 0)) if flags.size else 0.0
+    if share >= MOSTLY_VALID:
+        return ""
+    shares = {flag: float(np.mean((flags & int(flag)) != 0)) if flags.size else 0.0 for flag in Flag}
+    reasons = sorted((flag for flag in shares if shares[flag] > 0), key=lambda flag: -shares[flag])
+    what = f"{100 * (1 - share):.3g} % of the rows are not valid." if share > 0 else "no row is valid."
+    return " ".join([what, *(f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS])])
