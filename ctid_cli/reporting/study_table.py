@@ -274,11 +274,20 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
-    types = {"converged": "Int64", "initial_delay": "str"}
-    frame = pd.read_csv(file, dtype=types, float_precision="round_trip")
-    known = pd.to_numeric(frame["initial_delay"], errors="coerce")
-    delays = known.astype(object).where(known.notna(), frame["initial_delay"])
-    return frame.assign(initial_delay=delays.where(frame["initial_delay"].notna(), None))
+    texts = pd.read_csv(file, dtype="str", keep_default_na=False)
+    frame = pd.DataFrame({name: texts[name] for name in texts if name in ("experiment", "sampling", "method")})
+    for name in texts.columns.difference(frame.columns):
+        frame[name] = pd.Series([_value(text) for text in texts[name]], dtype=object)
+    counts = frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
+    return counts[texts.columns]
+
+
+def _value(text: str) -> float | str | None:
+    """Return a number of a table; an initial delay may be a word."""
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return text
 
 
 def environment_of(published: Path) -> dict[str, Any] | None:
