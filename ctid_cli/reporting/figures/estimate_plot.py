@@ -103,7 +103,9 @@ def _draw_panel(axes: Axes, name: str, rows: Sequence[Row], settings: Settings) 
         for beyond, edge, side in ((errors < low, 0.01, "bottom"), (errors > high, 0.99, "top")):
             if beyond.any():
                 inside = axes.get_xaxis_transform()
-                axes.text(at, edge, str(beyond.sum()), transform=inside, ha="center", va=side, fontsize=7)
+                look_of_count: dict[str, Any] = {"ha": "center", "va": side, "fontsize": 7}
+                behind = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+                axes.text(at, edge, str(beyond.sum()), transform=inside, bbox=behind, **look_of_count)
     margin = 0.08 * (high - low)
     axes.set_ylim(low - margin, high + margin)
 
