@@ -112,7 +112,7 @@ def measure(name: str, folder: Path, spec: Path) -> None:
     arguments = {
         "write": ["run", str(spec), "--jobs", "1", *results],
         "run": ["run", str(spec), "--jobs", "1", *results],
-        "show": ["show", some, *results],
+        "show": ["export", "--id", some, *results],
         "export": ["export", NAME, *results, "--file", str(folder / "all.csv")],
     }.get(name, [name, NAME, *results])
     began = time.perf_counter()
