@@ -152,6 +152,8 @@ def write_files(files: Mapping[Path, bytes | Iterable[bytes]], within: Path | No
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, content)
+        except FileExistsError as error:
+            raise StorageError(f"{error.filename} is a file, not a folder to write in") from error
         except OSError as error:
             raise StorageError(f"{error.filename or path} cannot be written: {error.strerror or error}") from error
 

@@ -86,7 +86,7 @@ class RecordProgress(_Progress):
                 self._start(total, TaskProgressColumn())
             self._update(done)
         elif self._is_time():
-            self._say(f"{100 * done / total:.0f} % of {self.what}")
+            self._say(f"{100 * done / total:.0f} % of {self.what} done")
 
 
 class FitProgress(RecordProgress):

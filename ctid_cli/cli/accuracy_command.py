@@ -16,9 +16,9 @@ def accuracy(
     allow_code: AllowCode = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Compute the standard errors to expect of an experiment, before any data are taken.
+    """Compute the standard errors to expect of an experiment.
 
-    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
+    No data are needed. For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
     formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
     the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
     unexpected about them comes last.

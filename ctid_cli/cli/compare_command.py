@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @guarded
 def compare(
-    files: Annotated[list[Path], typer.Argument(metavar="FIT...", help="Files that ctid fit wrote (fit.json).")],
+    files: Annotated[list[Path], typer.Argument(metavar="FIT", help="Files that ctid fit wrote (fit.json).")],
     on: Annotated[Path, typer.Option("--on", metavar="FILE", help="Record, best one that no model was fitted to.")],
     columns: RecordOptions,
     form: FormatOptions,
@@ -35,9 +35,9 @@ def compare(
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for comparison.csv and .svg.")] = Path("."),
 ) -> None:
-    """Compare fitted models on the same samples of one record: fit, tests of the residuals, overlay.
+    """Compare fitted models on the same samples of one record.
 
-    Writes comparison.csv and comparison.svg.
+    Prints their fits and tests of their residuals, and writes comparison.csv and comparison.svg.
     """
     from ctid_cli.estimators import model_comparison
     from ctid_cli.reporting.column_file import frame_bytes

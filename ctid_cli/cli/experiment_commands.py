@@ -278,9 +278,9 @@ def schema(
     section: Annotated[str | None, typer.Argument(metavar="SECTION", help="A section or kind, with --text.")] = None,
     as_text: Annotated[bool, typer.Option("--text", help="Write a reference to read, not JSON.")] = False,
 ) -> None:
-    """Print the JSON Schema of experiment files, or a reference of their keys.
+    """Print the JSON Schema of experiment files, or a reference.
 
-    With --text: type, unit, default, allowed values and meaning of every key, or of those of one section or kind, for
+    With --text the reference: type, unit, default, allowed values and meaning of every key, or of those of one section or kind, for
     example `ctid schema --text sampling` or `ctid schema --text td_srivc`.
     """
     from ctid_cli.specification.load import json_schema

@@ -15,7 +15,7 @@ from ctid_cli.signals.treatment import ResponseMethod
 def frf(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="Record (.csv, .mat, .h5); several: realisations of one input."),
+        typer.Argument(metavar="FILE", help="Record (.csv, .mat, .h5); several: realisations of one input."),
     ],
     columns: RecordOptions,
     form: FormatOptions,
@@ -32,9 +32,9 @@ def frf(
     hold: InputHold = "zoh",
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for frf.csv and frf.svg.")] = Path("."),
 ) -> None:
-    """Estimate the frequency response of measured records, without a model.
+    """Estimate the frequency response of measured records.
 
-    An input that repeats itself is averaged over its periods, which gives the variance by the noise and, from lines
+    No model is fitted. An input that repeats itself is averaged over its periods, which gives the variance by the noise and, from lines
     without input or from several records, the level of nonlinear distortions. Any other record is taken by local
     polynomials. Writes frf.csv and frf.svg.
     """

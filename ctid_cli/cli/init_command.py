@@ -28,9 +28,9 @@ def init(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
 ) -> None:
-    """Write commented experiment files to begin with into the current folder.
+    """Write commented experiment files to begin with.
 
-    Each runs as it is, in seconds, and says what every line of it means.
+    They go into the current folder. Each runs as it is, in seconds, and says what every line of it means.
     """
     wanted = kinds or list(TEMPLATES)
     for kind in wanted:

@@ -19,7 +19,7 @@ def figure(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME]...", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."
+            metavar="NAME", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."
         ),
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", metavar="KIND", help="measure or box.")] = None,
@@ -115,9 +115,9 @@ def report(
         Path | None, typer.Option("--validate", metavar="FILE", help="Of a fit: where its validation record is now.")
     ] = None,
 ) -> None:
-    """Write a page about a fit, a track, an experiment or a study, to read, print or send.
+    """Write a page about a fit, a track, an experiment or a study.
 
-    One HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it does, its residuals, and what to
+    To read, print or send: one HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it does, its residuals, and what to
     know before using it. Of a track: the signal, its spectrogram, its tones, and the spectrum of what these leave. Of
     an experiment or study: the question, tables, figures, differences of the estimators on the same data sets, what
     went wrong and the commands that show it, how all of it was computed. And how to cite it.

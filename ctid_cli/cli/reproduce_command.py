@@ -52,7 +52,7 @@ class Actions:
 def reproduce(
     actions: Actions,
     form: FormatOptions,
-    names: Annotated[list[str] | None, typer.Argument(metavar="[STUDY]...", help="Studies; all by default.")] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="STUDY", help="Studies; all by default.")] = None,
     runs: Runs = None,
     jobs: Jobs = None,
     out: Out = Path("results"),

@@ -14,7 +14,7 @@ from ctid_cli.reporting.document import Format, Tool
 @guarded
 def status(
     form: FormatOptions,
-    experiment: Annotated[str | None, typer.Argument(metavar="[EXPERIMENT]", help="Only this one, in full.")] = None,
+    experiment: Annotated[str | None, typer.Argument(metavar="EXPERIMENT", help="Only this one, in full.")] = None,
     out: Out = Path("results"),
 ) -> None:
     """Show stored, missing and failed estimates.
@@ -49,7 +49,7 @@ def table(
     form: FormatOptions,
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
+        typer.Argument(metavar="NAME", help="Table (1, useful-redundancy/3) or experiment (quickstart)."),
     ] = None,
     measure: Annotated[
         str | None,
@@ -96,7 +96,7 @@ def table(
 @guarded
 def export(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="Experiment (quickstart), or a fit (fit.json).")
+        str | None, typer.Argument(metavar="NAME", help="Experiment (quickstart), or a fit (fit.json).")
     ] = None,
     id: Annotated[
         str | None, typer.Option("--id", metavar="ID", help="One estimate in full, by the first letters of its id.")
@@ -112,9 +112,9 @@ def export(
     out: Out = Path("results"),
     file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
 ) -> None:
-    """Write every estimate of an experiment, one row each, one of them in full, or a fit as code for another tool.
+    """Write the estimates of an experiment, or a fit as code.
 
-    `ctid status EXPERIMENT` lists the identifiers of failed estimates.
+    Every estimate in one row, one of them in full (--id), or the model of a fit as code for another tool (--as). `ctid status EXPERIMENT` lists the identifiers of failed estimates.
     """
     form = "json" if json else format
     if name is not None and name.endswith(".json"):

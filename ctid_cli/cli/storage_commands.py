@@ -36,7 +36,7 @@ def merge(
 def verify(
     form: FormatOptions,
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments (quickstart); all by default.")
+        list[str] | None, typer.Argument(metavar="NAME", help="Experiments (quickstart); all by default.")
     ] = None,
     out: Out = Path("results"),
 ) -> None:
@@ -53,7 +53,8 @@ def verify(
     found = [check(stored_folder(out, name)) for name in dict.fromkeys(names or experiments_in(out))]
     if not found:
         raise UsageError(f"there are no results in {out}")
-    for item in found:
+    for number, item in enumerate(found):
+        typer.echo("", nl=number > 0 and form.form != "json")
         emit(VerificationResult(item, out), form.form)
     wrong = [item.folder for item in found if not item.is_intact]
     if wrong:

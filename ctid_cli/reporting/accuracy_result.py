@@ -96,7 +96,7 @@ class AccuracyResult(Result):
 
     def _surprises(self) -> Section:
         if not self.surprises:
-            agree = f"The stored estimates are as expected, as far as {FEWEST} data sets or more tell."
+            agree = f"The stored estimates are as expected; those of fewer than {FEWEST} data sets are not compared."
             return Section("", [] if self.surprises is None else [agree])
         return Section("Unexpected in the stored estimates:", [f"- {text}" for text in self.surprises])
 

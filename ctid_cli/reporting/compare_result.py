@@ -27,6 +27,11 @@ if TYPE_CHECKING:
 
 #: What is told of the tests of residuals.
 VERDICTS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value")
+#: What the columns of the table mean.
+MEANING = (
+    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals are "
+    "white, and independent of the input; p is the probability of residuals farther from that."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +98,10 @@ class ModelComparison(Result):
         samples = (
             f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
         )
-        formats = {"fit %": ".2f", "R2": ".5g", f"rms [{unit.output}]": ".4g", "p, white": ".2g", "p, input": ".2g"}
+        formats = {"fit %": ".2f", "R2": ".5g", f"rms [{unit.output}]": ".4g", "p, white": ".2g", "p, independent": ".2g"}
         return [
             Section(sentences=[f"{samples}, the same for all models."]),
-            Section(frame=self._table(), formats=formats, drawing=self.drawing()),
+            Section(frame=self._table(), formats=formats, notes=[MEANING], drawing=self.drawing()),
         ]
 
     def _table(self) -> pd.DataFrame:
@@ -111,10 +116,8 @@ class ModelComparison(Result):
                     f"rms [{model.units.output}]": one.rms,
                     "white": None if test is None else _verdict(test.white, test.whiteness_p_value),
                     "p, white": test and test.whiteness_p_value,
-                    "independent of the input": None
-                    if test is None
-                    else _verdict(test.uncorrelated, test.cross_p_value),
-                    "p, input": test and test.cross_p_value,
+                    "independent": None if test is None else _verdict(test.uncorrelated, test.cross_p_value),
+                    "p, independent": test and test.cross_p_value,
                     "initial state": one.initial_state,
                     "offset": one.offset,
                 }

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ctid_cli.inference.intervals import BIASED, NORMAL, UncertainValue
 from ctid_cli.kinds import KINDS
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Result, Section, pairs
 from ctid_cli.reporting.estimate import PARAMETER_FORMATS, as_object, parameter_frame, parameter_object, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
@@ -86,17 +86,17 @@ class EstimateResult(Result):
 
 def _facts(row: Mapping[str, Any]) -> Section:
     """Return how well a model fits, and how it was computed."""
-    facts = {"fit on the data it was estimated from [%]": number(row["fit_percent"])}
+    facts = {"fit": f"{number(row['fit_percent'])} % of the data that it was estimated from"}
     if row.get("validation_fit_percent") is not None:
-        facts["fit on the validation part [%]"] = number(row["validation_fit_percent"])
+        facts["validation fit"] = f"{number(row['validation_fit_percent'])} %"
     facts |= {name: number(value) for name, value in (row.get("custom_measures") or {}).items()}
     facts |= {
-        "mean squared output error [output unit^2]": number(row["cost"]),
+        "cost": f"{number(row['cost'])} (output unit)^2, mean squared output error",
         "iterations": number(row["iterations"]),
         "condition number": number(row["condition_number"], 3),
         "time": _times(row),
     }
-    return Section(frame=pd.DataFrame(facts.items(), columns=["", "value"]))
+    return Section(frame=pairs(list(facts.items())))
 
 
 def _frequencies(row: Mapping[str, Any]) -> Section:
@@ -115,7 +115,7 @@ def _times(row: Mapping[str, Any]) -> str:
 
 
 def _settings(content: Mapping[str, Any]) -> list[str]:
-    return ["\n".join(f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items()) + "\n"]
+    return ["\n".join(f"  {key}: {json.dumps(value, ensure_ascii=False)}" for key, value in content.items())]
 
 
 def _interval(row: Mapping[str, Any]) -> str:

@@ -70,9 +70,9 @@ class StatusResult(Result):
             sections.append(Section(frame=groups))
         sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
         if self.stored is not None:
-            sections.append(Section(frame=self.outcomes()))
-            more = [f"and {status.failed - LISTED} more"] if status.failed > LISTED else []
-            sections += [Section(frame=self.failures(), notes=more)] if status.failed else []
+            found = self.outcomes()
+            notes = [f"{each.status}: {each.message}" for each in found.itertuples() if each.message]
+            sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
             sections.append(Section(sentences=[aside]))
@@ -96,6 +96,13 @@ class StatusResult(Result):
         rows = [next(self.stored.part(place, place + 1).rows(*OF_FAILURES)) for place in places]
         frame = pd.DataFrame(rows, columns=OF_FAILURES)
         return frame.assign(message=frame["message"].map(first_line))
+
+    def _failed(self) -> list[Section]:
+        """Return a list of the first estimates that failed."""
+        failures, n = self.failures().to_dict("records"), self.status.failed
+        lines = ["- {id}, {estimator}, data set {replicate}, start {start}: {message}".format(**one) for one in failures]
+        more = [f"and {n - LISTED} more"] if n > LISTED else []
+        return [Section("Failed estimates:", [*lines, *more])] if n else []
 
     def _next(self) -> list[str]:
         """Return what to do next."""

@@ -313,6 +313,7 @@ def _record_sections(results: Results) -> list[Section]:
     if any(item.get("validation_fit_percent") is not None for item in rows):
         fits["fit, validation part"] = "validation_fit_percent"
     sections = [Section(results.experiment)]
+    several = len({row["start"] for row in rows}) > 1
     for block in _blocks(rows, ESTIMATES_PER_BLOCK):
         found = [parameters(row, bounds.get(row["estimator"])) for row in block]
         names = dict.fromkeys((one.name, one.unit) for own in found for one in own)
@@ -321,7 +322,7 @@ def _record_sections(results: Results) -> list[Section]:
             known = {(one.name, one.unit): _with_error(one) for one in own}
             texts = [row["id"], row["status"], *(known.get(name, "-") for name in names)]
             texts += [number(row.get(key), 4) for key in fits.values()]
-            title = f"{row['estimator']}, start {start_text(row['start'])}"
+            title = row["estimator"] + (f", start {start_text(row['start'])}" if several else "")
             columns[title] = [*texts, seconds(row.get("cpu_seconds") or row.get("seconds"))]
         lines = [("id", ""), ("status", ""), *names, *((title, "%") for title in fits), ("time", "")]
         sections.append(Section(frame=pd.DataFrame(lines, columns=["", "unit"]).assign(**columns)))

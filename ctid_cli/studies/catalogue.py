@@ -213,7 +213,7 @@ def find_figures(names: Sequence[str], out: Path | None = None) -> list[StudyFig
             known = [*_figure_names(), *own]
             hint = did_you_mean(name, known) or "."
             wrong = f"{name!r} is neither a figure nor a study with figures"
-            wrong += f", nor an experiment with results in {out}" if out else ""
+            wrong += f", nor an experiment with results in the folder {out}" if out else ""
             raise UsageError(f"{wrong}{hint} Known: {', '.join(known)}")
     return list(dict.fromkeys(found))
 

@@ -29,7 +29,7 @@ def page_of(name: str, out: Path) -> tuple[str, Path]:
     if name in studies:
         return study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
     hint = did_you_mean(name, [*known, *studies]) or "."
-    wrong = f"{name!r} is neither an experiment with results in {out} nor a study{hint}"
+    wrong = f"{name!r} is neither an experiment with results in the folder {out} nor a study{hint}"
     raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
 
 

@@ -1,49 +1,23 @@
-"""A tiny experiment, and a command line that runs inside the test."""
+"""A command line that runs inside the test, and a folder in which every command has been used once."""
 
+import contextlib
+import itertools
+import shlex
+
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from ctid_cli.cli import _compiling
-from ctid_cli.running import engine
-from ctid_cli.running.job import Begun, run_job
+from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
-
-TINY = """\
-experiment: tiny
-system:      {numerator: [2], denominator: [1, 2], delay: 0.35}
-excitation:  {kind: prbs, stages: 6, clock_period: 0.2, amplitude: 1.0}
-sampling:    {kind: regular, interval: 0.1, samples: 400}
-noise:       {kind: white, snr_db: [10, 20]}
-estimators:
-  search:    {kind: td_srivc, poles: 1, zeros: 0, delay_bounds: [0, 2], svf_cutoff: 2.0}
-  known:     {kind: srivc, poles: 1, zeros: 0, delay: 0.35, svf_cutoff: 2.0}
-starts:      {initial_delay: [0.3, {uniform: [0.2, 0.5]}]}
-monte_carlo: {runs: 2, seed: 1}
-success:     {delay_relative_error: 0.2}
-"""
-
-MEASURED = """\
-experiment: measured-tiny
-data:        {file: record.csv, time: t, input: u, output: y, hold: zoh, offset: remove, estimation_samples: 200}
-estimators:
-  known:     {kind: srivc, poles: 1, zeros: 0, svf_cutoff: 2.0}
-"""
+from tests.cli.records import MEASURED, SPECIFICATIONS, TINY, first_order, rows, tones, write
 
 
 @pytest.fixture(autouse=True)
 def compiled_in_silence(monkeypatch):
     """Compiled functions may be cached or not: what a command says while it waits for them is no part of a test."""
     monkeypatch.setattr(_compiling, "SILENT", 3600.0)
-
-
-def record_text(samples=300):
-    """A first-order response to a square wave, exact for a zero-order hold."""
-    lines, x = ["t,u,y"], 0.0
-    for k in range(samples):
-        u = 1.0 if (k // 15 + k // 40) % 2 else -1.0
-        lines.append(f"{0.1 * k:.1f},{u:g},{x + 1.0:.9f}")
-        x = 0.8187307530779818 * x + 0.18126924692201818 * u
-    return "\n".join(lines) + "\n"
 
 
 class Here:
@@ -55,8 +29,8 @@ class Here:
         pass
 
     def results(self, jobs, stopping):
-        for job in jobs:
-            yield job, Ending([entry for entry in run_job(job) if not isinstance(entry, Begun)])
+        for each in jobs:
+            yield each, Ending([entry for entry in job.run_job(each) if not isinstance(entry, job.Begun)])
 
     def close(self):
         pass
@@ -72,11 +46,11 @@ def without_workers():
 
 @pytest.fixture(scope="session")
 def ctid():
-    """Run a command: ``ctid("table", "1")``."""
+    """Run a command: ``ctid("table 1 --out", folder, code=2)``; the first words are as in a shell."""
     from ctid_cli.cli.main import app
 
-    def call(*arguments, code=0):
-        done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    def call(command, *arguments, code=0):
+        done = CliRunner().invoke(app, [*shlex.split(command), *map(str, arguments)])
         assert done.exit_code == code, f"exit code {done.exit_code}\n{done.stdout}\n{done.stderr}\n{done.exception!r}"
         assert "Traceback" not in done.output
         return done
@@ -84,30 +58,46 @@ def ctid():
     return call
 
 
-@pytest.fixture
-def tiny(tmp_path):
-    """File of the tiny experiment."""
-    file = tmp_path / "tiny.yaml"
-    file.write_text(TINY, encoding="utf-8")
-    return file
+@pytest.fixture(scope="session")
+def used(tmp_path_factory, ctid):
+    """Folder with specifications, their results, records, two fits and a track, made once."""
+    folder = tmp_path_factory.mktemp("used")
+    with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
+        patch.setattr(engine, "LocalWorkers", Here)
+        patch.setattr(_compiling, "SILENT", 3600.0)
+        # Every estimate takes ten milliseconds, on every machine.
+        ticks = itertools.count()
+        patch.setattr(job, "_clocks", lambda: np.full(2, 0.01 * next(ticks)))
+        for name, text in SPECIFICATIONS.items():
+            (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+        write("measured.csv", first_order())
+        write("record.csv", rows(0, noise=0.05, offset=0.3), "t [s],u [V],y [mm]")
+        write("other.csv", rows(1, noise=0.05, offset=0.3), "t [s],u [V],y [mm]")
+        write("tones.csv", tones(), "t,y")
+        ctid("run --quiet", *(f"{name}.yaml" for name in SPECIFICATIONS))
+        for poles in (1, 2):
+            ctid(f"fit record.csv --poles {poles} --delay 0:3 --offset estimate --out p{poles}")
+        ctid("track tones.csv --tones 2 --out track")
+    return folder
 
 
 @pytest.fixture
-def measured(tmp_path):
-    """File of a measured experiment, with its record beside it."""
-    (tmp_path / "record.csv").write_text(record_text(), encoding="utf-8")
-    file = tmp_path / "measured.yaml"
-    file.write_text(MEASURED, encoding="utf-8")
-    return file
+def home(used, monkeypatch):
+    """The used folder as working directory; a test that writes there removes what it wrote."""
+    monkeypatch.chdir(used)
+    return used
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory, ctid):
-    """Results folder with the tiny and the measured experiment, run once."""
-    folder = tmp_path_factory.mktemp("done")
-    (folder / "tiny.yaml").write_text(TINY, encoding="utf-8")
-    (folder / "measured.yaml").write_text(MEASURED, encoding="utf-8")
-    (folder / "record.csv").write_text(record_text(), encoding="utf-8")
-    files = folder / "tiny.yaml", folder / "measured.yaml"
-    assert ctid("run", *files, "--jobs", 1, "--quiet", "--out", folder / "results").stdout == ""
-    return folder / "results"
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A new folder with the tiny and the measured experiment as working directory."""
+    (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    (tmp_path / "measured-tiny.yaml").write_text(MEASURED, encoding="utf-8")
+    write(tmp_path / "measured.csv", first_order())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def contents(folder):
+    """Bytes of every file in a folder."""
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}

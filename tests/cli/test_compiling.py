@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 import typer
 
@@ -13,6 +12,7 @@ from ctid_cli.cli import _compiling
 from ctid_cli.cli._common import ComputingCommand
 from ctid_cli.cli._compiling import ANNOUNCEMENT, CompilationNotice
 from ctid_cli.cli.main import app
+from tests.cli.records import tones, write
 
 #: Commands that show, move or describe files, and need not load Numba.
 STORED = {"status", "export", "verify", "merge", "init"}
@@ -40,18 +40,13 @@ class Clock:
     join = cancel
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(_compiling.threading, "Timer", clock)
-    monkeypatch.setattr(_compiling.time, "monotonic", lambda: clock.now)
-    return clock
-
-
 @pytest.mark.parametrize(
     ("silent", "waits", "times"), [(2.0, [2.0], 1), (10.0, [10.0, 4.0], 1), (99.0, [99.0, 93.0, 87.0], 0)]
 )
-def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, clock, monkeypatch, capsys):
+def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, monkeypatch, capsys):
+    clock = Clock()
+    monkeypatch.setattr(_compiling.threading, "Timer", clock)
+    monkeypatch.setattr(_compiling.time, "monotonic", lambda: clock.now)
     monkeypatch.setattr(_compiling, "SILENT", silent)
     notice = CompilationNotice()
     for _ in range(3):
@@ -66,10 +61,7 @@ def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, c
 
 def test_a_command_tells_it_in_a_pipe_and_with_a_filled_cache_never(tmp_path):
     """Real compilation, announced at once: JSON stays JSON, and what is loaded from disk is no compilation."""
-    t = 0.001 * np.arange(500)
-    np.savetxt(
-        tmp_path / "signal.csv", np.column_stack((t, np.cos(100 * np.pi * t))), header="t,u", delimiter=",", comments=""
-    )
+    write(tmp_path / "signal.csv", tones(500), "t,y")
     program = "from ctid_cli.cli import _compiling, main; _compiling.SILENT = 0.0; main.main()"
     command = [sys.executable, "-c", program, "track", "signal.csv", "--tones", "1", "--json"]
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -82,12 +74,5 @@ def test_a_command_tells_it_in_a_pipe_and_with_a_filled_cache_never(tmp_path):
 
 
 def test_every_command_that_computes_tells_it():
-    def commands(group, prefix=""):
-        for name, command in group.commands.items():
-            if hasattr(command, "commands"):
-                yield from commands(command, f"{name} ")
-            else:
-                yield prefix + name, command
-
-    quiet = {name for name, command in commands(typer.main.get_group(app)) if not isinstance(command, ComputingCommand)}
-    assert quiet == STORED
+    commands = typer.main.get_group(app).commands
+    assert {name for name, command in commands.items() if not isinstance(command, ComputingCommand)} == STORED

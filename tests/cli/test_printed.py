@@ -1,0 +1,172 @@
+"""What commands print in a pipe: text read by eye when it changes, and JSON with the keys and types that it has."""
+
+import csv
+import io
+import json
+import re
+
+import pytest
+
+PRINTED = """\
+--help
+init open-loop measured --force
+schema --text noise
+validate tiny.yaml measured-tiny.yaml loop.yaml beat.yaml
+validate tiny.yaml --set "monte_carlo={seed: 1, until: {percent_half_width: 9}, at_most: 200}"
+validate tiny.yaml --set system.denominator=[1,80]
+run tiny.yaml --dry-run --runs 3
+run tiny.yaml --dry-run --set noise.snr_db=30
+run tiny.yaml --dry-run --shard 2/3
+run tiny.yaml --dry-run --out new --set "monte_carlo={seed: 1, until: {rmse_relative: 0.5}, at_most: 200}"
+status
+status --out nowhere
+status tiny
+status beat
+table tiny
+table tiny --format md
+table tiny --measure rmse,cpu --format latex
+table tiny --measure bias,coverage,percent
+table measured-tiny
+table loop
+table beat
+verify
+accuracy tiny.yaml
+accuracy loop.yaml
+compare p1/fit.json p2/fit.json --on other.csv --out compared
+frf record.csv --out response
+frf record.csv --method welch --out response
+track tones.csv --tones 2 --out track
+figure tiny
+figure tiny --measure rmse:delay --format pdf
+report tiny
+report p2/fit.json --file page.html
+report track/track.json
+export p2/fit.json --as control
+export p2/fit.json --as scipy
+export p2/fit.json --as matlab
+export tiny --file rows.csv
+reproduce --list
+""".splitlines()
+
+#: One JSON object each, or several, one on a line.
+AS_JSON = """\
+validate tiny.yaml
+status
+status tiny
+table tiny
+table tiny --measure bias,coverage,percent
+table measured-tiny
+table beat
+export tiny
+export beat
+export loop
+verify
+accuracy tiny.yaml
+compare p1/fit.json p2/fit.json --on other.csv --out compared
+frf record.csv --out response
+track tones.csv --tones 2 --out track
+reproduce --list
+""".splitlines()
+
+
+@pytest.mark.parametrize("command", PRINTED, ids=PRINTED)
+def test_text(ctid, home, snapshot, command):
+    done = ctid(command)
+    # The last digits of numbers that are written in full are those of a processor.
+    text = re.sub(r"\d+\.\d{6,}(e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", done.stdout)
+    assert [text, done.stderr] == snapshot
+
+
+@pytest.mark.parametrize("name", ["tiny", "loop", "beat"])
+def test_one_estimate_in_full(ctid, home, snapshot, name):
+    estimates = json.loads(ctid(f"export {name} --json").stdout)
+    some = {each["estimator"]: each for each in estimates}
+    # A beginning of the identifier is enough.
+    shown = [ctid(f"export --id {each['id'][:10]}").stdout for each in some.values()]
+    assert [re.sub(r"/\S*/experiments/", "", text) for text in shown] == snapshot
+    for each in some.values():
+        whole = json.loads(ctid(f"export --id {each['id']} --json").stdout)
+        assert {key: whole[key] for key in each if key != "parameters"} == {
+            key: value for key, value in each.items() if key != "parameters"
+        }
+        assert (whole["seed"], whole["settings"]["kind"]) == (1, each["kind"])
+
+
+def structure(*found):
+    """Keys and types of what was found in one place of plain data."""
+    items = [item for each in found if isinstance(each, list) for item in each]
+    parts = [each for each in found if isinstance(each, dict)]
+    if parts:
+        names = dict.fromkeys(name for each in parts for name in each)
+        return {name: structure(*(each[name] for each in parts if name in each)) for name in names}
+    return [structure(*items)] if items else " or ".join(sorted({type(each).__name__ for each in found}))
+
+
+@pytest.mark.parametrize("command", AS_JSON)
+def test_json(ctid, home, snapshot, command):
+    shown = ctid(f"{command} --json").stdout
+    assert ctid(f"{command} --format json").stdout == shown
+    try:
+        found = json.loads(shown)
+    except ValueError:
+        found = [json.loads(line) for line in shown.splitlines()]
+    assert structure(found) == snapshot
+
+
+@pytest.mark.parametrize("name", ["tiny", "loop", "beat"])
+def test_csv_holds_what_json_holds(ctid, home, name):
+    estimates = json.loads(ctid(f"export {name} --json").stdout)
+    text = ctid(f"export {name}").stdout
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["id"] for row in rows] == [each["id"] for each in estimates]
+    for row, each in zip(rows, estimates, strict=True):
+        flat = {key: value for key, value in each.items() if not isinstance(value, dict | list)}
+        flat |= each.get("measures") or {}
+        flat |= {f"se_{key}": value for key, value in (each.get("standard_errors") or {}).items()}
+        flat |= each.get("parameters") or {}
+        # What no estimate of the experiment has is no column.
+        assert {flat.pop(key) for key in [*flat] if key not in row} <= {None, "none", ""}
+        assert {key: row[key] for key in flat} == {
+            key: "" if value is None else str(value) for key, value in flat.items()
+        }
+        for letter, part in (("a", "denominator"), ("b", "numerator")):
+            if each.get(part):
+                assert [float(row[f"{letter}{k}"]) for k in range(letter == "a", len(each[part]))] == (
+                    each[part][letter == "a" :]
+                )
+    table = json.loads(ctid(f"table {name} --json").stdout)
+    shown = list(csv.DictReader(io.StringIO(ctid(f"table {name} --format csv").stdout)))
+    assert [list(row) for row in shown] == [list(table[0])] * len(table)
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [("tiny", ["initial_delay", "snr_db"]), ("loop", ["samples", "start"]), ("beat", ["half_width", "h"])],
+)
+def test_a_table_counts_the_estimates_that_meet_the_rule(ctid, home, name, keys):
+    estimates = json.loads(ctid(f"export {name} --json").stdout)
+    for row in json.loads(ctid(f"table {name} --json").stdout):
+        cell = [row["method"], *(row[key] for key in keys)]
+        mine = [each for each in estimates if [each["estimator"], *map(each.get, keys)] == cell]
+        assert (row["n"], row["converged"]) == (len(mine), sum(each["converged"] for each in mine))
+        assert row["percent"] == 100 * row["converged"] / row["n"]
+
+
+def test_the_rule_of_success(ctid, home):
+    for each in json.loads(ctid("export tiny --json").stdout):
+        assert each["converged"] == (abs(each["delay"] - 0.35) <= 0.2 * 0.35)
+    truth = {"g1_a1": 0.25, "g1_a2": 0.25, "g1_b0": 3.0, "g2_a1": 0.01, "g2_a2": 0.025, "g2_b0": 1.0}
+    for each in json.loads(ctid("export loop --json").stdout):
+        # By natural frequency, although the specification has the faster one first.
+        errors = [abs(each["parameters"][name] / true - 1) for name, true in truth.items()]
+        assert each["converged"] == (max(errors) <= 0.2)
+    settling = ("settling_time_1", "settling_time_2", "settling_after_step_1", "settling_after_step_2")
+    for each in json.loads(ctid("export beat --json").stdout):
+        times = [each["measures"].get(name) for name in settling]
+        assert each["estimator"] == "whole" or each["converged"] == all(t is not None and t <= 8 for t in times)
+
+
+def test_a_measured_record(ctid, home):
+    (row,) = json.loads(ctid("table measured-tiny --json").stdout)
+    # y' = -2 y + 2 u
+    assert row["denominator"] == pytest.approx([1, 2], rel=0.05)

@@ -1,0 +1,93 @@
+"""``ctid frf`` and ``ctid track``: from a file to numbers, whatever its clock, units and format."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import wavfile
+
+from ctid_cli import HeldSignal, TransferFunction, simulate
+from tests.cli.records import tones, write
+
+T, Y = tones().T
+
+
+def answered(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
+    """The response of 2 / (p + 1), with noise."""
+    t = 0.1 * np.arange(u.size) if times is None else times
+    y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
+    return write(file, (t, u, y + 0.1 * np.random.default_rng(seed + 100).standard_normal(t.size)), header)
+
+
+def test_the_interval_of_a_response_holds_the_true_one(ctid, tmp_path):
+    record = answered(tmp_path / "record.csv", np.random.default_rng(0).standard_normal(1500))
+    ctid("frf", record, "--out", tmp_path / "new")
+    frame = pd.read_csv(tmp_path / "new" / "frf.csv")
+    w, bias = frame["frequency [rad/s]"], frame["hold_bias [mm/V]"]
+    true = 2.0 / np.hypot(1.0, w)
+    inside = (frame["gain_low [mm/V]"] - bias <= true) & (true <= frame["gain_high [mm/V]"] + bias)
+    assert inside[(w > 0.5) & (w < 2.0)].mean() > 0.8
+    assert (tmp_path / "new" / "frf.svg").read_bytes().startswith(b"<?xml")
+
+
+def test_periods_realisations_and_units(ctid, tmp_path):
+    once = [np.random.default_rng(k).standard_normal(200) for k in range(3)]
+    files = [answered(tmp_path / f"{k}.csv", np.tile(u, 6), k, "t [ms],u,y") for k, u in enumerate(once)]
+    content = json.loads(ctid("frf --json --out", tmp_path, files[0]).stdout)
+    assert (content["method"], len(content["frequencies"]), content["distortion"]) == ("periodic", 99, None)
+    assert content["units"] == {"time": "ms", "input": "in", "output": "out"}
+    several = json.loads(ctid("frf --json --out", tmp_path, *files).stdout)
+    assert several["distortion"] is not None
+    assert "realisations" in " ".join(several["notes"])
+    text = ctid("frf --width 8 --out", tmp_path, files[0]).stdout
+    assert "17 lines" in text
+    assert "rad/ms" in text
+    irregular = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.15, 1200))
+    file = answered(tmp_path / "any.csv", np.tile(once[0], 6), times=irregular)
+    assert "the clock is irregular" in ctid("frf --out", tmp_path, file).stdout
+
+
+def unusual(folder):
+    """The two tones in another unit of time, as sound, without times, and with single samples missing."""
+    number, keep = np.arange(T.size), np.random.default_rng(1).random(T.size) < 0.6
+    wavfile.write(folder / "sound.wav", 500, (8000 * Y).astype(np.int16))
+    write(folder / "ms.csv", (1e3 * T, Y), "t [ms],y")
+    write(folder / "numbered.csv", (number, Y), "number,y")
+    write(folder / "some.csv", (T, np.where(keep, Y, np.nan)), "t,y")
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ("track sound.wav", {"interval": 0.002}),
+        ("track ms.csv --from 1000 --to 5000", {"start": 1.0, "samples": 2001}),
+        ("track numbered.csv --rate 500 --hdf5", {"interval": 0.002}),
+        ("track numbered.csv --interval 0.002 --every 0.05", {"every": 0.05}),
+        ("track some.csv --accuracy 0.5", {"samples": 3000, "accuracy_hz": 0.5}),
+        ("track some.csv --every 1e308", {"rows": 1}),
+    ],
+)
+def test_tones_are_found(ctid, tmp_path, monkeypatch, command, expected):
+    monkeypatch.chdir(tmp_path)
+    unusual(tmp_path)
+    content = json.loads(ctid(f"{command} --tones 2 --json --out new").stdout)
+    assert [tone["frequency_hz"] for tone in content["tones"]] == pytest.approx([12.0, 19.0], abs=0.05)
+    assert {key: content[key] for key in expected} == pytest.approx(expected, rel=0.1)
+    table = "new/track.h5" if "--hdf5" in command else "new/track.csv"
+    assert content["written"] == [table, "new/track.svg", "new/track.json"]
+    if table.endswith("csv"):
+        assert len(pd.read_csv(table)) == content["rows"]
+
+
+def test_missing_samples_are_flagged(ctid, tmp_path):
+    keep = (np.arange(T.size) < 1000) | (np.arange(T.size) >= 1400)
+    ctid("track --tones 2 --out", tmp_path, write(tmp_path / "gap.csv", (T[keep], Y[keep]), "t,y"))
+    frame = pd.read_csv(tmp_path / "track.csv")
+    inside = frame[(frame["t"] > T[1100]) & (frame["t"] < T[1300])]
+    assert len(inside)
+    assert (inside["valid_1"] == 0).all()
+    assert inside["flags_1"].str.contains("gap").all()
+    valid = frame[frame["valid_1"] == 1]
+    assert valid["omega_2"].median() == pytest.approx(2 * np.pi * 19.0, rel=1e-3)
+    assert valid["amplitude_1"].median() == pytest.approx(1.5, rel=0.02)
