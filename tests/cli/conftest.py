@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from ctid_cli.cli import _compiling
 from ctid_cli.running import engine, job
 from ctid_cli.running.workers import Ending
-from tests.cli.records import MEASURED, SPECIFICATIONS, TINY, first_order, rows, tones, write
+from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
 
 
 @pytest.fixture(autouse=True)
@@ -91,8 +91,8 @@ def home(used, monkeypatch):
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """A new folder with the tiny and the measured experiment as working directory."""
-    (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
-    (tmp_path / "measured-tiny.yaml").write_text(MEASURED, encoding="utf-8")
+    for name in ("tiny", "measured-tiny"):
+        (tmp_path / f"{name}.yaml").write_text(SPECIFICATIONS[name], encoding="utf-8")
     write(tmp_path / "measured.csv", first_order())
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -1,70 +1,25 @@
 """Records and specifications as the files that commands read."""
 
+from pathlib import Path
+
 import numpy as np
+import yaml
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.custom_code import STUDIES
 
+#: Command lines: what they print, and how they are refused.
+COMMANDS = yaml.safe_load((Path(__file__).parent / "commands.yaml").read_text(encoding="utf-8"))
 #: The system of most records.
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 
-TINY = """\
-experiment: tiny
-system:      {numerator: [2], denominator: [1, 2], delay: 0.35}
-excitation:  {kind: prbs, stages: 6, clock_period: 0.2, amplitude: 1.0}
-sampling:    {kind: regular, interval: 0.1, samples: 400}
-noise:       {kind: white, snr_db: [10, 20]}
-estimators:
-  search:    {kind: td_srivc, poles: 1, zeros: 0, delay_bounds: [0, 2], svf_cutoff: 2.0}
-  known:     {kind: srivc, poles: 1, zeros: 0, delay: 0.35, svf_cutoff: 2.0}
-starts:      {initial_delay: [0.3, {uniform: [0.2, 0.5]}]}
-monte_carlo: {runs: 2, seed: 1}
-success:     {delay_relative_error: 0.2}
-"""
-
-MEASURED = """\
-experiment: measured-tiny
-data:        {file: measured.csv, time: t, input: u, output: y, hold: zoh, offset: remove, estimation_samples: 200}
-estimators:
-  known:     {kind: srivc, poles: 1, zeros: 0, svf_cutoff: 2.0}
-"""
-
-#: Submodels in a loop, with coloured noise and starts around the truth.
-LOOP = """\
-experiment: loop
-system:
-  additive:
-    - {numerator: [1], denominator: [0.025, 0.01, 1]}
-    - {numerator: [3], denominator: [0.25, 0.25, 1]}
-loop:
-  controller: {pid: {kp: 0.0115, ki: 0.00725, kd: 0.00454}}
-  reference: {kind: gaussian, standard_deviation: 10.0}
-sampling: {kind: regular, interval: 0.05, samples: {geometric: [300, 600, 2]}}
-noise: {kind: arma, numerator: [1], denominator: [1, -0.5], variance: 0.01}
-estimators:
-  both: {kind: additive_srivc, terms: [{poles: 2, zeros: 0}, {poles: 2, zeros: 0}], instruments: closed_loop}
-  one: {kind: srivc, poles: 4, zeros: 2, instruments: closed_loop}
-starts: {parameters: [{relative_uniform: 0.01}, {relative_uniform: 0.02}]}
-monte_carlo: {runs: 2, seed: 1}
-success: {parameter_relative_error: 0.2}
-"""
-
-#: Frequencies of a signal, by two trackers and one estimator of the whole record.
-BEAT = f"""\
-experiment: beat
-signal:
-  tones: [{{frequency: [{{until: 8, value: 1.8}}, {{value: 2.2}}]}}, {{frequency: 3.0, phase: 1.5}}]
-disturbance: {{kind: uniform, half_width: [0.001, 0.01]}}
-sampling: {{kind: regular, interval: 0.02, duration: 20}}
-estimators:
-  restarting: {{kind: restarting_least_squares, tones: 2, h: [0.6, 0.7], prefilter: 0.5}}
-  finite: {{kind: drem_finite_time, tones: 2, h: 0.7, d: 0.4, epsilon: 0.1, gamma: 1.0, initial_frequencies: [2, 4]}}
-  whole: {{kind: "{STUDIES}/finite_time_frequency/comparators/whole_record.py:Esprit", tones: 2}}
-success: {{band: 0.05, by: 8, window: [18, 20]}}
-monte_carlo: {{runs: 3, seed: 1}}
-"""
-
-SPECIFICATIONS = {"tiny": TINY, "measured-tiny": MEASURED, "loop": LOOP, "beat": BEAT}
+SPECIFICATIONS = {
+    name: (Path(__file__).parent / "specifications" / f"{name}.yaml").read_text(encoding="utf-8")
+    for name in ("tiny", "measured-tiny", "loop", "beat")
+}
+# The folder of the studies lies elsewhere on every machine; the code that they name may run.
+SPECIFICATIONS["beat"] = SPECIFICATIONS["beat"].replace("STUDIES", str(STUDIES))
+TINY = SPECIFICATIONS["tiny"]
 
 
 def rows(seed=0, n=500, noise=0.02, offset=0.0):

@@ -76,23 +76,3 @@ def test_a_record_that_shows_nothing(ctid, tmp_path, monkeypatch, snapshot):
     done = ctid("check", "idle.csv", "--strict", code=7)
     assert done.stdout == snapshot
     assert done.stderr.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "rig.csv:1: the file is empty"),
-        ("t\n1\n", "rig.csv:1: the file has 't' and nothing else"),
-        ("t,u,y\n0,1,2\n1,a,3\n", "rig.csv:3: column 'u' holds 'a'"),
-        ("t,u,y\n0,1,\n1,1,nan\n", "rig.csv:2: no sample of the output 'y' is a finite number"),
-        ("t,u,y\n0,1,2\n0,1,2\n", "rig.csv:3: time 't' repeats 0 s"),
-    ],
-)
-def test_unusable_files(ctid, tmp_path, text, message):
-    path = tmp_path / "rig.csv"
-    path.write_text(text, encoding="utf-8")
-    done = ctid("check", path, code=2)
-    assert done.stdout == ""
-    assert done.stderr.startswith("ctid: ")
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1

@@ -7,69 +7,10 @@ import re
 
 import pytest
 
-PRINTED = """\
---help
-init open-loop measured --force
-schema --text noise
-validate tiny.yaml measured-tiny.yaml loop.yaml beat.yaml
-validate tiny.yaml --set "monte_carlo={seed: 1, until: {percent_half_width: 9}, at_most: 200}"
-validate tiny.yaml --set system.denominator=[1,80]
-run tiny.yaml --dry-run --runs 3
-run tiny.yaml --dry-run --set noise.snr_db=30
-run tiny.yaml --dry-run --shard 2/3
-run tiny.yaml --dry-run --out new --set "monte_carlo={seed: 1, until: {rmse_relative: 0.5}, at_most: 200}"
-status
-status --out nowhere
-status tiny
-status beat
-table tiny
-table tiny --format md
-table tiny --measure rmse,cpu --format latex
-table tiny --measure bias,coverage,percent
-table measured-tiny
-table loop
-table beat
-verify
-accuracy tiny.yaml
-accuracy loop.yaml
-compare p1/fit.json p2/fit.json --on other.csv --out compared
-frf record.csv --out response
-frf record.csv --method welch --out response
-track tones.csv --tones 2 --out track
-figure tiny
-figure tiny --measure rmse:delay --format pdf
-report tiny
-report p2/fit.json --file page.html
-report track/track.json
-export p2/fit.json --as control
-export p2/fit.json --as scipy
-export p2/fit.json --as matlab
-export tiny --file rows.csv
-reproduce --list
-""".splitlines()
-
-#: One JSON object each, or several, one on a line.
-AS_JSON = """\
-validate tiny.yaml
-status
-status tiny
-table tiny
-table tiny --measure bias,coverage,percent
-table measured-tiny
-table beat
-export tiny
-export beat
-export loop
-verify
-accuracy tiny.yaml
-compare p1/fit.json p2/fit.json --on other.csv --out compared
-frf record.csv --out response
-track tones.csv --tones 2 --out track
-reproduce --list
-""".splitlines()
+from tests.cli.records import COMMANDS
 
 
-@pytest.mark.parametrize("command", PRINTED, ids=PRINTED)
+@pytest.mark.parametrize("command", COMMANDS["text"], ids=str)
 def test_text(ctid, home, snapshot, command):
     done = ctid(command)
     # The last digits of numbers that are written in full are those of a processor.
@@ -102,7 +43,7 @@ def structure(*found):
     return [structure(*items)] if items else " or ".join(sorted({type(each).__name__ for each in found}))
 
 
-@pytest.mark.parametrize("command", AS_JSON)
+@pytest.mark.parametrize("command", COMMANDS["json"], ids=str)
 def test_json(ctid, home, snapshot, command):
     shown = ctid(f"{command} --json").stdout
     assert ctid(f"{command} --format json").stdout == shown

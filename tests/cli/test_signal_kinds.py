@@ -103,25 +103,3 @@ def test_gains_in_continuous_time_follow_the_interval(loaded, tmp_path):
     file.write_text("t,r,u,y\n" + "".join(f"{0.1 * k},{k % 3},{k % 5},{k % 7}\n" for k in range(30)))
     source = MeasuredSource(str(file), reference="r", loop=LoopOptions(ContinuousPid(kp=1.0, ti=2.0)))
     np.testing.assert_allclose(source.dataset(0).record.loop.controller.numerator, [1.05, -1.0])
-
-
-DESIGNED = {"excitation": {"kind": "multisine"} | MULTISINE, "noise": None, "monte_carlo": None}
-CLOSED = {"known": {"kind": "srivc", "poles": 1, "zeros": 0, "delay": 0.35, "instruments": "closed_loop"}}
-
-
-@pytest.mark.parametrize(
-    ("command", "sections", "said"),
-    [
-        ("validate", LOOP | {"loop": {"controller": {"continuous_pid": {"kp": 1, "ti": 1, "ki": 1}}}}, "ti gives the same as ki"),
-        ("validate", LOOP | {"loop": {"controller": RELAY | {"pid": {"kp": 1}}}}, "gives the controller a second time"),
-        ("validate", LOOP | {"loop": {"controller": RELAY}, "estimators": CLOSED}, "closed-loop instruments need the reference"),
-        ("accuracy", LOOP | {"loop": {"controller": RELAY}}, "theory is given here for linear controllers"),
-        ("validate", DESIGNED, "ok, one"),
-        ("validate", DESIGNED | {"excitation": {"kind": "multisine"} | MULTISINE | {"phases": "random"}}, "monte_carlo: is missing"),
-    ],
-)  # fmt: skip
-def test_what_is_said_of_loops_and_of_what_draws_nothing(ctid, tmp_path, command, sections, said):
-    (tmp_path / "spec.yaml").write_text(specification(**sections))
-    refused = command == "validate" and "ok" not in said
-    done = ctid(command, tmp_path / "spec.yaml", code=2 if refused else 0)
-    assert said in " ".join((done.stderr if refused else done.stdout).split())
