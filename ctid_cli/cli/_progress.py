@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Self
 
 import typer
@@ -29,10 +28,9 @@ TIME_AFTER = 2.0
 class _Progress:
     """A bar on stderr, from when it is started."""
 
-    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
-        self._clock = clock
-        self._began = self._last = clock()
+        self._began = self._last = time.monotonic()
         self._bar: Progress | None = None
         self._task: TaskID | None = None
 
@@ -44,12 +42,17 @@ class _Progress:
             self._bar.stop()
 
     def _start(self, total: int, *columns: ProgressColumn, **fields: Any) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
         shown = (TextColumn("{task.description}"), BarColumn(bar_width=20), *columns, TimeRemainingColumn())
-        self._bar = Progress(*shown, console=Console(stderr=True))
-        self._task = self._bar.add_task(self.name.rpartition("/")[2], total=total, **fields)
+        self._show(self.name.rpartition("/")[2], *shown, total=total, **fields)
+
+    def _show(self, text: str, *columns: ProgressColumn, transient: bool = False, **fields: Any) -> None:
+        from rich.console import Console
+        from rich.progress import Progress
+
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=transient)
+        self._task = self._bar.add_task(text, **fields)
         self._bar.start()
 
     def _update(self, done: int, **fields: Any) -> None:
@@ -59,10 +62,10 @@ class _Progress:
 
     def _is_time(self) -> bool:
         """Whether a line is due where no bar is drawn."""
-        return self._bar is None and self._clock() - self._last >= LINE_EVERY
+        return self._bar is None and time.monotonic() - self._last >= LINE_EVERY
 
     def _say(self, text: str) -> None:
-        self._last = self._clock()
+        self._last = time.monotonic()
         line = f"{self.name}: {text}"
         if self._bar is not None:
             self._bar.console.print(line, markup=False, highlight=False)
@@ -80,7 +83,7 @@ class RecordProgress(_Progress):
     def __call__(self, done: int, total: int) -> None:
         """Show that so many of all samples are done."""
         if sys.stderr.isatty():
-            if self._bar is None and self._clock() - self._began > BAR_AFTER:
+            if self._bar is None and time.monotonic() - self._began > BAR_AFTER:
                 from rich.progress import TaskProgressColumn
 
                 self._start(total, TaskProgressColumn())
@@ -112,13 +115,10 @@ class FitProgress(RecordProgress):
         super().__call__(done, total)
 
     def _show_time(self) -> None:
-        from rich.console import Console
-        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
 
         shown = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-        self._bar = Progress(*shown, console=Console(stderr=True), transient=True)
-        self._bar.add_task(self._fitting)
-        self._bar.start()
+        self._show(self._fitting, *shown, transient=True)
 
     def _stop_time(self) -> None:
         self._timer.cancel()
@@ -131,8 +131,8 @@ class FitProgress(RecordProgress):
 class Reporter(_Progress):
     """Shows the progress of one run on stderr."""
 
-    def __init__(self, name: str, clock: Callable[[], float] = time.monotonic, *, quiet: bool = False) -> None:
-        super().__init__(name, clock)
+    def __init__(self, name: str, *, quiet: bool = False) -> None:
+        super().__init__(name)
         self._quiet = quiet
         #: What was said first begins the run.
         self._ready = False
@@ -165,7 +165,7 @@ class Reporter(_Progress):
 
     def _advance(self, progress: RunProgress) -> None:
         done, total, failed = progress.done, progress.total, progress.failed
-        speed = done / max(self._clock() - self._began, 1e-9)
+        speed = done / max(time.monotonic() - self._began, 1e-9)
         self._update(done, total=total, rate=rate(speed), failed=failed)
         if self._is_time() or (self._bar is None and done == total):
             left = f", ETA {seconds((total - done) / speed)}" if 0 < done < total else ""

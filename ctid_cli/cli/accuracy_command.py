@@ -2,23 +2,23 @@
 
 from pathlib import Path
 
-from ctid_cli.cli._common import AllowCode, AllowOutside, Config, Out, Overrides, emit, guarded
+from ctid_cli.cli._common import Config, Out, emit, guarded
 from ctid_cli.cli._options import FormatOptions
-from ctid_cli.cli.experiment_commands import load_plans
+from ctid_cli.cli.experiment_commands import SpecOptions
 
 
 @guarded
 def accuracy(
     config: Config,
+    spec: SpecOptions,
     form: FormatOptions,
-    overrides: Overrides = None,
     out: Out = Path("results"),
-    allow_code: AllowCode = False,
-    allow_outside: AllowOutside = False,
 ) -> None:
     """Compute the standard errors to expect of an experiment.
 
-    No data are needed. For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
+    No data are needed.
+
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
     formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
     the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
     unexpected about them comes last.
@@ -26,5 +26,5 @@ def accuracy(
     from ctid_cli.reporting.accuracy_result import accuracy_of
     from ctid_cli.reporting.results import find_results
 
-    ((_, plan),) = load_plans([config], overrides or [], allow_code=allow_code, allow_outside=allow_outside)
+    ((_, plan),) = spec.plans([config])
     emit(accuracy_of(plan, find_results(out, plan.experiment)), form.form)

@@ -59,39 +59,6 @@ class Failure(StrEnum):
     memory = "memory"
 
 
-def load_plans(
-    configs: Sequence[Path],
-    overrides: Sequence[str],
-    runs: int | None = None,
-    *,
-    allow_code: bool = False,
-    allow_outside: bool = False,
-) -> list[tuple[Path, Plan]]:
-    """Read and check experiment files; warnings go to stderr."""
-    from ctid_cli.running.plan import build_plan
-    from ctid_cli.running.trial import load_tried
-
-    problems: list[Problem] = []
-    plans: list[tuple[Path, Plan]] = []
-    for config in configs:
-        try:
-            spec = load_tried(config, overrides, allow_code=allow_code, allow_outside=allow_outside)
-            plans.append((config, build_plan(spec, runs)))
-        except SpecError as error:
-            problems += error.problems
-    if problems:
-        raise SpecError(problems)
-    seen: dict[str, Path] = {}
-    for config, plan in plans:
-        if plan.experiment in seen:
-            both = f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r}"
-            raise UsageError(f"{both}; run them one at a time, or give one of them another name")
-        seen[plan.experiment] = config
-        for warning in plan.spec.warnings:
-            typer.echo(printable(f"warning: {warning}"), err=True)
-    return plans
-
-
 @dataclass(frozen=True)
 class SpecOptions:
     """How specifications are read."""
@@ -101,9 +68,29 @@ class SpecOptions:
     allow_outside: AllowOutside = False
 
     def plans(self, configs: Sequence[Path], runs: int | None = None) -> list[tuple[Path, Plan]]:
-        """Read and check specifications."""
+        """Read and check specifications; warnings go to stderr."""
+        from ctid_cli.running.plan import build_plan
+        from ctid_cli.running.trial import load_tried
+
+        problems: list[Problem] = []
+        plans: list[tuple[Path, Plan]] = []
         allowed = {"allow_code": self.allow_code, "allow_outside": self.allow_outside}
-        return load_plans(configs, self.overrides or [], runs, **allowed)
+        for config in configs:
+            try:
+                plans.append((config, build_plan(load_tried(config, self.overrides or [], **allowed), runs)))
+            except SpecError as error:
+                problems += error.problems
+        if problems:
+            raise SpecError(problems)
+        seen: dict[str, Path] = {}
+        for config, plan in plans:
+            if plan.experiment in seen:
+                both = f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r}"
+                raise UsageError(f"{both}; run them one at a time, or give one of them another name")
+            seen[plan.experiment] = config
+            for warning in plan.spec.warnings:
+                typer.echo(printable(f"warning: {warning}"), err=True)
+        return plans
 
 
 @dataclass(frozen=True)
@@ -280,8 +267,8 @@ def schema(
 ) -> None:
     """Print the JSON Schema of experiment files, or a reference.
 
-    With --text the reference: type, unit, default, allowed values and meaning of every key, or of those of one section or kind, for
-    example `ctid schema --text sampling` or `ctid schema --text td_srivc`.
+    With --text the reference: type, unit, default, allowed values and meaning of every key, or of those of one
+    section or kind, for example `ctid schema --text sampling` or `ctid schema --text td_srivc`.
     """
     from ctid_cli.specification.load import json_schema
     from ctid_cli.specification.reference import reference_text

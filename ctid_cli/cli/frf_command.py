@@ -34,9 +34,9 @@ def frf(
 ) -> None:
     """Estimate the frequency response of measured records.
 
-    No model is fitted. An input that repeats itself is averaged over its periods, which gives the variance by the noise and, from lines
-    without input or from several records, the level of nonlinear distortions. Any other record is taken by local
-    polynomials. Writes frf.csv and frf.svg.
+    No model is fitted. An input that repeats itself is averaged over its periods, which gives the variance by the
+    noise and, from lines without input or from several records, the level of nonlinear distortions. Any other
+    record is taken by local polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
     from ctid_cli.reporting.column_file import frame_bytes

@@ -18,9 +18,7 @@ Form = Literal["svg", "png", "pdf"]
 def figure(
     names: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="NAME", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."
-        ),
+        typer.Argument(metavar="NAME", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."),
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", metavar="KIND", help="measure or box.")] = None,
     measure: Annotated[
@@ -117,10 +115,11 @@ def report(
 ) -> None:
     """Write a page about a fit, a track, an experiment or a study.
 
-    To read, print or send: one HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it does, its residuals, and what to
-    know before using it. Of a track: the signal, its spectrogram, its tones, and the spectrum of what these leave. Of
-    an experiment or study: the question, tables, figures, differences of the estimators on the same data sets, what
-    went wrong and the commands that show it, how all of it was computed. And how to cite it.
+    To read, print or send: one HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it
+    does, its residuals, and what to know before using it. Of a track: the signal, its spectrogram, its tones, and
+    the spectrum of what these leave. Of an experiment or study: the question, tables, figures, differences of the
+    estimators on the same data sets, what went wrong and the commands that show it, how all of it was computed. And
+    how to cite it.
     """
     path = Path(name)
     if path.suffix.lower() == ".json" or path.is_file():

@@ -114,7 +114,8 @@ def export(
 ) -> None:
     """Write the estimates of an experiment, or a fit as code.
 
-    Every estimate in one row, one of them in full (--id), or the model of a fit as code for another tool (--as). `ctid status EXPERIMENT` lists the identifiers of failed estimates.
+    Every estimate in one row, one of them in full (--id), or the model of a fit as code for another tool (--as).
+    `ctid status EXPERIMENT` lists the identifiers of failed estimates.
     """
     form = "json" if json else format
     if name is not None and name.endswith(".json"):

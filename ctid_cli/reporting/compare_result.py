@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 VERDICTS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value")
 #: What the columns of the table mean.
 MEANING = (
-    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals are "
-    "white, and independent of the input; p is the probability of residuals farther from that."
+    "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals "
+    "are white, and independent of the input; p is the probability of residuals farther from that."
 )
 
 
@@ -98,7 +98,8 @@ class ModelComparison(Result):
         samples = (
             f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
         )
-        formats = {"fit %": ".2f", "R2": ".5g", f"rms [{unit.output}]": ".4g", "p, white": ".2g", "p, independent": ".2g"}
+        formats = {"fit %": ".2f", "R2": ".5g", f"rms [{unit.output}]": ".4g"}
+        formats |= dict.fromkeys(("p, white", "p, independent"), ".2g")
         return [
             Section(sentences=[f"{samples}, the same for all models."]),
             Section(frame=self._table(), formats=formats, notes=[MEANING], drawing=self.drawing()),

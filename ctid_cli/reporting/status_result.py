@@ -71,7 +71,8 @@ class StatusResult(Result):
         sections += [Section(frame=precision_frame(self.precision))] if self.precision else []
         if self.stored is not None:
             found = self.outcomes()
-            notes = [f"{each.status}: {each.message}" for each in found.itertuples() if each.message]
+            messages = zip(found["status"], found["message"], strict=True)
+            notes = [f"{status}: {message}" for status, message in messages if message]
             sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
@@ -99,8 +100,8 @@ class StatusResult(Result):
 
     def _failed(self) -> list[Section]:
         """Return a list of the first estimates that failed."""
-        failures, n = self.failures().to_dict("records"), self.status.failed
-        lines = ["- {id}, {estimator}, data set {replicate}, start {start}: {message}".format(**one) for one in failures]
+        rows, n = self.failures().to_numpy().tolist(), self.status.failed
+        lines = [f"- {id}, {by}, data set {number}, start {start}: {said}" for id, by, number, start, said in rows]
         more = [f"and {n - LISTED} more"] if n > LISTED else []
         return [Section("Failed estimates:", [*lines, *more])] if n else []
 

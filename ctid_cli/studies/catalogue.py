@@ -138,11 +138,9 @@ class StudyList(Result):
 
         return [
             Section(
-                f"{each.name}: {each.title}",
-                frame=pd.DataFrame(
-                    [(name, f"configs/{config}") for name, config in each.configs.items()],
-                    columns=["experiment", "specification"],
-                ),
+                each.name,
+                [f"{each.title}. Specifications are in configs."],
+                frame=pd.DataFrame(each.configs.items(), columns=["experiment", "specification"]),
             )
             for each in self.studies
         ]

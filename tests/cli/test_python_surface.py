@@ -91,7 +91,7 @@ def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     assert list(frame["unit"]) == ["1/s", "out/in/s"]
     assert f"fit {fit.fit_percent:.5g} % of 500 samples" in fit.summary()
     assert fit._repr_html_().count("<tr>") == 3
-    with pytest.raises(CtidError, match=r"a single Fit does not hold the record .* identify\("):
+    with pytest.raises(CtidError, match=r"a single MeasuredFit does not hold the record .* identify\("):
         fit.plot()
 
 
