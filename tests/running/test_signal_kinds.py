@@ -1,4 +1,4 @@
-"""Every kind of input, clock, noise and controller in an experiment, from its specification to its estimates."""
+"""Every kind of input, clock, noise and controller from its specification to its estimates."""
 
 import json
 
@@ -10,6 +10,7 @@ from ctid_cli.models.controller import ContinuousPid
 from ctid_cli.running.plan import build_plan
 from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource
 from ctid_cli.specification.load import load_spec
+from tests.running.fakes import outcomes_of
 
 #: A value for every section, and options for every kind that has some without a default.
 USUAL = {
@@ -35,9 +36,9 @@ REFERENCE = {"kind": "gaussian", "clock_period": 1.0}
 LOOP = {"excitation": None, "noise": {"kind": "white", "variance": 1e-3}}
 
 
-def specification(name="one", **sections):
+def specification(**sections):
     common = {
-        "experiment": name,
+        "experiment": "one",
         "system": {"numerator": [2], "denominator": [1, 2], "delay": 0.35},
         "estimators": {"known": {"kind": "srivc", "poles": 1, "zeros": 0, "delay": 0.35}},
         "monte_carlo": {"runs": 1, "seed": 1},
@@ -60,30 +61,11 @@ def specifications():
     yield "relay", LOOP | {"loop": {"controller": RELAY}}
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory, ctid, without_workers):
-    """Results folder of all experiments, run once."""
-    folder = tmp_path_factory.mktemp("kinds")
-    (folder / "input.csv").write_text("t,u\n0,1\n3,-1\n4,1\n11,-1\n13,1\n")
-    instants = 7.0 + 0.1 * np.arange(400) ** 1.02
-    (folder / "instants.csv").write_text("t\n" + "\n".join(map(str, instants)) + "\n")
-    for name, sections in specifications():
-        (folder / f"{name}.yaml").write_text(specification(name, **sections))
-    ctid("run --quiet --out", folder / "results", *folder.glob("*.yaml"))
-    return folder / "results"
-
-
-@pytest.mark.parametrize("name", [name for name, _ in specifications()])
-def test_every_kind_runs_from_its_specification_to_its_estimates(ctid, results, name):
-    (estimate,) = json.loads(ctid("export --json --out", results, name).stdout)
-    assert estimate["status"] == "CONVERGED"
-    # 30 dB and a few hundred samples: a fifth is far more than the noise can do.
-    np.testing.assert_allclose([*estimate["numerator"], estimate["denominator"][1]], [2.0, 2.0], rtol=0.2)
-
-
 @pytest.fixture
-def loaded(tmp_path):
-    """The plan of a specification."""
+def plan_of(tmp_path):
+    """The plan of a specification with some sections."""
+    write_columns(tmp_path / "input.csv", "t,u", [0, 3, 4, 11, 13], [1, -1, 1, -1, 1])
+    write_columns(tmp_path / "instants.csv", "t", 7.0 + 0.1 * np.arange(400) ** 1.02)
 
     def call(**sections):
         (tmp_path / "spec.yaml").write_text(specification(**sections))
@@ -92,10 +74,23 @@ def loaded(tmp_path):
     return call
 
 
-def test_gains_in_continuous_time_follow_the_interval(loaded, tmp_path):
+def write_columns(file, header, *columns):
+    np.savetxt(file, np.column_stack(columns), delimiter=",", header=header, comments="")
+
+
+@pytest.mark.parametrize("sections", [pytest.param(sections, id=name) for name, sections in specifications()])
+def test_every_kind_runs_from_its_specification_to_its_estimates(plan_of, sections):
+    (outcome,) = outcomes_of(plan_of(**sections).job(0, 0))
+    estimate = outcome.result
+    assert estimate["status"] == "CONVERGED"
+    # 30 dB and a few hundred samples: a fifth is far more than the noise can do.
+    np.testing.assert_allclose([*estimate["numerator"], estimate["denominator"][1]], [2.0, 2.0], rtol=0.2)
+
+
+def test_gains_in_continuous_time_follow_the_interval(plan_of, tmp_path):
     loop = {"controller": {"continuous_pid": {"kp": 0.5, "ti": [2.0, 4.0]}}, "reference": {"kind": "gaussian"}}
     sampling = {"kind": "regular", "interval": [0.05, 0.1], "samples": 50}
-    for cell in loaded(**LOOP, loop=loop, sampling=sampling).data_cells:
+    for cell in plan_of(**LOOP, loop=loop, sampling=sampling).data_cells:
         kp = 0.5 + 0.5 * cell.swept["interval"] / cell.swept["ti"]
         np.testing.assert_allclose(cell.dataset(0).record.loop.controller.numerator, [kp, -0.5])
     # A measured loop takes gains in seconds too.
