@@ -55,7 +55,7 @@ class FrequencyResponseResult(Result):
         rows = np.unique(np.searchsorted(found.frequencies, places).clip(max=found.frequencies.size - 1))
         low, high = found.gain_band()
         columns = {
-            f"[rad/{units.time}]": found.frequencies,
+            f"frequency [rad/{units.time}]": found.frequencies,
             f"gain [{units.gain}]": np.abs(found.response),
             "95 % low": low,
             "95 % high": high,

@@ -219,7 +219,7 @@ def read_fit(
     except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
         refuse(file, FIT, f"is damaged ({str(error)[:200]})")
     if validation is not None and other is None:
-        raise UsageError(f"{file} has no validation record, so that none can be elsewhere")
+        raise UsageError(f"{file} has no validation record; leave --validate out")
     for source in (*sources, *([other] if other else [])):
         if source.moved is not None:
             source.require_same()

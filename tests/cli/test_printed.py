@@ -22,9 +22,9 @@ def test_text(ctid, home, snapshot, command):
 def test_one_estimate_in_full(ctid, home, snapshot, name):
     estimates = json.loads(ctid(f"export {name} --json").stdout)
     some = {each["estimator"]: each for each in estimates}
-    # A beginning of the identifier is enough.
-    shown = [ctid(f"export --id {each['id'][:10]}").stdout for each in some.values()]
-    assert [re.sub(r"/\S*/experiments/", "", text) for text in shown] == snapshot
+    # A beginning of the identifier is enough; code of a study is named by a path of this machine.
+    shown = [ctid(f"export --id {each['id'][:10]}").stdout for each in some.values() if ":" not in each["kind"]]
+    assert shown == snapshot
     for each in some.values():
         whole = json.loads(ctid(f"export --id {each['id']} --json").stdout)
         assert {key: whole[key] for key in each if key != "parameters"} == {

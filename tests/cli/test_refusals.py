@@ -58,5 +58,5 @@ def test_one_message_and_nothing_is_written(prepared, monkeypatch, snapshot, com
     assert done.exit_code == code, done.output
     assert contents(prepared) == before
     assert done.stdout == "" or code == ExitCode.DIFFERENCE
-    assert done.stderr.replace(str(prepared), "HERE") == snapshot
+    assert (done.stdout + done.stderr).replace(str(prepared), "HERE") == snapshot
     assert done.stderr.isprintable() or re.fullmatch(r"[^\x00-\x09\x0b-\x1f\u202e]*", done.stderr)

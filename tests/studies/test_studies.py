@@ -127,7 +127,7 @@ def clean(monkeypatch, tmp_path):
     """A checkout without changes, whose code computed the results, and a folder that everything is published in."""
     answers = {"status": "", "rev-parse": "1234abcd"}
     monkeypatch.setattr(publishing, "_git", lambda *arguments: answers[arguments[0]])
-    monkeypatch.setattr(publishing, "spec_from_canonical", lambda content: content)
+    monkeypatch.setattr(publishing, "spec_from_canonical", lambda content, folder: content)
     monkeypatch.setattr(publishing, "build_plan", lambda spec: spec)
     monkeypatch.setattr(publishing, "current_version", lambda plan: answers.get("version", "c"))
     for module in (publishing, claims):
