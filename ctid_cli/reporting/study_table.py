@@ -12,7 +12,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import delay_label, number, seconds
-from ctid_cli.reporting.measures import COUNTED, percentage_frame, settings_of, with_types
+from ctid_cli.reporting.measures import COUNTED, percentage_frame, records_of, settings_of, with_types
 from ctid_cli.reporting.results import (
     Results,
     differences,
@@ -36,7 +36,6 @@ from ctid_cli.reporting.table_result import (
     named,
     notes_of,
     percent_text,
-    records_of,
     time_of,
 )
 from ctid_cli.running.plan import build_plan, current_version
@@ -159,7 +158,7 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
     frame["table"] = table.number
     frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
     first, last = ["table", "experiment", "sampling"], ["initial_delay", "method", *COUNTED]
-    others = [name for name in settings_of([frame.columns]) if name not in first]
+    others = [name for name in settings_of(frame) if name not in first]
     return _sorted(study, with_types(frame))[[*first, *others, *last]]
 
 

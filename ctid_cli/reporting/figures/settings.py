@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
-from ctid_cli.reporting.measures import Row, settings_of
+from ctid_cli.reporting.measures import settings_of
 from ctid_cli.reporting.results import Results
 from ctid_cli.signals.sampling import InstantsFile
 from ctid_cli.signals.sinusoids import SumOfSinusoids
@@ -21,6 +21,7 @@ from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSecti
 from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
 
 _SECTIONS = {
@@ -36,8 +37,6 @@ _SAMPLING_FORMS: dict[str, type] = {
     "times": ListedTimesSection,
     "file": InstantsFile,
 }
-#: Values of the settings that vary, in the order of their names.
-Point = tuple[Any, ...]
 
 
 class Settings(NamedTuple):
@@ -47,40 +46,38 @@ class Settings(NamedTuple):
     names: tuple[str, ...]
     #: Their titles with units.
     titles: tuple[str, ...]
-    points: list[Point]
+    #: Values of the settings at each place of a figure.
+    points: list[tuple[Any, ...]]
     methods: list[str]
 
-    def row_at(self, point: Point, rows: Sequence[Row]) -> Row | None:
-        """The row of a point; one that does not have a setting, such as an initial delay, is the same at all of its."""
-        at = list(zip(self.names, point, strict=True))
-        return next((row for row in rows if all(row[name] in (None, value) for name, value in at)), None)
 
-    def words(self, point: Point) -> str:
-        """A point as the title of a panel, without settings that it does not have."""
-        named = zip((title.partition(" [") for title in self.titles), point, strict=True)
-        known = ((title, value_text(value), unit) for (title, _, unit), value in named if value is not None)
-        return ", ".join(f"{title} {text} {unit.rstrip(']')}".strip() for title, text, unit in known)
+def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFrame]:
+    """Return what varies in the rows of an experiment, and the rows with their ``place``.
 
+    A row that lacks a setting, such as an initial delay, is the same at all values of it.
+    """
+    import pandas as pd
 
-def settings_in(rows: Sequence[Row], results: Results) -> Settings:
-    """What varies in the rows of an experiment."""
-    values = {name: _ordered(row[name] for row in rows) for name in [*settings_of(rows), "initial_delay"]}
+    values = {name: _ordered(frame[name]) for name in [*settings_of(frame), "initial_delay"]}
     varied = {name: found for name, found in values.items() if len(found) > 1}
-    methods = list(dict.fromkeys(row["method"] for row in rows))
     titles = tuple(title_of(name, results.settings) for name in varied)
-    every = Settings(tuple(varied), titles, list(itertools.product(*varied.values())), methods)
-    # Estimators of one name may differ in options that only some of them have: not every combination is planned.
-    return every._replace(points=[point for point in every.points if every.row_at(point, rows) is not None])
-
-
-def part_of(shown: Sequence[Any], found: Sequence[Any]) -> str:
-    """That there is more than what is shown."""
-    return f", the first {len(shown)} of {len(found)} settings" if len(shown) < len(found) else ""
+    points, parts = [], []
+    for point in itertools.product(*varied.values()):
+        own = frame
+        for name, value in zip(varied, point, strict=True):
+            column = own[name].map(_hashable)
+            own = own[column.isna() | (column == value)]
+        # Estimators of one name may differ in options that only some of them have: not every combination is planned.
+        if len(own):
+            parts.append(own.assign(place=len(points)))
+            points.append(point)
+    rows = pd.concat(parts).drop_duplicates([*({"parameter"} & {*frame}), "method", "place"])
+    return Settings((*varied,), titles, points, frame["method"].unique().tolist()), rows
 
 
 def _ordered(values: Any) -> list[Any]:
     """Values without repetition, numbers by size and before words."""
-    found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None]
+    found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None and value == value]
     return sorted(found, key=lambda value: (0, value) if _is_number(value) else (1, 0.0))
 
 

@@ -21,7 +21,6 @@ from ctid_cli.reporting.status_result import first_line
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.folder import SPEC
-from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import public_sessions
 from ctid_cli.text import count
 
@@ -59,7 +58,7 @@ def _counts(results: Results) -> str:
     methods = len({part["name"] for part in manifest["estimators"]})
     sets = sum(cell["replicates"] for cell in manifest["data_cells"])
     cells = f" in {count(len(manifest['data_cells']), 'setting')}" if len(manifest["data_cells"]) > 1 else ""
-    estimates = count(len(results.rows), "estimate")
+    estimates = count(len(results.stored), "estimate")
     failed = f", {results.failed} of them failed" if results.failed else ", none of them failed"
     return f"{count(methods, 'estimator')} on {count(sets, 'data set')}{cells}: {estimates}{failed}"
 
@@ -84,7 +83,7 @@ def _question(results: Results) -> Iterator[Section]:
 def _tables(results: Results) -> list[Section]:
     """Return the tables of ``ctid table``, and the usual measures where they are not among them."""
     tables = [experiment_table(results)]
-    if any(map(true_values, results.manifest["data_cells"])):
+    if results.is_simulated:
         others = [name for name in MEASURES if name not in default_measures(results)]
         tables += [measure_table(results, others)] if others else []
     return [section for table in tables for section in table.shown]
