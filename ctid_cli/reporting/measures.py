@@ -111,8 +111,8 @@ def percentage_frame(
 ) -> pd.DataFrame:
     """Return how often the estimators of an experiment converged, a row for each group that was planned."""
     labels = label_frame(results, table, fields)
-    frame = labels.join(_counted(results).reindex(labels.index))
-    return with_types(frame.join(_frequencies(results))) if is_of_signal(results.manifest) else with_types(frame)
+    frame = with_types(labels.join(_counted(results)))
+    return frame.join(_frequencies(results)) if is_of_signal(results.manifest) else frame
 
 
 def _counted(results: Results) -> pd.DataFrame:

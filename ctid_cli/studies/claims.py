@@ -34,7 +34,7 @@ class Claim:
 
 def within(claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = "") -> Claim:
     """Return the claim that a number lies in an interval; None stands for what never came."""
-    number = math.inf if value is None else float(value)
+    number = math.inf if value is None or math.isnan(value) else float(value)
     if math.isinf(low):
         required = f"at most {high:g}"
     else:
