@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,6 +68,11 @@ def records_of(frame: pd.DataFrame) -> list[Row]:
     return list(rows)
 
 
+def parts_of(frame: pd.DataFrame, *keys: Any) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Yield the rows of each group, in the order of their appearance."""
+    yield from frame.groupby([*keys], sort=False, dropna=False)
+
+
 # --- which groups there are -----------------------------------------------------------------------------------------
 
 
@@ -97,7 +102,7 @@ def label_frame(
     return pd.DataFrame(rows, dtype=object)
 
 
-def settings_of(names: Iterable[str]) -> list[str]:
+def settings_of(names: Iterable[Any]) -> list[str]:
     """Return the keys of swept fields; none has a reserved name, but initial parameters are told apart by theirs."""
     others = reserved_names().difference(["start"])
     return [name for name in names if name not in others and not name.startswith(OF_FREQUENCIES)]
@@ -193,14 +198,16 @@ def _measured(results: Results, name: str) -> pd.DataFrame:
     bounds = _bounds(results) if name.partition(":")[0] == "efficiency" else {}
     truths = [true_values(cell) for cell in results.manifest["data_cells"]]
     rows = []
-    for (group, parameter), own in values.groupby(["group", "parameter"], sort=False, dropna=False):
+    for (group, parameter), own in parts_of(values, "group", "parameter"):
         found = measured_of(own, measure, bounds.get(group, {}).get(parameter, math.nan))
         unit = measure.unit
         if measure.source == "errors":
-            of_parameter = parameter_unit(parameter, [*truths[results.groups["cell"][group]]])
+            of_parameter = parameter_unit(parameter, [*truths[results.place(group)[0]]])
             unit = {"": of_parameter, "^2": f"({of_parameter})^2"}.get(unit, unit)
         rows.append((group, parameter, unit, *found, int((~np.isfinite(own["value"])).sum())))
-    rows += [(group, None, measure.unit, *Measured(), 0) for group in results.groups.index.difference(values["group"])]
+    rows += [
+        (group, None, measure.unit, *Measured(), 0) for group in set(results.groups.index).difference(values["group"])
+    ]
     columns = ["group", "parameter", "unit", *Measured._fields, "without_value"]
     frame = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(Measured._fields, "float64"))
     frame.insert(2, "measure", name)
@@ -239,7 +246,7 @@ def values_of(results: Results, name: str) -> pd.DataFrame:
     values = np.full(len(stored), np.nan)
     if measure.source == "distance":
         for group in np.unique(numbers).tolist():
-            system = system_of(results.manifest["data_cells"][results.groups["cell"][group]], name)
+            system = system_of(results.manifest["data_cells"][results.place(group)[0]], name)
             values[numbers == group] = distances(system, results.members(group), name)
     elif measure.source == "converged":
         # Of a group with an estimate that no rule is about, nothing is said.

@@ -20,7 +20,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import Difference, holm, median_difference, percent_difference, rms_difference
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.measures import Row, label_frame, parameter_unit
+from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of
 from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.table_result import TableResult, labels_of, named, notes_of
 from ctid_cli.storage.manifest import true_values
@@ -76,12 +76,12 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     """Return the differences of two estimators of an experiment, or of one with several options, each pair once."""
     options, rows = results.swept("estimators"), list[Row]()
     labels = label_frame(results)
-    methods = [named(row["method"], row, options) for row in labels.to_dict("records")]
-    shared = labels.drop(columns=["method", *options])
+    methods = [named(row["method"], row, options) for row in records_of(labels)]
+    shared = records_of(labels.drop(columns=["method", *options]))
     for one, other in _pairs(results, first, second):
         # An estimator without a start goes with the other's.
-        label = shared.loc[other if results.groups["start"][one] == "none" else one].to_dict()
-        label |= {"first": methods[one], "second": methods[other]}
+        label = shared[other if results.place(one)[2] == "none" else one]
+        label = label | {"first": methods[one], "second": methods[other]}
         rows += [label | row for row in (*_percentages(results, one, other), *_values(results, one, other))]
     for measure in METHODS:
         family = [row for row in rows if row["measure"] == measure]
@@ -109,7 +109,7 @@ def _percentages(results: Results, *pair: int) -> Iterator[Row]:
         own = results.members(group)
         hits = ~own.failures if own.converged is None else own.converged
         sides.append(pd.DataFrame({"hit": hits, "id": own.values("id")}, index=own.column("replicate")))
-    common = sides[0].join(sides[1], rsuffix="_2", how="inner")
+    common = pd.concat([sides[0], sides[1].add_suffix("_2")], axis=1, join="inner")
     if len(common) < FEWEST:
         return
     only_first, only_second = common["hit"] & ~common["hit_2"], ~common["hit"] & common["hit_2"]
@@ -125,8 +125,8 @@ def _values(results: Results, *pair: int) -> Iterator[Row]:
     """Root mean square errors of the parameters that both estimate, and median processor times."""
     if results.is_simulated:
         errors = results.errors[results.errors["group"].isin(pair)]
-        names = [*true_values(results.manifest["data_cells"][results.groups["cell"][pair[0]]])]
-        for name, own in errors.groupby("parameter", sort=False):
+        names = [*true_values(results.manifest["data_cells"][results.place(pair[0])[0]])]
+        for (name,), own in parts_of(errors, "parameter"):
             sides = own.pivot(index="replicate", columns="group", values="value").reindex(columns=pair).dropna()
             if len(sides) >= FEWEST:
                 found = rms_difference(*sides.to_numpy().T.copy())

@@ -85,6 +85,11 @@ class Results:
         """Errors of the parameters of simulated systems: a row for each parameter of each estimate."""
         return error_frame(self.stored, self.numbers)
 
+    def place(self, group: int) -> tuple[int, int, str]:
+        """Return the places of data cell and estimator of a group, and its start."""
+        cell, estimator, start = self.groups.iloc[group]
+        return cell, estimator, start
+
     def members(self, group: int) -> Estimates:
         """Return the estimates of one group."""
         return self.stored.chosen(self.numbers == group)

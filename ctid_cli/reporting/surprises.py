@@ -15,7 +15,7 @@ from ctid_cli.inference.monte_carlo_tests import FEWEST as FEWEST
 from ctid_cli.inference.monte_carlo_tests import MEASURED, Departure, departures
 from ctid_cli.inference.paired import holm
 from ctid_cli.reporting.layout import delay_label, setting_text, setting_title
-from ctid_cli.reporting.measures import Row, counted_in, label_frame, measure_frame, records_of, settings_of
+from ctid_cli.reporting.measures import Row, counted_in, label_frame, measure_frame, parts_of, records_of, settings_of
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.simulation.dataset import SimulatedSource
 from ctid_cli.simulation.expected_accuracy import why_biased
@@ -69,7 +69,7 @@ def _tested(results: Results) -> Iterator[Finding]:
     labels = dict(enumerate(records_of(label_frame(results))))
     frame = measure_frame(results, MEASURED).dropna(subset="parameter")
     frame["counted"] = counted_in(frame)
-    for (group, parameter), own in frame.groupby([frame.index, "parameter"], sort=False):
+    for (group, parameter), own in parts_of(frame, frame.index, "parameter"):
         rows = own.set_index("measure")
         found = {str(row["measure"]): Measured(row["value"], row["error"]) for row in records_of(own)}
         for test in departures(found, *rows.loc[["bias", "error_ratio"], "counted"]):
@@ -78,7 +78,7 @@ def _tested(results: Results) -> Iterator[Finding]:
 
 def _reasons(results: Results, finding: Finding, far: set[str]) -> list[str]:
     """Return what the specification holds that explains a finding, what matters most first."""
-    kind, plan, (k, j, start) = finding.test.kind, results.plan, results.groups.loc[finding.group]
+    kind, plan, (k, j, start) = finding.test.kind, results.plan, results.place(finding.group)
     source = None if plan is None else plan.data_cells[k].source
     if plan is None or not isinstance(source, SimulatedSource):
         return []

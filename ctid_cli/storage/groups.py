@@ -112,7 +112,7 @@ def _given_delays(groups: pd.DataFrame, truths: Sequence[dict[str, float]], foun
     """Return the places of the estimators whose delay is no estimate."""
     delays: dict[int, list[Array]] = {}
     for number, (values, errors, _) in found.items():
-        cell, estimator, _ = groups.loc[number]
+        cell, estimator = groups.iloc[number, :2].tolist()
         if "delay" in truths[cell]:
             k = list(truths[cell]).index("delay")
             delays.setdefault(estimator, []).append(np.array([values[:, k], errors[:, k]]))

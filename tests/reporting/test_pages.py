@@ -38,7 +38,7 @@ def test_a_page_says_all_that_it_should(page, results):
     assert page.tags["svg"] == 2
     assert "2 estimators on 8 data sets in 2 settings: 16 estimates, 1 of them failed." in page.text
     assert "percent of the data sets whose delay estimate lies within 1 % of the true delay" in page.text
-    failed = next(row["id"] for row in results.rows if row["status"] == "FAILED")
+    failed = next(row["id"] for row in results.stored if row["status"] == "FAILED")
     assert f"ctid export useful-redundancy/case1-regular --id {failed}" in page.text
     assert "Huong Ha" not in page.text  # nobody's method but td_srivc's
     assert "doi:10.1016/j.jprocont.2014.10.003" in page.text

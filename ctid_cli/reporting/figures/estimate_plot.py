@@ -46,7 +46,7 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
         panels = panels_of(figure, len(names), columns)
         for axes, name in zip(panels, names, strict=True):
             _draw_panel(axes, boxes[boxes["parameter"] == name], settings)
-            unit = parameter_unit(name, results.errors["parameter"].unique())
+            unit = parameter_unit(name, results.errors["parameter"].unique().tolist())
             axes.set_ylabel(f"error of {plain(name)}" + ("" if unit == "-" else f" [{unit}]"))
             scale.apply(axes)
             axes.set_xlabel(", ".join(settings.titles))
@@ -60,8 +60,8 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
 def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings) -> None:
     """Draw the boxes of one parameter; what lies far outside most boxes is counted at the edge."""
     width, middle = 0.7 / len(settings.methods), 0.5 * (len(settings.methods) - 1)
-    boxes = [
-        (place + width * (k - middle), k, own["value"].to_numpy())
+    boxes: list[tuple[float, int, Any]] = [
+        (float(str(place)) + width * (k - middle), k, own["value"].to_numpy())
         for k, method in enumerate(settings.methods)
         for place, own in rows[rows["method"] == method].groupby("place")
     ]

@@ -61,7 +61,8 @@ def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFram
     values = {name: _ordered(frame[name]) for name in [*settings_of(frame), "initial_delay"]}
     varied = {name: found for name, found in values.items() if len(found) > 1}
     titles = tuple(title_of(name, results.settings) for name in varied)
-    points, parts = [], []
+    points: list[tuple[Any, ...]] = []
+    parts: list[pd.DataFrame] = []
     for point in itertools.product(*varied.values()):
         own = frame
         for name, value in zip(varied, point, strict=True):
