@@ -10,7 +10,7 @@ import pytest
 from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
-from ctid_cli.reporting.pages.question import formula_of, parts, polynomial
+from ctid_cli.reporting.pages.question import formula_of, polynomial
 from ctid_cli.storage.folder import SPEC
 from tests.reporting.parsed_page import Page
 
@@ -100,10 +100,3 @@ def test_styles_are_those_of_print_and_phones():
     assert "@media print" in css
     assert "overflow-x: auto" in css
     assert "http" not in css
-
-
-def test_of_a_noise_the_polynomials_are_options():
-    noise = {"kind": "arma", "numerator": [1.0], "denominator": [1.0, -0.9], "variance": 0.02}
-    system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.5}
-    found = {part.title: part.frame["option"].tolist() for part in parts({"noise": noise, "system": system})}
-    assert found == {"System": ["delay"], "Noise (arma)": ["numerator", "denominator", "variance"]}

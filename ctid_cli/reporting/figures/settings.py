@@ -4,39 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
 from ctid_cli.reporting.measures import settings_of
 from ctid_cli.reporting.results import Results
-from ctid_cli.signals.sampling import InstantsFile
-from ctid_cli.signals.sinusoids import SumOfSinusoids
-from ctid_cli.simulation.dataset import MeasuredSource
-from ctid_cli.specification.messages import option_docs
-from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSection
-from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
+from ctid_cli.specification.reference import unit_of
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-
-_SECTIONS = {
-    "system": SystemSection,
-    "starts": StartsSection,
-    "loop": LoopSection,
-    "signal": SumOfSinusoids,
-    "data": MeasuredSource,
-}
-#: Forms of the sampling that a key tells apart from others of the same kind.
-_SAMPLING_FORMS: dict[str, type] = {
-    "duration": RegularDurationSection,
-    "times": ListedTimesSection,
-    "file": InstantsFile,
-}
 
 
 class Settings(NamedTuple):
@@ -95,36 +74,16 @@ def value_text(value: Any) -> str:
     return plain(number(value))
 
 
-def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
-    kind = content.get("kind")
-    if kind in KINDS.get(section, {}):
-        forms = [form for key, form in _SAMPLING_FORMS.items() if section == "sampling" and key in content]
-        target: type | None = forms[0] if forms else resolve(section, kind)
-    else:
-        target = AdditiveSystemSection if "additive" in content else _SECTIONS.get(section) if kind is None else None
-    if target is None:
-        return "", {}
-    return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)
-
-
-def unit_in(text: str) -> str:
-    """The unit that the text about an option names; empty where it names none."""
-    unit = re.search(r"\[([^],…]+)\]", text)
-    return unit[1] if unit and unit[1] != "-" else ""
-
-
 def title_of(name: str, settings: Mapping[str, Any]) -> str:
     """The name of a swept setting with its unit."""
     if name == "initial_delay":
         return "initial delay [s]"
-    key = name.rpartition(".")[2]
+    key, title = name.rpartition(".")[2], "SNR" if name == "snr_db" else name.replace("_", " ")
     sections = [(section, item) for section, item in settings.items() if isinstance(item, Mapping)]
-    sections += [("estimator", item) for item in settings["estimators"].values()]
-    for section, content in sections:
-        if key in content and (unit := unit_in(documentation(section, content)[1].get(key, ""))):
-            return f"{'SNR' if name == 'snr_db' else name.replace('_', ' ')} [{unit}]"
-    return name.replace("_", " ")
+    sections += [("estimators", item) for item in settings["estimators"].values()]
+    units = (unit_of(section, key) for section, content in sections if key in content)
+    unit = next(filter(None, units), "")
+    return f"{title} [{unit}]" if unit else title
 
 
 class Scale(NamedTuple):
