@@ -33,12 +33,6 @@ def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
     )
 
 
-def warning_lines(warnings: Iterable[str]) -> list[str]:
-    """Return the warnings as the end of a text; nothing where there are none."""
-    lines = [wrapped(f"- {warning}", hanging="  ") for warning in warnings]
-    return ["", "Warnings:", *lines] if lines else []
-
-
 def closest(word: str, known: Iterable[str]) -> str | None:
     """Return the known name that was probably meant, whatever its capitals."""
     names = {name.lower(): name for name in reversed(list(known))}

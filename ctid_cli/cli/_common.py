@@ -30,7 +30,6 @@ Function = TypeVar("Function", bound=Callable[..., None])
 Number = TypeVar("Number", int, float)
 
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder that holds the results.")]
-Json = Annotated[bool, typer.Option("--json", help="Write JSON to stdout instead of text.")]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
@@ -51,15 +50,10 @@ AllowMixed = Annotated[bool, typer.Option("--allow-mixed", help="Mix code versio
 Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
 Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")]
-TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
-InputColumn = Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")]
-OutputColumn = Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")]
 InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its samples.")]
-From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
-To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
 
 #: Options that say where and in what form results are written, not what they are.
-_OF_OUTPUT = ("as_json", "format", "json", "out", "report", "csv", "export")
+_OF_OUTPUT = ("format", "json", "out", "report", "csv", "export")
 #: Errors that are the disk's: full, over quota, read-only, or failing.
 _OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
@@ -119,17 +113,6 @@ def span(text: str, number: Callable[[str], Number]) -> tuple[Number, Number] | 
         return number(low), number(high if colon else low)
     except ValueError:
         return None
-
-
-def answer(
-    as_json: bool, content: Callable[[], Mapping[str, Any]], text: Callable[[], str], written: Sequence[Path] = ()
-) -> None:
-    """Write the answer of a command to stdout, as one JSON object or as text, with the files that it has written."""
-    names = list(map(str, written))
-    if as_json:
-        typer.echo(json.dumps({**content(), **({"written": names} if names else {})}, allow_nan=False))
-    else:
-        typer.echo(text() + (f"\n\nWritten: {', '.join(names)}" if names else ""))
 
 
 def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str | None = None) -> None:

@@ -53,17 +53,20 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     return wrapper
 
 
+TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
+From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
+To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
+
+
 @dataclass(frozen=True)
 class RecordOptions:
     """Which columns and which part of measured records are used."""
 
-    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None
+    time: TimeColumn = None
     input: Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")] = None
     output: Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")] = None
-    start: Annotated[
-        float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")
-    ] = None
-    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None
+    start: From = None
+    stop: To = None
 
     def read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         """Read a record, between the instants that are given."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 
@@ -24,14 +24,12 @@ if TYPE_CHECKING:
 class SignalOptions:
     """Which column and which part of a recorded signal is used, and its clock."""
 
-    time: Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")] = None
+    time: TimeColumn = None
     signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None
     interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None
     rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None
-    start: Annotated[
-        float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")
-    ] = None
-    stop: Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")] = None
+    start: From = None
+    stop: To = None
 
     def reading(self) -> Reading:
         """Return how the signal is read from its file."""

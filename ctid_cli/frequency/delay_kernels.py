@@ -210,18 +210,18 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
 
 
 @njit(cache=True, nogil=True)
-def rooms_of(omega: Array) -> Array:
+def spacings_of(omega: Array) -> Array:
     """Distances of ascending frequencies to their nearest neighbours, or to zero."""
-    rooms = omega.copy()
-    rooms[1:] -= omega[:-1]
-    rooms[:-1] = np.minimum(rooms[:-1], rooms[1:])
-    return rooms
+    spacings = omega.copy()
+    spacings[1:] -= omega[:-1]
+    spacings[:-1] = np.minimum(spacings[:-1], spacings[1:])
+    return spacings
 
 
 @njit(cache=True, nogil=True)
 def lasts_a_period(omega: Array, elapsed: float) -> bool:
     """Whether a time [s] holds a period of every frequency, and a beat of all neighbours."""
-    return bool(rooms_of(omega).min() * elapsed >= 2.0 * np.pi)
+    return bool(spacings_of(omega).min() * elapsed >= 2.0 * np.pi)
 
 
 @njit(cache=True, nogil=True)
@@ -247,7 +247,7 @@ def flag_uncertain(
     n, misfit, rounded = theta.size, squared_residual(gram, theta), rounding_of(gram, theta)
     if misfit < DETERMINED * rounded:
         misfit = min(left, max(misfit, rounded))
-    rooms = rooms_of(omega)
+    spacings = spacings_of(omega)
     for i in range(n):
         # d c_i/d theta_k = -c_i^(n-k)/prod_j(c_i - c_j), and w = arccos(c)/h.
         others = roots[i] - roots
@@ -256,12 +256,12 @@ def flag_uncertain(
         direction = slopes.copy()
         substitute(factor, scales, direction)
         error = np.sqrt(max(np.sum(direction * slopes), 0.0) * misfit)
-        periods = rooms[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
+        periods = spacings[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
         if periods < 1.0:
             error /= max(periods, 1e-30) ** 5
         # Rounding does not shrink with time, and is not enlarged by the lack of it. Equal roots leave NaN.
         rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(direction) * scales)
-        if not error + rounding <= CERTAIN_FRACTION * rooms[i]:
+        if not error + rounding <= CERTAIN_FRACTION * spacings[i]:
             return UNCERTAIN
     return 0
 

@@ -172,8 +172,8 @@ def render_latex(sections: Iterable[Section]) -> str:
     """Render tables in LaTeX (booktabs), with titles and sentences as comments."""
     blocks: list[str] = []
     for section in sections:
-        comments = [section.title] if section.title else []
-        blocks += [f"% {line}" for text in (*comments, *section.sentences) for line in text.splitlines()]
+        comments = [*([section.title] if section.title else []), *section.sentences, *section.lines]
+        blocks += [f"% {line}" for text in comments for line in text.splitlines()]
         blocks += [_latex_table(*aligned_lines(section))] if section.frame is not None else []
         blocks += [f"% {line}" for text in section.notes for line in text.splitlines()]
     return "\n\n".join(blocks)
@@ -196,7 +196,7 @@ def render_html(sections: Iterable[Section]) -> str:
     return "\n".join(blocks)
 
 
-def html_table(section: Section, limit: int | None = None) -> str:
+def html_table(section: Section) -> str:
     """Return the table of a section as HTML, of a long one the first rows."""
     (header, *rows), sides = aligned_lines(section)
     styles = [f' style="text-align: {"left" if side == "l" else "right"}"' for side in sides]
@@ -205,7 +205,7 @@ def html_table(section: Section, limit: int | None = None) -> str:
         cells = [f"<{tag}{style}>{html.escape(text)}</{tag}>" for text, style in zip(texts, styles, strict=True)]
         return f"<tr>{''.join(cells)}</tr>"
 
-    return "<table>" + "\n".join([row("th", header), *(row("td", texts) for texts in rows[:limit])]) + "</table>"
+    return "<table>" + "\n".join([row("th", header), *(row("td", texts) for texts in rows)]) + "</table>"
 
 
 RENDERERS: Mapping[str, Callable[[Iterable[Section]], str]] = {

@@ -85,7 +85,7 @@ def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None
     integrators = next(k for k, value in enumerate(reversed(denominator)) if value != 0)
     named |= {name: units.of_submodel(name, integrators if name.startswith("g1_") else 0) for name in submodels}
     delay = estimate.get("delay")
-    # Of an estimator of one's own, in units that it alone knows.
+    # Of a custom estimator, in units that it alone knows.
     free = {name: "" for name in given if name not in (*named, "delay")}
     values |= {**given, "delay": delay}
     found = [_found(name, values[name], errors, unit) for name, unit in {**named, **free, "delay": units.time}.items()]

@@ -13,7 +13,7 @@ import pandas as pd
 from ctid_cli.inference.intervals import BIASED, NORMAL, UncertainValue
 from ctid_cli.kinds import KINDS
 from ctid_cli.reporting.document import Result, Section
-from ctid_cli.reporting.estimate import as_object, parameter_object, parameters
+from ctid_cli.reporting.estimate import PARAMETER_FORMATS, as_object, parameter_frame, parameter_object, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
 from ctid_cli.storage import columns
@@ -23,9 +23,6 @@ from ctid_cli.storage.manifest import swept_names
 
 if TYPE_CHECKING:
     from ctid_cli.storage.status import FoundEstimate
-
-#: Formats of the columns of a table of parameters.
-FORMATS = {"standard error": ".3g", "relative %": ".2g", "95 % low": ".5g", "95 % high": ".5g"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +35,7 @@ class EstimateResult(Result):
     def parameters(self) -> list[UncertainValue]:
         """Parameters with their uncertainty."""
         estimator = self.found.slot.estimator
-        # An estimator of one's own may mean something else by the name.
+        # A custom estimator may mean something else by the name.
         ours = estimator["kind"] in KINDS["estimator"]
         return parameters(self.found.row, estimator["content"].get("delay_bounds") if ours else None)
 
@@ -83,10 +80,8 @@ class EstimateResult(Result):
         notes = [f"True delay: {number(row['true_delay'])} s."] if row.get("true_delay") is not None else []
         if not names:
             return Section(notes=notes)
-        titles = {"name": "parameter", "standard_error": "standard error", "relative_percent": "relative %"}
-        titles |= {"low": "95 % low", "high": "95 % high"}
-        meaning = [*_conventions(names), _interval(row)]
-        return Section(frame=self.to_frame().rename(columns=titles), formats=FORMATS, notes=[" ".join(meaning), *notes])
+        meaning = " ".join([*_conventions(names), _interval(row)])
+        return Section(frame=parameter_frame(self.parameters), formats=PARAMETER_FORMATS, notes=[meaning, *notes])
 
 
 def _facts(row: Mapping[str, Any]) -> Section:

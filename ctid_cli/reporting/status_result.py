@@ -273,7 +273,7 @@ class MergeResult(Result):
         lines += [f"  they {MIXED.replace('mixes', 'mix')}, which tables will say"] if merged.mixed else []
         lines += [f"  {merged.missing}"] if merged.missing else []
         lines.append(f"  next: ctid table {merged.experiment}{out_option(self.out)}")
-        return [Section(sentences=["\n".join(lines)])]
+        return [Section(lines=lines)]
 
     def content(self) -> dict[str, Any]:
         """Return what was made for JSON."""

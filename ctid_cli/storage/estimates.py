@@ -41,8 +41,9 @@ if TYPE_CHECKING:
 CLOCKS = ("seconds", "cpu_seconds")
 #: Columns of several numbers, each with a name.
 _BY_NAME = [column.name for column in columns.COLUMNS if column.type == "by name"]
-#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both.
-Times = Callable[[str, str], Mapping[tuple[int, str], tuple[float | None, float | None]]]
+#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both and the first
+#: and the last replicate.
+Times = Callable[[str, str, int, int], Mapping[tuple[int, str], tuple[float | None, float | None]]]
 
 
 def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
@@ -70,10 +71,10 @@ def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
     return Estimates(export_in_memory(log), times)
 
 
-def _times_in(folder: Path, data_hash: str, estimator_hash: str) -> Any:
+def _times_in(folder: Path, *part: Any) -> Any:
     """Return the times that a journal holds."""
     with place.reading_journal(folder) as log:
-        return {} if log is None else log.times(data_hash, estimator_hash)
+        return {} if log is None else log.times(*part)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +193,11 @@ class Estimates:
         found, unknown = np.full((2, len(self)), np.nan), (np.nan, np.nan)
         for block in self.blocks if self._times is not None else ():
             assert self._times is not None
-            own, times = slice(block.first, block.last), self._times(block.cell["hash"], block.hash)
-            starts = [start.decode() for start in self.column("start")[own].tolist()]
-            keys = zip(self.column("replicate")[own].tolist(), starts, strict=True)
+            own = slice(block.first, block.last)
+            replicates, starts = self.column("replicate")[own].tolist(), self.column("start")[own].tolist()
+            # Not those of the whole block: of a large one this is a small part.
+            times = self._times(block.cell["hash"], block.hash, min(replicates), max(replicates))
+            keys = zip(replicates, (start.decode() for start in starts), strict=True)
             found[:, own] = np.array([times.get(key, unknown) for key in keys], dtype=float).T
         return found
 
@@ -317,7 +320,11 @@ class Estimates:
         known = {c.name: c for c in columns.COLUMNS}
         shown = [n for n in names or self.names if n not in known or known[n].of != left_out]
         dtypes = {name: known[name].dtype if name in known else (types or {}).get(name) for name in shown}
-        frame = pd.DataFrame({name: pd.Series(self.values(name), dtype=dtype) for name, dtype in dtypes.items()})
+        # Numbers are arrays already; a column that is not stored has no value.
+        arrays = {n for n in shown if n in known and known[n].type == "float64" and n != "true_delay" and self.has(n)}
+        frame = pd.DataFrame(
+            {n: pd.Series(self.column(n) if n in arrays else self.values(n), dtype=dtypes[n]) for n in shown}
+        )
         frame.attrs["mixed"] = self.mixed
         frame.attrs["units"] = {name: known[name].unit for name in shown if name in known and known[name].unit}
         return frame

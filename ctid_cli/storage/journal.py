@@ -216,9 +216,12 @@ class JournalReader:
         of_key = (key.data_hash, key.estimator_hash, key.replicate, key.start)
         return next(self._selected(f"WHERE {_IS_KEY}", *of_key), None)
 
-    def times(self, data_hash: str, estimator_hash: str) -> dict[tuple[int, str], tuple[float | None, float | None]]:
-        """Return times of the estimates of an estimator on a data cell [s], by replicate and start."""
-        rows = self._selected("WHERE data_hash = ? AND estimator_hash = ?", data_hash, estimator_hash)
+    def times(
+        self, data_hash: str, estimator_hash: str, first: int, last: int
+    ) -> dict[tuple[int, str], tuple[float | None, float | None]]:
+        """Return times of the estimates of an estimator on data sets of a cell, the last included [s], by key."""
+        where = "WHERE data_hash = ? AND estimator_hash = ? AND replicate BETWEEN ? AND ?"
+        rows = self._selected(where, data_hash, estimator_hash, first, last)
         return {(row.replicate, row.start): (row.seconds, row.cpu_seconds) for row in rows}
 
     def check(self, *, fully: bool = False) -> None:

@@ -22,10 +22,12 @@ def commit_of(found: StudyResults) -> str:
     changed = _git("status", "--porcelain", "--", ".", ":(exclude)results/published")
     if changed:
         raise RefusedError(f"nothing is published from files that are not committed:\n{changed}")
-    for results in found.experiments.values():
+    for short, results in found.experiments.items():
         if results.stored.mixed:
             raise RefusedError(f"{results.experiment} mixes results of different code versions or processors")
-        present = current_version(build_plan(spec_from_canonical(results.settings)))
+        # Code that a specification names is looked for beside it.
+        folder = found.study.config(short).parent
+        present = current_version(build_plan(spec_from_canonical(results.settings, folder)))
         if not {origin.code_version for origin in results.stored.origins} <= {present}:
             other = f"{results.experiment} was not computed by the code that is checked out"
             raise RefusedError(f"{other}; check out the commit that computed it, or run it again with --fresh")
