@@ -151,13 +151,13 @@ def _export_all(experiment: str, form: Format, out: Path, file: Path | None) -> 
     from ctid_cli.reporting.results import read_results
 
     results = read_results(out, experiment)
-    lines = csv_lines(results.stored) if form == "csv" else json_lines(results.rows)
+    lines = csv_lines(results.stored) if form == "csv" else json_lines(results.stored)
     if file is None:
         for text in lines:
             typer.echo(text, nl=False)
         return
     write_files({file: (text.encode() for text in lines)})
-    typer.echo(f"{len(results.rows)} estimates written to {file}", err=True)
+    typer.echo(f"{len(results.stored)} estimates written to {file}", err=True)
 
 
 def _export_one(experiment: str | None, id: str, form: Format, out: Path, file: Path | None) -> None:

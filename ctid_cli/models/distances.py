@@ -1,13 +1,14 @@
 """How far an estimated model is from the system, relative to the system itself [-]; infinite for an unstable model."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
 #: Frequencies at which the largest error is looked for, and how far they go beyond the slowest and the fastest pole.
 POINTS, BEYOND = 400, 100.0
@@ -73,3 +74,17 @@ def response_distance(system: TransferFunction, model: TransferFunction, frequen
     """The error of the frequency response at one frequency [rad/s] over the gain there."""
     gain = system.frequency_response(frequency)
     return float(np.abs(model.frequency_response(frequency) - gain) / np.abs(gain))
+
+
+def matched_poles(true: ComplexArray, denominator: Sequence[float] | None) -> ComplexArray:
+    """Poles of a model in the order of the true ones, so that all distances together are least.
+
+    NaN where there is no model, or it has another number of poles.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if denominator is None or len(denominator) != true.size + 1:
+        return np.full(true.size, complex(np.nan, np.nan))
+    found = sorted_roots(np.array(denominator))
+    order = linear_sum_assignment(np.abs(true[:, None] - found))[1]
+    return np.asarray(found[order])

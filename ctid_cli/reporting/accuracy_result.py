@@ -12,13 +12,13 @@ import pandas as pd
 from ctid_cli.errors import BiasedError, DataError, UsageError
 from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.reporting.document import Result, Section, aligned_lines
-from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.layout import setting_text, setting_title
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.surprises import FEWEST, surprises
 from ctid_cli.running.job import DataCell, EstimatorCell
 from ctid_cli.running.plan import Plan
 from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.expected_accuracy import expected_accuracy
 from ctid_cli.text import count, listed
 
 #: On what all of it rests.

@@ -14,11 +14,11 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import fisher, holm, smallest_detectable
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import number, percent
-from ctid_cli.reporting.measures import settings_of
+from ctid_cli.reporting.measures import records_of, settings_of
 from ctid_cli.reporting.results import shown_path
 from ctid_cli.reporting.study import Study, load_study
 from ctid_cli.reporting.study_table import build_tables, committed_tables, made_by, read_tables
-from ctid_cli.reporting.table_result import labels_of, records_of
+from ctid_cli.reporting.table_result import labels_of
 from ctid_cli.text import count, listed
 
 #: Chance that a check reports any difference although nothing has changed.
@@ -153,7 +153,7 @@ def compare(
     assumes. The comparisons for information are a family of their own.
     """
     known = rows.iloc[:0] if committed is None else committed
-    settings = list(dict.fromkeys([*settings_of([rows.columns]), *settings_of([known.columns])]))
+    settings = list(dict.fromkeys([*settings_of(rows), *settings_of(known)]))
     fresh, known = (_keyed(side, settings) for side in (rows, known))
     known = known[(known["n"] > 0) & known["converged"].notna()]
     tables = fresh["table"].astype(str).unique()

@@ -13,7 +13,7 @@ from ctid_cli.reporting import surprises as unexpected
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing
 from ctid_cli.reporting.figures.style import Picture
-from ctid_cli.reporting.measures import Row, default_measures, measure_rows
+from ctid_cli.reporting.measures import Row, default_measures, measure_frame
 from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results
 from ctid_cli.reporting.table_result import TableResult, experiment_table, notes_of
@@ -45,7 +45,7 @@ class ExperimentResults(Results, Result):
     """
 
     def __repr__(self) -> str:
-        planned, stored = planned_count(self.manifest), len(self.rows)
+        planned, stored = planned_count(self.manifest), len(self.stored)
         estimators = ", ".join(dict.fromkeys(part["name"] for part in self.manifest["estimators"]))
         head = f"{self.experiment}: {stored} of {planned} estimates by {estimators}, {self.failed} failed"
         return f"{head}\n  in {count(len(self.manifest['data_cells']), 'data cell')}, {self.folder}"
@@ -77,11 +77,6 @@ class ExperimentResults(Results, Result):
         return self.folder.parents[len(Path(self.experiment).parts) - 1]
 
     @property
-    def estimates(self) -> pd.DataFrame:
-        """One row for each estimate, what ``ctid export`` writes; the units of columns are in ``attrs["units"]``."""
-        return self.stored.frame()
-
-    @property
     def surprises(self) -> list[str]:
         """What the estimates show that theory does not expect, with its reasons; empty where there is nothing."""
         return unexpected.surprises(self)
@@ -106,9 +101,7 @@ class ExperimentResults(Results, Result):
         UsageError
             If there is no such measure, or this experiment cannot have it.
         """
-        import pandas as pd
-
-        return pd.DataFrame(measure_rows(self, names or default_measures(self) or ["percent"]))
+        return measure_frame(self, names or default_measures(self) or ["percent"]).reset_index(drop=True)
 
     def compare(self, first: str, second: str) -> pd.DataFrame:
         """Differences of two estimators on the same data sets, what ``ctid table --compare`` prints.

@@ -19,27 +19,23 @@ Keys of a row
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IntArray
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, quantile, requested, wilson_interval
+from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, wilson_interval
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.model_measures import distance_of, distances, pole_estimates, system_of
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group, least_variances
-from ctid_cli.reporting.results import Group, Results, lookup
+from ctid_cli.reporting.model_measures import distances, pole_errors, system_of
+from ctid_cli.reporting.results import Results, lookup
+from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import base_name
 from ctid_cli.storage.columns import reserved_names
-from ctid_cli.storage.estimates import CLOCKS, Estimates
+from ctid_cli.storage.estimates import CLOCKS
 from ctid_cli.storage.manifest import is_of_signal, true_values
 from ctid_cli.text import did_you_mean, listed
 
@@ -60,44 +56,55 @@ ALWAYS = {"snr_db": "noise.snr_db"}
 SUCCESSES = {Status.CONVERGED.name, Status.LEAST_SQUARES.name, "VALID"}
 #: What is measured where the specification does not say.
 DEFAULT = ("bias", "rmse")
+#: Measures of which an estimate without a value counts as infinitely bad.
+INFINITE = [name for name, item in MEASURES.items() if item.source in ("distance", "fresh_fit_percent")]
 #: What the measures of frequencies begin with in rows.
 OF_FREQUENCIES = ("median_settling", "median_rms", "false_alarms")
 
-#: A parameter or status, what was measured of it, its unit, and how many estimates have no value.
-Found = tuple[str | None, Measured, str, int]
+
+def records_of(frame: pd.DataFrame) -> list[Row]:
+    """Return the rows of a frame, None where there is no value."""
+    rows: Any = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    return list(rows)
+
+
+def parts_of(frame: pd.DataFrame, *keys: Any) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Yield the rows of each group, in the order of their appearance."""
+    yield from frame.groupby([*keys], sort=False, dropna=False)
 
 
 # --- which groups there are -----------------------------------------------------------------------------------------
 
 
-def labelled_groups(
+def label_frame(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
-) -> Iterator[tuple[Group, Row]]:
-    """Yield every combination of swept fields, estimator and start that was planned, with the keys of all its rows."""
+) -> pd.DataFrame:
+    """Return the keys of all rows of each planned combination of swept fields, estimator and start."""
+    import pandas as pd
+
     manifest = results.manifest
     down, across = results.swept("data_cells"), results.swept("estimators")
     fields = fields or ({} if is_of_signal(manifest) else ALWAYS)
     constant = {name: lookup(results.settings, path) for name, path in fields.items()}
     # Several sets of initial parameters are told apart by their names, as initial delays are by their values.
     given = {label for label, delay in manifest["starts"].items() if delay is None and label != "none"}
-    for cell, estimator in itertools.product(manifest["data_cells"], manifest["estimators"]):
-        own = {name: estimator["swept"].get(name) for name in across}
-        for start in estimator["starts"]:
-            yield (
-                Group(cell["hash"], estimator["name"], tuple(own.values()), start),
-                {"table": table or results.experiment, "experiment": results.experiment, "sampling": results.sampling}
-                | constant
-                | {name: cell["swept"].get(name) for name in down}
-                | ({"start": start if start in given else None} if len(given) > 1 else {})
-                | own
-                | {"initial_delay": manifest["starts"].get(start), "method": estimator["name"]},
-            )
+    rows = []
+    for cell, estimator, start in results.groups.itertuples(index=False, name=None):
+        data, part = manifest["data_cells"][cell], manifest["estimators"][estimator]
+        rows.append(
+            {"table": table or results.experiment, "experiment": results.experiment, "sampling": results.sampling}
+            | constant
+            | {name: data["swept"].get(name) for name in down}
+            | ({"start": start if start in given else None} if len(given) > 1 else {})
+            | {name: part["swept"].get(name) for name in across}
+            | {"initial_delay": manifest["starts"].get(start), "method": part["name"]}
+        )
+    return pd.DataFrame(rows, dtype=object)
 
 
-def settings_of(rows: Iterable[Iterable[str]]) -> list[str]:
+def settings_of(names: Iterable[Any]) -> list[str]:
     """Return the keys of swept fields; none has a reserved name, but initial parameters are told apart by theirs."""
     others = reserved_names().difference(["start"])
-    names = dict.fromkeys(key for row in rows for key in row)
     return [name for name in names if name not in others and not name.startswith(OF_FREQUENCIES)]
 
 
@@ -108,36 +115,27 @@ def percentage_frame(
     results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
 ) -> pd.DataFrame:
     """Return how often the estimators of an experiment converged, a row for each group that was planned."""
+    labels = label_frame(results, table, fields)
+    frame = with_types(labels.join(_counted(results)))
+    return frame.join(_frequencies(results)) if is_of_signal(results.manifest) else frame
+
+
+def _counted(results: Results) -> pd.DataFrame:
+    """Return counts, percentages and median times of groups."""
     import pandas as pd
 
-    groups, labels = zip(*labelled_groups(results, table, fields), strict=True)
-    members = results.groups()
-    numbers = np.full(len(results.stored), -1)
-    for k, group in enumerate(groups):
-        if group in members:
-            numbers[members[group].places] = k
-    frame = pd.DataFrame(list(labels), dtype=object).join(_counted(results.stored, numbers, len(groups)))
-    return frame.join(_frequencies(results.stored, numbers)) if is_of_signal(results.manifest) else frame
-
-
-def _counted(stored: Estimates, numbers: IntArray, groups: int) -> pd.DataFrame:
-    """Return counts, percentages and median times of groups, from the number of the group of each estimate."""
-    import pandas as pd
-
+    stored = results.stored
     columns = {"failed": stored.failures, "converged": stored.judged, **{name: stored.column(name) for name in CLOCKS}}
-    found = pd.DataFrame(columns).groupby(numbers)
+    found = pd.DataFrame(columns).groupby(results.numbers)
     hits = found["converged"].agg(["size", "count", "sum"])
     n, converged = hits["size"], hits["sum"].where(hits["count"] == hits["size"])
-    counts = pd.DataFrame(
-        {"n": n, "failed": found["failed"].sum(), "converged": converged, "percent": 100 * converged / n}
-    )
     ends = [
         wilson_interval(int(k), int(n)) if k == k else (math.nan, math.nan) for n, k in zip(n, converged, strict=True)
     ]
-    counts[["low", "high"]] = 100 * np.reshape(ends, (-1, 2))
-    for clock in CLOCKS:
-        counts[f"median_{clock}"] = found[clock].median()
-    return with_types(counts.reindex(range(groups)))
+    low, high = 100 * np.reshape(ends, (-1, 2)).T
+    counts = {"n": n, "failed": found["failed"].sum(), "converged": converged, "percent": 100 * converged / n}
+    medians = {f"median_{clock}": found[clock].median() for clock in CLOCKS}
+    return pd.DataFrame(counts | {"low": low, "high": high} | medians)
 
 
 def with_types(frame: pd.DataFrame) -> pd.DataFrame:
@@ -150,10 +148,11 @@ def with_types(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.drop(columns=[*COUNTED], errors="ignore").join(counts)
 
 
-def _frequencies(stored: Estimates, numbers: IntArray) -> pd.DataFrame:
+def _frequencies(results: Results) -> pd.DataFrame:
     """Return medians of the measures of frequencies; what does not exist counts as later or larger than all else."""
     import pandas as pd
 
+    stored, numbers = results.stored, results.numbers
     if not stored.has("measures"):
         return pd.DataFrame()
     names = list(map(str, stored.export.parts("measures")))
@@ -174,32 +173,115 @@ def _frequencies(stored: Estimates, numbers: IntArray) -> pd.DataFrame:
 # --- measures -------------------------------------------------------------------------------------------------------
 
 
-def measure_rows(results: Results, names: Sequence[str]) -> list[Row]:
-    """Return measures by name, of every combination of swept fields, estimator and start that was planned."""
+def measure_frame(results: Results, names: Sequence[str]) -> pd.DataFrame:
+    """Return measures by name, of every planned combination of swept fields, estimator and start, by its number."""
+    import pandas as pd
+
+    names = list(dict.fromkeys(names))
     for name in names:
         _require_measurable(name, results)
-    source, rows = _Measuring(results), []
-    for group, labels in labelled_groups(results):
-        members = results.groups().get(group, results.stored.part(0, 0))
-        counts = {"n": len(members), "failed": int(members.failures.sum())}
-        for name in dict.fromkeys(names):
-            measure = measure_of(name, results)
-            found = source.found(name, measure, group, members) if members else [(None, Measured(), measure.unit, 0)]
-            rows += [
-                labels
-                | {"parameter": parameter, "measure": name, "unit": unit, **measured._asdict()}
-                | counts
-                | {"without_value": without}
-                for parameter, measured, unit, without in found
-            ]
-    return rows
+    labels = label_frame(results)
+    failures = pd.Series(results.stored.failures).groupby(results.numbers).agg(["size", "sum"])
+    failures = failures.reindex(labels.index, fill_value=0)
+    found = pd.concat([_measured(results, name) for name in names]).sort_index(kind="stable")
+    counts = pd.DataFrame({"n": failures["size"], "failed": failures["sum"]}).loc[found.index]
+    return pd.concat(
+        [labels.loc[found.index], found.drop(columns="without_value"), counts, found["without_value"]], axis=1
+    )
 
 
-def counted_in(row: Mapping[str, Any]) -> int:
-    """Return the number of data sets that the value of a row is computed from."""
-    measure = MEASURES.get(row["measure"].partition(":")[0])
-    infinite = measure is not None and measure.source in ("distance", "fresh_fit_percent")
-    return int(row["n"] - (0 if infinite else row["without_value"]))
+def _measured(results: Results, name: str) -> pd.DataFrame:
+    """Return one measure of every planned group, a row for each parameter or status that it is about."""
+    import pandas as pd
+
+    measure, values = measure_of(name, results), values_of(results, name)
+    bounds = _bounds(results) if name.partition(":")[0] == "efficiency" else {}
+    truths = [true_values(cell) for cell in results.manifest["data_cells"]]
+    rows = []
+    for (group, parameter), own in parts_of(values, "group", "parameter"):
+        found = measured_of(own, measure, bounds.get(group, {}).get(parameter, math.nan))
+        unit = measure.unit
+        if measure.source == "errors":
+            of_parameter = parameter_unit(parameter, [*truths[results.place(group)[0]]])
+            unit = {"": of_parameter, "^2": f"({of_parameter})^2"}.get(unit, unit)
+        rows.append((group, parameter, unit, *found, int((~np.isfinite(own["value"])).sum())))
+    rows += [
+        (group, None, measure.unit, *Measured(), 0) for group in set(results.groups.index).difference(values["group"])
+    ]
+    columns = ["group", "parameter", "unit", *Measured._fields, "without_value"]
+    frame = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(Measured._fields, "float64"))
+    frame.insert(2, "measure", name)
+    return frame.set_index("group")
+
+
+def measured_of(values: pd.DataFrame, measure: Measure, bound: float = math.nan) -> Measured:
+    """Return a measure of the values of one group, of those that are known."""
+    known = values[values["value"].notna()]
+    found = known["value"].to_numpy()
+    if measure.source == "errors":
+        widths, reach = known["standard_error"].to_numpy(), known["quantile"].to_numpy()
+        return measure.compute(Sample(found, widths, bound, reach))
+    return measure.compute(found)
+
+
+def _bounds(results: Results) -> dict[int, dict[str, float]]:
+    """Return the variances that theory gives the parameters of each group, where it does."""
+    if results.plan is None:
+        return {}
+    return {k: least_variances(results.plan, *place) for k, *place in results.groups.iloc[:, :2].itertuples()}
+
+
+def values_of(results: Results, name: str) -> pd.DataFrame:
+    """Return what a measure is computed from, with ``group`` and ``parameter``; NaN where an estimate has no value."""
+    import pandas as pd
+
+    measure, stored, numbers = measure_of(name, results), results.stored, results.numbers
+    if measure.source == "errors":
+        return _errors_for(results, name)
+    if measure.source == "status":
+        status = np.char.decode(stored.column("status"))
+        counted = sorted({*status.tolist()} - SUCCESSES) or ["FAILED"]
+        hits = [pd.DataFrame({"group": numbers, "parameter": one, "value": 1.0 * (status == one)}) for one in counted]
+        return pd.concat(hits)
+    values = np.full(len(stored), np.nan)
+    if measure.source == "distance":
+        for group in np.unique(numbers).tolist():
+            system = system_of(results.manifest["data_cells"][results.place(group)[0]], name)
+            values[numbers == group] = distances(system, results.members(group), name)
+    elif measure.source == "converged":
+        # Of a group with an estimate that no rule is about, nothing is said.
+        judged = pd.Series(stored.judged)
+        values = judged.mask(judged.isna().groupby(numbers).transform("any")).to_numpy()
+    elif stored.has(measure.source):
+        values = stored.column(measure.source)
+        if measure.source == "custom_measures":
+            names = stored.export.parts("custom_measures")
+            values = values[:, names.index(name)] if name in names else np.full(len(stored), np.nan)
+        # Where there is no model, it fits a fresh data set infinitely badly.
+        values = np.where(np.isfinite(values), values, -np.inf if measure.source == "fresh_fit_percent" else np.nan)
+    return pd.DataFrame({"group": numbers, "parameter": None, "value": values})
+
+
+def _errors_for(results: Results, name: str) -> pd.DataFrame:
+    """Return the errors of every parameter, of one, or of the poles."""
+    import pandas as pd
+
+    argument, errors = name.partition(":")[2], results.errors
+    if argument == "poles":
+        cells = [results.manifest["data_cells"][k] for k in results.groups["cell"]]
+        groups = np.unique(results.numbers).tolist()
+        errors = pd.concat([pole_errors(k, system_of(cells[k], name), results.members(k)) for k in groups])
+    elif argument:
+        errors = errors[errors["parameter"] == argument]
+    if measure_of(name, results).of_widths:
+        return errors.assign(value=errors["value"].where(errors["standard_error"].notna()))
+    return errors
+
+
+def counted_in(rows: pd.DataFrame) -> pd.Series:
+    """Return the number of data sets that each value is computed from."""
+    infinite = rows["measure"].str.partition(":")[0].isin(INFINITE)
+    return rows["n"] - rows["without_value"].where(~infinite, 0)
 
 
 def measure_of(name: str, results: Results) -> Measure:
@@ -220,7 +302,7 @@ def asked_measures(results: Results) -> list[str]:
 def default_measures(results: Results) -> Sequence[str]:
     """Return what the specification asks for; without a success rule bias and root mean square error; else nothing."""
     asked = asked_measures(results)
-    measurable = not results.settings.get("success") and any(map(true_values, results.manifest["data_cells"]))
+    measurable = not results.settings.get("success") and results.is_simulated
     return asked or (DEFAULT if measurable else ())
 
 
@@ -241,79 +323,6 @@ def _require_measurable(name: str, results: Results) -> None:
     if name == "fresh_fit" and name not in asked_measures(results):
         advice = "add 'measures: [fresh_fit]' to the specification, and run it again"
         raise UsageError(f"{where}: {name} is computed while the experiment runs; {advice}")
-
-
-@dataclass(frozen=True)
-class _Measuring:
-    """What the measures of an experiment are computed from, read when it is first needed."""
-
-    results: Results
-
-    @cached_property
-    def estimates(self) -> dict[Group, ParameterEstimates]:
-        return {one.group: one for one in estimates_by_group(self.results)}
-
-    @cached_property
-    def bounds(self) -> dict[Group, dict[str, float]]:
-        return least_variances(self.results)
-
-    @cached_property
-    def cells(self) -> dict[str, Mapping[str, Any]]:
-        return {cell["hash"]: cell for cell in self.results.manifest["data_cells"]}
-
-    @cached_property
-    def statuses(self) -> list[str]:
-        known = {status.decode() for status in np.unique(self.results.stored.column("status")).tolist()}
-        return sorted(known - SUCCESSES) or ["FAILED"]
-
-    def found(self, name: str, measure: Measure, group: Group, rows: Estimates) -> Iterator[Found]:
-        """Yield a measure of the estimates of one group: of each parameter, of each status, or of the whole."""
-        if measure.source == "errors":
-            yield from self._of_errors(name, measure, group, rows)
-        elif measure.source == "status":
-            status = rows.column("status")
-            for each in self.statuses:
-                yield each, measure.compute(status == each.encode()), measure.unit, 0
-        elif measure.source == "distance":
-            base, _, argument = name.partition(":")
-            values = distances(system_of(self.cells[group.cell], name), rows, distance_of(base, argument))
-            yield None, measure.compute(values), measure.unit, int(np.isinf(values).sum())
-        elif measure.source == "converged":
-            hits = np.zeros(0, dtype=bool) if rows.converged is None else rows.converged
-            yield None, measure.compute(hits), measure.unit, len(rows) - hits.size
-        else:
-            values = _known_values(name, measure, rows)
-            lacking = len(rows) - values.size
-            if measure.source == "fresh_fit_percent":
-                # Where there is no model, it fits infinitely badly.
-                values = np.append(values, np.full(lacking, -np.inf))
-            yield None, measure.compute(values), measure.unit, lacking
-
-    def _of_errors(self, name: str, measure: Measure, group: Group, rows: Estimates) -> Iterator[Found]:
-        """Yield a measure of the errors of every parameter, of one, or of the poles."""
-        base, _, argument = name.partition(":")
-        estimates = self.estimates[group]
-        if argument == "poles":
-            estimates = pole_estimates(estimates, system_of(self.cells[group.cell], name), rows)
-        bounds = self.bounds.get(group, {}) if base == "efficiency" else {}
-        for k, parameter in enumerate(estimates.names):
-            if argument in ("", "poles", parameter):
-                sample = estimates.sample(k, bounds.get(parameter, math.nan))
-                sample = sample.with_widths() if measure.of_widths else sample
-                own = parameter_unit(parameter, estimates.names)
-                unit = {"": own, "^2": f"({own})^2"}.get(measure.unit, measure.unit)
-                yield parameter, measure.compute(sample), unit, estimates.runs - sample.errors.size
-
-
-def _known_values(name: str, measure: Measure, rows: Estimates) -> Array:
-    """Return finite values of a column, or of one part of the column of custom measures."""
-    if not rows.has(measure.source):
-        return np.zeros(0)
-    values = rows.column(measure.source)
-    if measure.source == "custom_measures":
-        names = rows.export.parts("custom_measures")
-        values = values[:, names.index(name)] if name in names else np.zeros(0)
-    return np.asarray(values[np.isfinite(values)])
 
 
 def parameter_unit(name: str, names: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
 """Two estimators on the same data sets: the result of ``ctid table EXPERIMENT --compare A,B``.
 
-Keys of a row
--------------
+Columns
+-------
 - The keys of all tables; ``first`` and ``second`` in place of ``method``: the estimators with their swept options.
 - ``measure``: ``percent``, ``rmse`` or ``cpu``, with the ``parameter`` and the ``unit``; ``value``: first minus second,
   with its 95 % interval from ``low`` to ``high``; ``n``: data sets that both have a value for.
@@ -10,22 +10,19 @@ Keys of a row
   the first on those where only the second does.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import Difference, holm, median_difference, percent_difference, rms_difference
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.measures import Row, labelled_groups, parameter_unit
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, common_places, estimates_by_group
-from ctid_cli.reporting.results import Group, Results, out_option
+from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of
+from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.table_result import TableResult, labels_of, named, notes_of
-from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.text import count, did_you_mean
 
@@ -39,6 +36,8 @@ METHODS = {
     "rmse": "RMSE by the paired bootstrap (BCa)",
     "cpu": "median CPU time by the paired bootstrap (BCa)",
 }
+#: Keys of a row that are no settings.
+OWN = ("first", "second", "p_value", "adjusted_p_value", "family", "failed_ids")
 
 
 def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
@@ -54,7 +53,7 @@ def compare_estimators(results: Results, names: str, out: Path) -> TableResult:
     families = "; ".join(frame["family"].unique())
     foot = f"First minus second, 95 % intervals: {methods}. p: adjusted by Holm over the {families}."
     head = Section(f"{results.experiment}: {first} minus {second}, on the same data sets")
-    lost = Section(sentences=_lost(results, rows, first, second, out))
+    lost = Section(sentences=_lost(results, frame, first, second, out))
     return TableResult(rows, [head, *tables, Section(notes=[foot]), lost], notes_of(results, out))
 
 
@@ -75,25 +74,15 @@ def _known_pair(results: Results, names: str) -> list[str]:
 
 def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     """Return the differences of two estimators of an experiment, or of one with several options, each pair once."""
-    members = results.groups()
-    simulated = any(map(true_values, results.manifest["data_cells"]))
-    estimates = {one.group: one for one in estimates_by_group(results)} if simulated else {}
-    labels = {group: row for group, row in labelled_groups(results) if group in members}
-    options = results.swept("estimators")
-    rows: list[Row] = []
-    for one, other in _pairs(list(labels), first, second):
+    options, rows = results.swept("estimators"), list[Row]()
+    labels = label_frame(results)
+    methods = [named(row["method"], row, options) for row in records_of(labels)]
+    shared = records_of(labels.drop(columns=["method", *options]))
+    for one, other in _pairs(results, first, second):
         # An estimator without a start goes with the other's.
-        shared = labels[other if one.start == "none" else one]
-        shared = {key: value for key, value in shared.items() if key not in ("method", *options)}
-        shared |= {
-            key: named(group.estimator, labels[group], options) for key, group in (("first", one), ("second", other))
-        }
-        places = common_places(*(members[group].column("replicate") for group in (one, other)))
-        common = [members[group].chosen(some) for group, some in zip((one, other), places, strict=True)]
-        found = [*_percentages(*common), *_times(*common)]
-        if one in estimates:
-            found[1:1] = _errors(estimates[one], estimates[other])
-        rows += [shared | row for row in found]
+        label = shared[other if results.place(one)[2] == "none" else one]
+        label = label | {"first": methods[one], "second": methods[other]}
+        rows += [label | row for row in (*_percentages(results, one, other), *_values(results, one, other))]
     for measure in METHODS:
         family = [row for row in rows if row["measure"] == measure]
         name = f"{count(len(family), 'difference')} in {measure}"
@@ -102,45 +91,51 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     return rows
 
 
-def _pairs(groups: Sequence[Group], first: str, second: str) -> Iterator[tuple[Group, Group]]:
+def _pairs(results: Results, first: str, second: str) -> Iterator[tuple[int, int]]:
     """Yield the groups of both estimators that are of the same data sets, and of the same start if both have one."""
-    for k, one in enumerate(groups):
-        for other in groups[k + 1 if first == second else 0 :]:
-            same_start = one.start == other.start or "none" in (one.start, other.start)
-            if (one.estimator, other.estimator, one.cell) == (first, second, other.cell) and same_start:
-                yield one, other
+    groups = results.groups.loc[sorted(set(results.numbers.tolist()))]
+    groups = groups.assign(method=[results.manifest["estimators"][k]["name"] for k in groups["estimator"]])
+    pairs = groups.reset_index().merge(groups.reset_index(), on="cell", suffixes=("", "_2"))
+    pairs = pairs[(pairs["method"] == first) & (pairs["method_2"] == second)]
+    same_start = (pairs["start"] == pairs["start_2"]) | (pairs[["start", "start_2"]] == "none").any(axis=1)
+    once = pairs["index"] < pairs["index_2"] if first == second else True
+    yield from pairs.loc[same_start & once, ["index", "index_2"]].itertuples(index=False, name=None)
 
 
-def _percentages(one: Estimates, other: Estimates) -> Iterator[Row]:
+def _percentages(results: Results, *pair: int) -> Iterator[Row]:
     """How often each succeeds; without a rule an estimate succeeds that does not fail."""
-    if len(one) < FEWEST:
+    sides = []
+    for group in pair:
+        own = results.members(group)
+        hits = ~own.failures if own.converged is None else own.converged
+        sides.append(pd.DataFrame({"hit": hits, "id": own.values("id")}, index=own.column("replicate")))
+    common = pd.concat([sides[0], sides[1].add_suffix("_2")], axis=1, join="inner")
+    if len(common) < FEWEST:
         return
-    hits = [~side.failures if side.converged is None else side.converged for side in (one, other)]
-    only_first, only_second = hits[0] & ~hits[1], ~hits[0] & hits[1]
+    only_first, only_second = common["hit"] & ~common["hit_2"], ~common["hit"] & common["hit_2"]
     counts = int(only_first.sum()), int(only_second.sum())
     yield {
-        **_row("percent", None, "%", len(one), percent_difference(*counts, len(one))),
+        **_row("percent", None, "%", len(common), percent_difference(*counts, len(common))),
         **dict(zip(("only_first", "only_second"), counts, strict=True)),
-        "failed_ids": one.chosen(only_second).values("id"),
+        "failed_ids": common["id"][only_second].tolist(),
     }
 
 
-def _errors(one: ParameterEstimates, other: ParameterEstimates) -> Iterator[Row]:
-    """Root mean square errors of the parameters that both estimate."""
-    sides = list(zip((one, other), common_places(one.replicates, other.replicates), strict=True))
-    for name in [name for name in one.names if name in other.names]:
-        errors = np.array([side.errors[places, side.names.index(name)] for side, places in sides])
-        errors = errors[:, np.isfinite(errors).all(axis=0)]
-        if errors.shape[1] >= FEWEST:
-            yield _row("rmse", name, parameter_unit(name, one.names), errors.shape[1], rms_difference(*errors))
-
-
-def _times(one: Estimates, other: Estimates) -> Iterator[Row]:
-    """Median processor times."""
-    known = np.array([side.column("cpu_seconds") for side in (one, other)])
-    known = known[:, np.isfinite(known).all(axis=0)]
-    if known.shape[1] >= FEWEST:
-        yield _row("cpu", None, "s", known.shape[1], median_difference(*known))
+def _values(results: Results, *pair: int) -> Iterator[Row]:
+    """Root mean square errors of the parameters that both estimate, and median processor times."""
+    if results.is_simulated:
+        errors = results.errors[results.errors["group"].isin(pair)]
+        names = [*true_values(results.manifest["data_cells"][results.place(pair[0])[0]])]
+        for (name,), own in parts_of(errors, "parameter"):
+            sides = own.pivot(index="replicate", columns="group", values="value").reindex(columns=pair).dropna()
+            if len(sides) >= FEWEST:
+                found = rms_difference(*sides.to_numpy().T.copy())
+                yield _row("rmse", name, parameter_unit(name, names), len(sides), found)
+    members = [results.members(group) for group in pair]
+    times = [pd.Series(own.column("cpu_seconds"), index=own.column("replicate")) for own in members]
+    both = pd.concat(times, axis=1, join="inner").dropna()
+    if len(both) >= FEWEST:
+        yield _row("cpu", None, "s", len(both), median_difference(*both.to_numpy().T.copy()))
 
 
 def _row(measure: str, parameter: str | None, unit: str, n: int, difference: Difference) -> Row:
@@ -155,9 +150,7 @@ def _table(frame: pd.DataFrame) -> pd.DataFrame:
     unit = "" if "parameter" in frame else f" [{first['unit']}]"
     texts: dict[str, Any] = {
         f"{first['measure']}{unit}: difference": frame["value"].map(lambda value: number(value, 3)),
-        "95 %": [
-            f"{number(low, 3)} to {number(high, 3)}" for low, high in zip(frame["low"], frame["high"], strict=True)
-        ],
+        "95 %": frame["low"].map(lambda low: f"{number(low, 3)} to ") + frame["high"].map(lambda high: number(high, 3)),
         "p": frame["adjusted_p_value"].map(lambda value: number(value, 2)),
     }
     counts = [name for name in ("only_first", "only_second", "n") if name in frame]
@@ -165,15 +158,11 @@ def _table(frame: pd.DataFrame) -> pd.DataFrame:
     return labels_of(frame, *others, options=(*counts, *OWN)).assign(**texts)
 
 
-#: Keys of a row that are no settings.
-OWN = ("first", "second", "p_value", "adjusted_p_value", "family", "failed_ids")
-
-
-def _lost(results: Results, rows: Sequence[Row], first: str, second: str, out: Path) -> list[str]:
+def _lost(results: Results, frame: pd.DataFrame, first: str, second: str, out: Path) -> list[str]:
     """Return the estimates of the first that fail on data sets where the second does not, with commands for them."""
     # An estimate of the first can be in several rows, beside other options or starts of the second.
-    ids = list(dict.fromkeys(name for row in rows for name in row.get("failed_ids") or ()))
-    if not ids:
+    ids = frame["failed_ids"].dropna().explode().dropna().unique() if "failed_ids" in frame else ()
+    if not len(ids):
         return []
     what = f"{count(len(ids), 'estimate')} of {first} missed on data sets where {second} did not:"
     commands = [f"  ctid export {results.experiment} --id {name}{out_option(out)}" for name in ids[:LISTED]]

@@ -1,31 +1,28 @@
 """Results of experiments, read back from the folder that ``ctid run`` wrote them to."""
 
+from __future__ import annotations
+
 import json
 import shlex
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.arrays import IndexArray
 from ctid_cli.errors import UsageError
+from ctid_cli.running.theory import readable_plan
 from ctid_cli.storage.estimates import Estimates, read_stored
 from ctid_cli.storage.folder import experiment_folders
-from ctid_cli.storage.manifest import Manifest
+from ctid_cli.storage.groups import error_frame, group_numbers, planned_groups
+from ctid_cli.storage.manifest import Manifest, true_values
 from ctid_cli.text import did_you_mean
 
+if TYPE_CHECKING:
+    import pandas as pd
 
-class Group(NamedTuple):
-    """Estimates that differ by their data sets only."""
-
-    cell: str
-    estimator: str
-    #: Values of the swept options of the estimators.
-    options: tuple[Any, ...]
-    start: str
+    from ctid_cli.running.plan import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +48,6 @@ class Results:
         spec: Mapping[str, Any] = self.manifest["spec"]
         return spec
 
-    @cached_property
-    def rows(self) -> Estimates:
-        """Stored estimates of the plan, whose rows are made when they are asked for."""
-        return self.stored
-
     @property
     def failed(self) -> int:
         """How many estimates ended in an error."""
@@ -71,22 +63,46 @@ class Results:
         """Names of the fields swept over ``data_cells`` or ``estimators``."""
         return list(dict.fromkeys(name for item in self.manifest[part] for name in item["swept"]))
 
-    def groups(self) -> dict[Group, Estimates]:
-        """Stored estimates by data cell, estimator and start."""
-        return self._groups
+    # --- one table of estimates, one of errors ----------------------------------------------------------------------
+
+    @property
+    def estimates(self) -> pd.DataFrame:
+        """One row for each estimate, what ``ctid export`` writes; the units of columns are in ``attrs["units"]``."""
+        return self.stored.frame()
 
     @cached_property
-    def _groups(self) -> dict[Group, Estimates]:
-        across, starts = self.swept("estimators"), self.stored.column("start")
-        found: dict[Group, list[IndexArray]] = {}
-        for block in self.stored.blocks:
-            options = tuple(block.estimator["swept"].get(name) for name in across)
-            own = starts[block.first : block.last]
-            first = {start: int(np.argmax(own == start)) for start in set(own.tolist())}
-            for start in sorted(first, key=lambda start: first[start]):
-                group = Group(block.cell["hash"], block.estimator["name"], options, start.decode())
-                found.setdefault(group, []).append(np.flatnonzero(own == start) + block.first)
-        return {group: self.stored.chosen(np.concatenate(places)) for group, places in found.items()}
+    def groups(self) -> pd.DataFrame:
+        """Places of data cell and estimator in the plan, and start, of each group that was planned."""
+        return planned_groups(self.manifest)
+
+    @cached_property
+    def numbers(self) -> IndexArray:
+        """Number of the group that each estimate is in."""
+        return group_numbers(self.stored)
+
+    @cached_property
+    def errors(self) -> pd.DataFrame:
+        """Errors of the parameters of simulated systems: a row for each parameter of each estimate."""
+        return error_frame(self.stored, self.numbers)
+
+    def place(self, group: int) -> tuple[int, int, str]:
+        """Return the places of data cell and estimator of a group, and its start."""
+        cell, estimator, start = self.groups.iloc[group]
+        return cell, estimator, start
+
+    def members(self, group: int) -> Estimates:
+        """Return the estimates of one group."""
+        return self.stored.chosen(self.numbers == group)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether there are true values of parameters."""
+        return any(map(true_values, self.manifest["data_cells"]))
+
+    @cached_property
+    def plan(self) -> Plan | None:
+        """Plan of the latest run, unless it names code or is of another version."""
+        return readable_plan(self.settings)
 
 
 def out_option(out: Path) -> str:

@@ -12,7 +12,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import delay_label, number, seconds
-from ctid_cli.reporting.measures import COUNTED, percentage_frame, settings_of, with_types
+from ctid_cli.reporting.measures import COUNTED, percentage_frame, records_of, settings_of, with_types
 from ctid_cli.reporting.results import (
     Results,
     differences,
@@ -22,7 +22,7 @@ from ctid_cli.reporting.results import (
     read_results,
     shown_path,
 )
-from ctid_cli.reporting.study import DEFAULT_STUDY, Study, StudyTable, data_folder, load_study, study_contents
+from ctid_cli.reporting.study import DEFAULT_STUDY, Study, StudyTable, data_folder, load_study
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import (
     NOT_RUN,
@@ -36,10 +36,8 @@ from ctid_cli.reporting.table_result import (
     named,
     notes_of,
     percent_text,
-    records_of,
     time_of,
 )
-from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.text import did_you_mean, listed
@@ -159,7 +157,7 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
     frame["table"] = table.number
     frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
     first, last = ["table", "experiment", "sampling"], ["initial_delay", "method", *COUNTED]
-    others = [name for name in settings_of([frame.columns]) if name not in first]
+    others = [name for name in settings_of(frame) if name not in first]
     return _sorted(study, with_types(frame))[[*first, *others, *last]]
 
 
@@ -274,16 +272,12 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
-    texts = pd.read_csv(file, dtype="str", keep_default_na=False)
-    frame = pd.DataFrame({name: texts[name] for name in texts if name in ("experiment", "sampling", "method")})
-    for name in texts.columns.difference(frame.columns):
-        frame[name] = pd.Series([_value(text) for text in texts[name]], dtype=object)
-    counts = frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
-    return counts[texts.columns]
+    options: dict[str, Any] = {"dtype": {"converged": "Int64"}, "float_precision": "round_trip"}
+    return pd.read_csv(file, converters={"initial_delay": _initial_delay}, **options)
 
 
-def _value(text: str) -> float | str | None:
-    """Return a number of a table; an initial delay may be a word."""
+def _initial_delay(text: str) -> float | str | None:
+    """Return an initial delay of a table, which may be a word."""
     try:
         return float(text) if text else None
     except ValueError:
@@ -299,26 +293,7 @@ def environment_of(published: Path) -> dict[str, Any] | None:
     return content
 
 
-def made_by(published: Path, study: str = DEFAULT_STUDY) -> str:
-    """Return which code computed the published results in a folder, as a participle clause; empty for the present."""
+def made_by(published: Path) -> str:
+    """Return which code computed the published results in a folder, as a participle clause; empty if unknown."""
     environment = environment_of(published)
-    if environment is None:
-        return ""
-    if all(_versions(own) <= _present(study, short) for short, own in environment["sessions"].items()):
-        return ""
-    commit = environment["commit"][:12]
-    return f"computed by an earlier version of the code or of its numerical libraries (commit {commit})"
-
-
-def _present(study: str, short: str) -> set[str]:
-    """Return the code versions that the estimates of an experiment of a study would have now."""
-    described = study_contents()[study]["experiments"].get(f"{study}/{short}")
-    if described is None:
-        return set()
-    return {current_version(build_plan(load_spec(data_folder("configs") / described["config"])))}
-
-
-def _versions(sessions: Iterable[Mapping[str, Any]]) -> set[str]:
-    """Return the code versions of runs; those of older ones were the same for all estimators."""
-    found = [session["code_version"] for session in sessions]
-    return {version for one in found for version in ([one] if isinstance(one, str) else one.values())}
+    return f"computed at commit {environment['commit'][:12]}" if environment else ""

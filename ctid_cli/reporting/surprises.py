@@ -14,14 +14,12 @@ from ctid_cli.inference.monte_carlo import Measured
 from ctid_cli.inference.monte_carlo_tests import FEWEST as FEWEST
 from ctid_cli.inference.monte_carlo_tests import MEASURED, Departure, departures
 from ctid_cli.inference.paired import holm
-from ctid_cli.reporting.expected_accuracy import why_biased
 from ctid_cli.reporting.layout import delay_label, setting_text, setting_title
-from ctid_cli.reporting.measures import Row, counted_in, labelled_groups, measure_rows, settings_of
-from ctid_cli.reporting.parameter_errors import place_of, readable_plan
-from ctid_cli.reporting.results import Group, Results, lookup
+from ctid_cli.reporting.measures import Row, counted_in, label_frame, measure_frame, parts_of, records_of, settings_of
+from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.expected_accuracy import why_biased
 from ctid_cli.specification.joint_warnings import joint_warnings
-from ctid_cli.storage.manifest import is_of_signal, true_values
 
 #: Chance of a sentence about an experiment that is as theory expects it.
 LEVEL = 0.05
@@ -40,50 +38,53 @@ PHRASES = {
 class Finding(NamedTuple):
     """One test of one parameter."""
 
-    group: Group
+    group: int
+    #: Keys of the rows of its group.
     labels: Row
     parameter: str
     test: Departure
 
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        return str(self.labels["method"])
+
 
 def surprises(results: Results) -> list[str]:
     """Return what the estimates of simulated systems show that theory does not expect, one sentence for each reason."""
-    if is_of_signal(results.manifest) or not any(map(true_values, results.manifest["data_cells"])):
+    if not results.is_simulated:
         return []
     tested = list(_tested(results))
     adjusted = holm([finding.test.p_value for finding in tested])
     found = [finding for finding, p_value in zip(tested, adjusted, strict=True) if p_value < LEVEL]
-    far = {f.group.estimator for f in tested if (f.parameter, f.test.kind) == ("delay", "rmse") and f.test.size >= FAR}
+    far = {f.estimator for f in tested if (f.parameter, f.test.kind) == ("delay", "rmse") and f.test.size >= FAR}
     together: dict[tuple[str, tuple[str, ...]], list[Finding]] = {}
     for finding in found:
         reasons = tuple(_reasons(results, finding, far))
-        together.setdefault((finding.group.estimator, reasons), []).append(finding)
+        together.setdefault((finding.estimator, reasons), []).append(finding)
     return [describe(name, reasons, members, tested) for (name, reasons), members in together.items()]
 
 
 def _tested(results: Results) -> Iterator[Finding]:
-    by_cell: dict[tuple[Any, ...], dict[str, dict[str, Row]]] = {}
-    labelled = list(labelled_groups(results))
-    for row in measure_rows(results, MEASURED):
-        place = tuple(row[key] for key in labelled[0][1])
-        by_cell.setdefault(place, {}).setdefault(row["parameter"], {})[row["measure"]] = row
-    for group, labels in labelled:
-        for parameter, rows in by_cell[*labels.values()].items():
-            measured = {name: Measured(row["value"], row["error"]) for name, row in rows.items()}
-            for test in departures(measured, counted_in(rows["bias"]), counted_in(rows["error_ratio"])):
-                yield Finding(group, labels, parameter, test)
+    labels = dict(enumerate(records_of(label_frame(results))))
+    frame = measure_frame(results, MEASURED).dropna(subset="parameter")
+    frame["counted"] = counted_in(frame)
+    for (group, parameter), own in parts_of(frame, frame.index, "parameter"):
+        rows = own.set_index("measure")
+        found = {str(row["measure"]): Measured(row["value"], row["error"]) for row in records_of(own)}
+        for test in departures(found, *rows.loc[["bias", "error_ratio"], "counted"]):
+            yield Finding(group, labels[group], parameter, test)
 
 
 def _reasons(results: Results, finding: Finding, far: set[str]) -> list[str]:
     """Return what the specification holds that explains a finding, what matters most first."""
-    group, kind, plan = finding.group, finding.test.kind, readable_plan(results)
-    k, j = place_of(results, group)
+    kind, plan, (k, j, start) = finding.test.kind, results.plan, results.place(finding.group)
     source = None if plan is None else plan.data_cells[k].source
     if plan is None or not isinstance(source, SimulatedSource):
         return []
     cell, part = results.manifest["data_cells"][k]["content"], results.manifest["estimators"][j]
     warned = any(path[:2] == ("sampling", "input_record") for path, _ in joint_warnings(plan.spec))
-    rows = results.groups()[group]
+    rows = results.members(finding.group)
     white = rows.has("covariance") and float(np.mean(rows.column("covariance") == b"white")) > 0.5
     coloured = source.noise is not None and getattr(source.noise, "coloured", True)
     treated = next((key for key in ("initial_state", "offset") if part["content"].get(key) == "estimate"), "")
@@ -95,7 +96,7 @@ def _reasons(results: Results, finding: Finding, far: set[str]) -> list[str]:
         f"the noise is coloured (noise.kind: {lookup(cell, 'noise.kind')}), and these standard errors are for white "
         "noise": kind in ("small", "large", "coverage") and white and coloured,
         "the search for the delay can end at another minimum of the cost (starts.initial_delay)": (
-            group.estimator in far and group.start != "none"
+            finding.estimator in far and start != "none"
         ),
         f"theory does not count what else is estimated (estimators.{part['name']}.{treated}: estimate)": (
             kind == "rmse" and treated
@@ -112,14 +113,14 @@ def describe(name: str, reasons: Sequence[str], found: Sequence[Finding], tested
             worst = max(members, key=lambda finding: finding.test.size)
             place = ", ".join([worst.parameter, *_swept(worst.labels, tested)])
             phrases.append(f"{phrase.format(worst.test.size)} ({place})")
-    own = {finding.group for finding in tested if finding.group.estimator == name}
+    own = {finding.group for finding in tested if finding.estimator == name}
     where = f", in {len({finding.group for finding in found})} of {len(own)} cells, at worst" if len(own) > 1 else ""
     return f"{name}{where}: {', '.join(phrases)}{': ' * bool(reasons)}{'; '.join(reasons)}"
 
 
 def _swept(labels: Row, tested: Sequence[Finding]) -> Iterator[str]:
     """Return the settings that differ between cells, with their values in one of them."""
-    for key in (*settings_of(finding.labels for finding in tested), "initial_delay"):
+    for key in (*settings_of(labels), "initial_delay"):
         if len({str(finding.labels[key]) for finding in tested}) > 1:
             title = "initial delay" if key == "initial_delay" else setting_title(key)
             value = labels[key]

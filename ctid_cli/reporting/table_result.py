@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from ctid_cli.inference.intervals import UncertainValue
+from ctid_cli.inference.monte_carlo import Measure
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.estimate import parameters
 from ctid_cli.reporting.layout import (
@@ -26,9 +27,10 @@ from ctid_cli.reporting.measures import (
     Row,
     counted_in,
     default_measures,
+    measure_frame,
     measure_of,
-    measure_rows,
     percentage_frame,
+    records_of,
     settings_of,
 )
 from ctid_cli.reporting.results import Results, out_option
@@ -91,18 +93,12 @@ def joined(tables: Sequence[TableResult]) -> TableResult:
     return TableResult(rows, [section for table in tables for section in table.shown], [*remarks])
 
 
-def records_of(frame: pd.DataFrame) -> list[Row]:
-    """Return the rows of a frame, None where there is no value."""
-    rows: Any = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    return list(rows)
-
-
 # --- parts of all tables --------------------------------------------------------------------------------------------
 
 
 def labels_of(frame: pd.DataFrame, *others: str, options: Sequence[str] = ()) -> pd.DataFrame:
     """Return as text what tells rows apart: swept fields but ``options``, starts, and other keys that any row has."""
-    keys = [key for key in settings_of([frame.columns]) if key not in options]
+    keys = [key for key in settings_of(frame) if key not in options]
     texts = {setting_title(key): [setting_text(key, value) for value in frame[key]] for key in keys if _has(frame, key)}
     if _has(frame, "initial_delay"):
         texts["initial delay"] = [
@@ -120,14 +116,14 @@ def _is_missing(value: Any) -> bool:
     return value is None or value != value
 
 
-def side_by_side(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence[str]) -> pd.DataFrame:
+def pivot(texts: pd.DataFrame, down: Sequence[str], across: str, shown: Sequence[str], empty: str = "") -> pd.DataFrame:
     """Return the columns ``shown`` for each value of ``across``, which is the title of the first of them."""
     parts = [
-        own.set_index(list(down))[list(shown)].rename(columns={shown[0]: title})
+        own.set_index([*down])[[*shown]].rename(columns={shown[0]: title})
         for title, own in texts.groupby(across, sort=False)
     ]
-    order = texts.set_index(list(down)).index.unique()
-    return pd.concat([part.reindex(order) for part in parts], axis=1).fillna("").reset_index()
+    order = texts.set_index([*down]).index.unique()
+    return pd.concat([part.reindex(order) for part in parts], axis=1).fillna(empty).reset_index()
 
 
 def cells_of(frame: pd.DataFrame, *, judged: bool = True) -> pd.DataFrame:
@@ -216,7 +212,7 @@ def _by_estimator(results: Results, frame: pd.DataFrame, cells: pd.DataFrame) ->
     names = [named(row["method"], row, options) for row in records_of(frame)]
     texts = labels.join(cells).assign(title=[f"{name}: {cells.columns[0]}" for name in names])
     return [
-        side_by_side(texts[texts["title"].isin(some)], [*labels], "title", [*cells])
+        pivot(texts[texts["title"].isin(some)], [*labels], "title", [*cells])
         for some in _blocks(texts["title"].unique().tolist(), ESTIMATORS_PER_BLOCK)
     ]
 
@@ -235,48 +231,42 @@ def _blocks(items: Sequence[Any], size: int) -> list[Sequence[Any]]:
 
 def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str] = ()) -> TableResult:
     """Return measures by name, those of parameters in one table, those of estimates in another, failures in a third."""
-    rows = measure_rows(results, names)
-    frame = pd.DataFrame(rows, dtype=object)
+    frame = measure_frame(results, names).reset_index(drop=True)
+    measures = {name: measure_of(name, results) for name in dict.fromkeys(names)}
     tables: dict[str, list[str]] = {}
-    for name in dict.fromkeys(names):
-        source = measure_of(name, results).source
-        kind = source if source in ("errors", "status") else "estimates"
+    for name, measure in measures.items():
+        kind = measure.source if measure.source in ("errors", "status") else "estimates"
         tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
-    shown = [Section(frame=_measured(results, frame[frame["measure"].isin(own)])) for own in tables.values()]
-    told = {name.partition(":")[0]: measure_of(name, results).meaning for name in names}
+    shown = [Section(frame=_measured(frame[frame["measure"].isin(own)], measures)) for own in tables.values()]
+    told = {name.partition(":")[0]: measure.meaning for name, measure in measures.items()}
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in told.items())
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if frame["without_value"].any():
         foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
-    return TableResult(rows, [Section(results.experiment), *shown, Section(notes=[foot])], remarks)
+    return TableResult(records_of(frame), [Section(results.experiment), *shown, Section(notes=[foot])], remarks)
 
 
-def _measured(results: Results, frame: pd.DataFrame) -> pd.DataFrame:
+def _measured(frame: pd.DataFrame, measures: Mapping[str, Measure]) -> pd.DataFrame:
     """Return swept fields, starts, estimators and parameters down, measures across."""
     labels = labels_of(frame, "method", "parameter")
-    rows, place = records_of(frame), labels.agg("\n".join, axis=1)
-    counted = pd.Series([counted_in(row) for row in rows], index=frame.index)
+    place, counted = labels.agg("\n".join, axis=1), counted_in(frame)
     # What most measures count; a measure of fewer estimates has its number beside it.
     most = counted.groupby(place).transform("max")
-    first = (
-        frame.assign(most=counted == most).sort_values("most", ascending=False, kind="stable").groupby(place).first()
-    )
+    first = frame[["failed", "without_value"]].assign(fewer=counted < most, place=place)
+    first = first.sort_values("fewer", kind="stable").groupby("place").first()
     counts = {"n": most.astype(str), "failed": place.map(first["failed"]).astype(str)}
     if frame["without_value"].any():
         counts["no value"] = place.map(first["without_value"]).astype(str)
-    texts = labels.assign(
-        **counts,
-        title=[_title(results, name) for name in frame["measure"]],
-        cell=[_cell(row, n, total) for row, n, total in zip(rows, counted, most, strict=True)],
-    )
-    table = side_by_side(texts, [*labels, *counts], "title", ["cell"])
+    titles = {name: _title(name, measure) for name, measure in measures.items()}
+    cells = [_cell(row, n, total) for row, n, total in zip(records_of(frame), counted, most, strict=True)]
+    texts = labels.assign(**counts, title=frame["measure"].map(titles), cell=cells)
+    table = pivot(texts, [*labels, *counts], "title", ["cell"])
     table = table[[*labels, *texts["title"].unique(), *counts]]
     return table.rename(columns={"parameter": "status"}) if "failures" in frame["measure"].values else table
 
 
-def _title(results: Results, name: str) -> str:
+def _title(name: str, measure: Measure) -> str:
     """Return a measure with its unit; one in the unit of its parameter has none."""
-    measure = measure_of(name, results)
     of_parameter = measure.source == "errors" and measure.unit != "%"
     return name if of_parameter or measure.unit == "-" else f"{name} [{measure.unit}]"
 
@@ -296,38 +286,34 @@ def _cell(row: Row, n: int, most: int) -> str:
 
 def _with_estimates(results: Results, frame: pd.DataFrame) -> list[Row]:
     """Return the rows of a measured record with its estimates."""
-    keys = ["estimator", "initial_delay", *settings_of([frame.columns])]
-    estimates = {tuple(item.get(key) for key in keys): item for item in reversed(list(results.rows))}
-    rows = []
-    for row in records_of(frame):
-        estimate = estimates.get(tuple({**row, "estimator": row["method"]}[key] for key in keys), {})
-        rows.append(row | {key: estimate.get(key) for key in OF_RECORDS})
-    return rows
+    estimates = dict(zip(results.numbers.tolist(), results.stored, strict=True))
+    found = [{key: estimates.get(group, {}).get(key) for key in OF_RECORDS} for group in frame.index]
+    return [row | own for row, own in zip(records_of(frame), found, strict=True)]
 
 
 def _record_sections(results: Results) -> list[Section]:
     """Return the estimates of a measured record across, parameters with standard errors and measures of fit down."""
     bounds = {item["name"]: item["content"].get("delay_bounds") for item in results.manifest["estimators"]}
-    rows = list(results.rows)
-    fits = {"fit, estimation part": "fit_percent"}
+    rows, options = list(results.stored), results.swept("estimators")
+    fits = {("fit, estimation part", "%"): "fit_percent"}
     if any(item.get("validation_fit_percent") is not None for item in rows):
-        fits["fit, validation part"] = "validation_fit_percent"
-    sections = [Section(results.experiment)]
+        fits["fit, validation part", "%"] = "validation_fit_percent"
+    columns, names = {}, dict[tuple[str, str], None]()
     several = len({row["start"] for row in rows}) > 1
-    for block in _blocks(rows, ESTIMATES_PER_BLOCK):
-        found = [parameters(row, bounds.get(row["estimator"])) for row in block]
-        names = dict.fromkeys((one.name, one.unit) for own in found for one in own)
-        columns = {}
-        for row, own in zip(block, found, strict=True):
-            known = {(one.name, one.unit): _with_error(one) for one in own}
-            texts = [row["id"], row["status"], *(known.get(name, "-") for name in names)]
-            texts += [number(row.get(key), 4) for key in fits.values()]
-            title = row["estimator"] + (f", start {start_text(row['start'])}" if several else "")
-            columns[title] = [*texts, seconds(row.get("cpu_seconds") or row.get("seconds"))]
-        lines = [("id", ""), ("status", ""), *names, *((title, "%") for title in fits), ("time", "")]
-        sections.append(Section(frame=pd.DataFrame(lines, columns=["", "unit"]).assign(**columns)))
+    for row in rows:
+        found = {(one.name, one.unit): _with_error(one) for one in parameters(row, bounds.get(row["estimator"]))}
+        names |= dict.fromkeys(found)
+        found |= {("id", ""): row["id"], ("status", ""): row["status"]}
+        found |= {line: number(row.get(key), 4) for line, key in fits.items()}
+        found["time", ""] = seconds(row.get("cpu_seconds") or row.get("seconds"))
+        title = named(row["estimator"], row, options)
+        columns[title + (f", start {start_text(row['start'])}" if several else "")] = found
+    lines = [("id", ""), ("status", ""), *names, *fits, ("time", "")]
+    table = pd.DataFrame(columns).reindex(pd.MultiIndex.from_tuples(lines, names=["", "unit"])).fillna("-")
+    blocks = [table[some] for some in _blocks([*table], ESTIMATES_PER_BLOCK)]
+    sections = [Section(frame=block[(block != "-").any(axis=1)].reset_index()) for block in blocks]
     foot = "± is one standard error. Fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x."
-    return [*sections, Section(notes=[foot])]
+    return [Section(results.experiment), *sections, Section(notes=[foot])]
 
 
 def _with_error(item: UncertainValue) -> str:

@@ -41,6 +41,14 @@ def reference_text(word: str | None = None) -> str:
     return "\n".join(_keys(part, schema["$defs"], "", None if word in sections else word)).rstrip()
 
 
+def unit_of(section: str, key: str) -> str:
+    """Return the unit of a key of a section; empty where it has none."""
+    schema = json_schema()
+    forms = _mappings(schema["properties"].get(section, {}), schema["$defs"])
+    texts = (_plain(form["properties"][key]) for form in forms if key in form["properties"])
+    return next((unit[1] for text in texts if (unit := _UNIT.search(text)) and unit[1] != "-"), "")
+
+
 def _kinds(node: Node, defs: Node) -> list[str]:
     return [kind for form in _mappings(node, defs) if (kind := _kind(form)) is not None]
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.document import Result, Section
-from ctid_cli.studies.catalogue import StudyFolder, StudyResults, last_part, published_folder
+from ctid_cli.reporting.layout import picked
+from ctid_cli.studies.catalogue import StudyResults, last_part
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,7 +34,7 @@ class Claim:
 
 def within(claim: str, value: float | None, low: float = -math.inf, high: float = math.inf, shown: str = "") -> Claim:
     """Return the claim that a number lies in an interval; None stands for what never came."""
-    number = math.inf if value is None else float(value)
+    number = math.inf if value is None or math.isnan(value) else float(value)
     if math.isinf(low):
         required = f"at most {high:g}"
     else:
@@ -65,35 +65,21 @@ class CheckedClaims(Result):
         tested = [claim.holds for claim in self.claims if claim.holds is not None]
         return f"{sum(tested)} of {len(tested)} hold"
 
-    @property
-    def changed(self) -> list[Claim]:
-        """Claims of which published results said otherwise, as they were published."""
-        published = {(claim.experiment, claim.claim): claim for claim in read_claims(self.results.study)}
-        pairs = [(claim, published.get((claim.experiment, claim.claim))) for claim in self.claims]
-        return [before for claim, before in pairs if before is not None and before.holds != claim.holds]
-
     def to_frame(self) -> pd.DataFrame:
         """Return a row for each claim."""
-        return _frame(self.claims)
+        import pandas as pd
+
+        columns = ("experiment", "claim", "measured", "required")
+        rows = [{**picked(claim, columns), "holds": claim.verdict} for claim in self.claims]
+        return pd.DataFrame(rows, columns=[*columns, "holds"])
 
     def content(self) -> dict[str, Any]:
         """Return the claims for JSON."""
         return {"study": self.results.study.name, "claims": [asdict(claim) for claim in self.claims]}
 
     def sections(self) -> list[Section]:
-        """Return the claims, and those that changed since they were published."""
-        shown = [Section(self.results.study.name, frame=self.to_frame(), notes=[self.counted])]
-        if self.changed:
-            shown.append(Section("When they were published:", frame=_frame(self.changed)))
-        return shown
-
-
-def _frame(claims: Sequence[Claim]) -> pd.DataFrame:
-    import pandas as pd
-
-    columns = ("experiment", "claim", "measured", "required")
-    rows = [{**{name: getattr(claim, name) for name in columns}, "holds": claim.verdict} for claim in claims]
-    return pd.DataFrame(rows, columns=[*columns, "holds"])
+        """Return the claims."""
+        return [Section(self.results.study.name, frame=self.to_frame(), notes=[self.counted])]
 
 
 def check_claims(found: StudyResults) -> CheckedClaims:
@@ -108,17 +94,3 @@ def check_claims(found: StudyResults) -> CheckedClaims:
                 made = state(*(found[short] for short in shorts))
                 claims += (replace(claim, experiment=" and ".join(shorts)) for claim in made)
     return CheckedClaims(found, claims)
-
-
-def read_claims(study: StudyFolder) -> list[Claim]:
-    """Read the published claims of a study; none where it was never published."""
-    file = published_folder(study) / "claims.csv"
-    if not file.is_file():
-        return []
-    with file.open(encoding="utf-8", newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    verdicts = {"yes": True, "NO": False}
-    return [
-        Claim(row["claim"], row["measured"], row["required"], verdicts.get(row["holds"]), row["experiment"])
-        for row in rows
-    ]

@@ -51,7 +51,7 @@ def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Est
         plan = study.plan(short, ["monte_carlo.runs=1", *overrides])
         run_experiment(plan, out / plan.experiment, jobs=jobs)
         steps = _single_steps(plan)
-        for row in read_results(out, plan.experiment).rows:
+        for row in read_results(out, plan.experiment).stored:
             swept = [f"{name}={row[name]}" for name in plan.data_cells[0].swept]
             words = [short, *swept, row["estimator"], str(row.get("initial_delay")), str(row["replicate"])]
             compared = row["status"] in COMPARED or row["estimator"] in steps

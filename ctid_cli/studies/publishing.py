@@ -4,10 +4,11 @@ import json
 import subprocess
 from pathlib import Path
 
+import pandas as pd
+
 from ctid_cli.custom_code import DATA
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.reporting.document import Section, render_markdown
-from ctid_cli.reporting.layout import csv_text
 from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.status import public_sessions
@@ -49,14 +50,18 @@ def _git(*arguments: str) -> str:
 
 
 def published_texts(found: StudyResults) -> dict[str, str]:
-    """Published tables and numbers of a study by file name."""
-    texts = {file: getattr(found.study.module("tables"), name)(found) for file, name in found.study.texts.items()}
+    """Return the published tables and numbers of a study, by file name."""
+    texts, tables = {}, found.study.module("tables")
+    for file, name in found.study.texts.items():
+        made = getattr(tables, name)(found)
+        texts[file] = made if isinstance(made, str) else f"{render_markdown(made)}\n"
     for file, item in found.study.numbers.items():
         shorts = [short for short in item.get("experiments", found.experiments) if short in found]
-        rows = [row for short in shorts for row in getattr(found.study.module("tables"), item["rows"])(found[short])]
+        rows = [getattr(tables, item["rows"])(found[short]) for short in shorts]
+        frame = pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
         # To 6 digits: a published file must not change with the last bit of a sum.
-        rounded = [{k: float(f"{x:.6g}") if isinstance(x, float) else x for k, x in row.items()} for row in rows]
-        texts[file] = csv_text(rounded, item.get("columns"))
+        rounded = frame.map(lambda value: float(f"{value:.6g}") if isinstance(value, float) else value)
+        texts[file] = rounded.to_csv(index=False, columns=item.get("columns"), lineterminator="\n")
     return texts
 
 

@@ -11,7 +11,7 @@ from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
 from ctid_cli.reporting.results import experiments_in, out_option, read_results
 from ctid_cli.reporting.study import study_contents
-from ctid_cli.reporting.study_table import environment_of, made_by
+from ctid_cli.reporting.study_table import environment_of
 from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, all_studies, published_folder, read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
@@ -44,7 +44,7 @@ def study_page(study: StudyFolder, out: Path) -> str:
     else:
         texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
         claims = sections_of(texts.pop(CLAIMS)) if CLAIMS in texts else []
-        origin = list(_published_origin(published, study.name))
+        origin = list(_published_origin(published))
     source = study_contents()[study.name].get("source")
     cited = f" {source['authors']}: {source['title']} ({source['identifier']})." if source else ""
     again = [
@@ -87,7 +87,7 @@ def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> It
             yield Section(drawing=svg, caption=f"{caption}. `{command}`")
 
 
-def _published_origin(published: Path, study: str) -> Iterator[str]:
+def _published_origin(published: Path) -> Iterator[str]:
     """Return what made the published results, in sentences."""
     environment = environment_of(published)
     if environment is None:
@@ -99,5 +99,3 @@ def _published_origin(published: Path, study: str) -> Iterator[str]:
     yield f"Published from commit {environment['commit']}: {made}."
     packages = sessions[-1]["packages"].items()
     yield "Made with " + ", ".join(f"{name} {version}" for name, version in packages) + "."
-    if remark := made_by(published, study):
-        yield f"These results were {remark}."

@@ -1,4 +1,4 @@
-"""Figures of the study: 2, 3, 4 and 6 of the paper, and two of our own.
+"""Figures of the study: 2, 3, 4 and 6 of the paper.
 
 Numbers are those of González, Classens, Rojas, Welsh and Oomen, "Identification of Additive Continuous-time Systems in
 Open and Closed-loop" (arXiv:2401.01263). Figures 2 and 6 are computed from the specifications; the others show results.
@@ -14,22 +14,16 @@ from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import find_study
 
 from .frequency_plot import Response, dense_frequencies, response_svg
-from .measures import ParameterErrors, errors_of, parameters
-from .parameter_plot import bias_svg, coverage_svg, mse_svg
+from .measures import errors_of, parameters
+from .parameter_plot import mse_svg
 
-#: Estimators of each experiment, and what they are called: those in open loop,
+#: Estimators of each experiment, and what they are called: those in open loop, and in closed loop.
 OPEN_LOOP = {"additive": "sum of four submodels", "srivc": "SRIVC, 8 poles and 6 zeros, factored"}
-#: in closed loop,
 CLOSED_LOOP = {
     "additive": "sum of two submodels, closed loop",
     "clsrivc": "CLSRIVC, factored",
     "srivc": "SRIVC (direct), factored",
 }
-#: under coloured noise in the loop,
-COLOURED = CLOSED_LOOP | {"additive_direct": "sum of two submodels, instruments from the input"}
-#: and the formulas of standard errors in open loop, where the noise is coloured, and in closed loop, where it is white.
-COVERAGE_OPEN_LOOP = {"sandwich": "sandwich", "white": "white formula, misused"}
-COVERAGE_CLOSED_LOOP = {"white": "white formula"}
 
 
 def figure_2() -> bytes:
@@ -83,23 +77,6 @@ def figure_6() -> bytes:
     return response_svg(curves, title, unit="Hz", unwrap=False)
 
 
-def figure_coloured(results: Results) -> bytes:
-    """Biases under coloured noise in closed loop."""
-    rows = errors_of(results)
-    title = r"Biases in the loop of section 6.2 with noise $v = e/(1 - 0.9 q^{-1})$ of variance 0.01, "
-    return bias_svg(rows, COLOURED, parameters(results), f"{title}N = {_samples(rows)}")
-
-
-def figure_coverage(open_loop: Results, closed_loop: Results) -> bytes:
-    """How often 95 % intervals contain the true parameters."""
-    ours, theirs = errors_of(open_loop), errors_of(closed_loop)
-    panels = [
-        (f"open loop, coloured noise, N = {_samples(ours)}", ours, COVERAGE_OPEN_LOOP),
-        (f"closed loop, N = {_samples(theirs)}", theirs, COVERAGE_CLOSED_LOOP),
-    ]
-    return coverage_svg(panels, "95 % intervals from the standard errors of single estimates of the sum of submodels")
-
-
 def empirical_response(record: Record, lowest: float, highest: float) -> tuple[Array, ComplexArray]:
     r"""Frequency response as the quotient of windowed spectra, without a model.
 
@@ -114,7 +91,3 @@ def empirical_response(record: Record, lowest: float, highest: float) -> tuple[A
     outputs, inputs = (np.fft.rfft(window * signal)[inside] for signal in (record.y, record.input.at(record.t)))
     hold = (1 - np.exp(-1j * frequencies * h)) / (1j * frequencies * h)
     return frequencies, np.asarray(outputs / (inputs * hold))
-
-
-def _samples(rows: list[ParameterErrors]) -> str:
-    return ", ".join(dict.fromkeys(str(row.samples) for row in rows))

@@ -5,10 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_regression import theta_of
-from ctid_cli.reporting.layout import markdown_table, number
+from ctid_cli.reporting.layout import number
 from ctid_cli.studies.catalogue import find_study
 
 from .measures import settle
@@ -26,9 +27,9 @@ EXPERIMENTS = {
 HEADER = ["what is printed", "measured", "as printed", "as corrected"]
 
 
-def table() -> str:
-    """All lines as Markdown."""
-    return markdown_table(HEADER, list(rows()), "llrr")
+def table() -> pd.DataFrame:
+    """Return all lines."""
+    return pd.DataFrame(rows(), columns=HEADER)
 
 
 def rows() -> Iterator[list[str]]:

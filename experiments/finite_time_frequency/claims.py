@@ -4,12 +4,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import last_part
 from ctid_cli.studies.claims import Claim, near, within
 
-from .measures import READINGS, Row, efficiency, followed, larger_error, recovery, residuals, settling
+from .measures import READINGS, efficiency, followed, larger_error, recovery, residuals, settling
 
 #: Longest times to come back to 1e-6 rad/s after a step without noise [s].
 RECOVERY = {"window": 7.605, "restarting": 2.85, "restarting_prefiltered": 3.9}
@@ -26,16 +27,16 @@ GRADIENT = (
 )
 
 
-def one(rows: Iterator[Row], **wanted: Any) -> Row:
-    """The one row of these properties."""
-    (row,) = (row for row in rows if row.items() >= wanted.items())
-    return row
+def one(rows: pd.DataFrame, **wanted: Any) -> pd.Series:
+    """Return the one row of these properties."""
+    (place,) = np.flatnonzero(np.logical_and.reduce([rows[name] == value for name, value in wanted.items()]))
+    return rows.iloc[place]
 
 
 def finite_time_is_exact(results: Results) -> Iterator[Claim]:
     """Finite time without noise: right from n(2h + d) on, and not valid before."""
     begin, until, limit = EXACT[last_part(results.experiment)]
-    source, track = next(stored[0] for common, stored in followed(results) if common["estimator"] == "finite_time")
+    source, track = next(rest for common, *rest in followed(results) if "finite_time" in common)
     error = larger_error(source, track)
     before, after = track.t < begin - 1e-9, (track.t > begin - 1e-9) & (track.t < until - 1e-9)
     yield within(f"finite time: error from {begin} s on", error[after].max(), high=limit)
@@ -64,16 +65,16 @@ def disturbance_leaves_a_bias(harmonic: Results) -> Iterator[Claim]:
 
 def prefilter_removes_the_noise(random: Results) -> Iterator[Claim]:
     """A tracker with a prefilter in noise."""
-    rms = [row["rms"] for row in residuals(random) if row["estimator"] == "restarting_prefiltered"]
-    yield within("restarting_prefiltered: median rms error", max(rms), high=2e-4)
+    rms = residuals(random).query("estimator == 'restarting_prefiltered'")["rms"]
+    yield within("restarting_prefiltered: median rms error", rms.max(), high=2e-4)
 
 
 def memory_ends(results: Results) -> Iterator[Claim]:
     """After a step without noise, estimators whose memory ends are in finite time again."""
-    for row in recovery(results):
-        if row["estimator"] in RECOVERY:
-            name = f"{row['estimator']}, within {row['band']:g}, {row['reading']} [s]"
-            yield within(name, row["longest"], high=RECOVERY[row["estimator"]])
+    for row in recovery(results).query("estimator in @RECOVERY").itertuples():
+        yield within(
+            f"{row.estimator}, within {row.band:g}, {row.reading} [s]", row.longest, high=RECOVERY[row.estimator]
+        )
 
 
 def steps_are_found_in_noise(results: Results) -> Iterator[Claim]:
@@ -88,11 +89,10 @@ def steps_are_found_in_noise(results: Results) -> Iterator[Claim]:
 
 def errors_reach_the_bound(results: Results) -> Iterator[Claim]:
     """Errors against the Cramer-Rao bound, and the bias of the finite-time estimate."""
-    rows = list(efficiency(results))
-    for estimator, limit in EFFICIENT.items():
-        ratio = max(row["ratio"] for row in rows if row["estimator"] == estimator)
-        yield within(f"{estimator}: rms error / bound", ratio, high=limit)
-    bias = one(iter(rows), estimator="finite_time", tone=2)["bias"]
+    rows = efficiency(results)
+    for estimator, ratio in rows.groupby("estimator")["ratio"].max()[[*EFFICIENT]].items():
+        yield within(f"{estimator}: rms error / bound", ratio, high=EFFICIENT[estimator])
+    bias = one(rows, estimator="finite_time", tone=2)["bias"]
     yield within("finite_time: bias of w2", bias, 0.029, 0.035)
 
 

@@ -95,6 +95,7 @@ def track_of(cell: DataCell, replicate: int, part: EstimatorCell, interval: floa
 
 def _whole_record_error(results: Results) -> float:
     """Root-mean-square error of nonlinear least squares over all data sets, of the worse tone [rad/s]."""
-    found = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
-    errors = np.array([[measures["rms_1"], measures["rms_2"]] for measures in found])
-    return float(np.sqrt(np.mean(errors**2, axis=0)).max())
+    stored = results.stored
+    measures = dict(zip(stored.export.parts("measures"), stored.column("measures").T, strict=True))
+    own = stored.column("estimator") == b"nonlinear_least_squares"
+    return max(float(np.sqrt(np.mean(measures[name][own] ** 2))) for name in ("rms_1", "rms_2"))

@@ -1,14 +1,18 @@
 """What is published of the study: everything that was measured as numbers, and the tables for a reader."""
 
-from typing import Any
+from collections.abc import Sequence
+from functools import partial
 
-from ctid_cli.reporting.layout import markdown_table, number
+import pandas as pd
+
+from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.results import Results
 from ctid_cli.studies.catalogue import StudyResults
 
 from . import as_printed
 from .figures import DERIVED
-from .measures import BANDS, READINGS, by_estimator, efficiency, is_derived, recovery, residuals, settling
+from .measures import BANDS, READINGS, efficiency, is_derived, recovery, residuals, settling
 
 #: Titles of the experiments of the paper.
 TITLES = {
@@ -19,48 +23,43 @@ TITLES = {
 }
 
 
-def tables(found: StudyResults) -> str:
-    """The tables for people."""
-    parts = [
-        "`observer`, `filter` and `filter_gradient` are derived, not the published algorithms: the equations of the "
-        "two comparators of the paper were not to be had. Frequencies and errors in rad/s, times in s."
-    ]
+def tables(found: StudyResults) -> list[Section]:
+    """Return the tables for people."""
+    said = "`observer`, `filter` and `filter_gradient` are derived, not the published algorithms: the equations of the "
+    said += "two comparators of the paper were not to be had. Frequencies and errors in rad/s, times in s."
+    parts = [Section(sentences=[said])]
     for name, title in TITLES.items():
         if name in found:
-            parts += [f"### {title}", *paper_tables(found[name])]
+            parts += [Section(title), *paper_tables(found[name])]
     beyond = {"recovery": recovery_table, "recovery-in-noise": noisy_recovery_table, "efficiency": efficiency_table}
-    for name, write in beyond.items():
-        parts += write(found[name]) if name in found else []
-    parts += ["### The formulas as they are printed", as_printed.table()]
-    return "\n\n".join(parts) + "\n"
-
-
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """A table whose first column holds names."""
-    return markdown_table(header, rows, "l".ljust(len(header), "r"))
+    parts += [write(found[name]) for name, write in beyond.items() if name in found]
+    return [*parts, Section("The formulas as they are printed", frame=as_printed.table())]
 
 
 def named(estimator: str) -> str:
-    """An estimator as the tables show it."""
+    """Return an estimator as the tables show it."""
     return f"`{estimator}`, {DERIVED}" if is_derived(estimator) else f"`{estimator}`"
 
 
-def time(value: float | None, digits: int = 2) -> str:
-    """A time [s], or that it never came."""
-    return "never" if value is None else f"{value:.{digits}f}"
+def times(values: pd.Series, digits: int = 2) -> pd.Series:
+    """Return times [s] as text, or that they never came."""
+    return values.map(f"{{:.{digits}f}}".format).mask(values.isna(), "never")
 
 
-def paper_tables(results: Results) -> list[str]:
-    """Settling times and errors of one experiment of the paper, one table for each reading of the step."""
-    settled, left = list(settling(results)), list(residuals(results))
-    pieces = list(dict.fromkeys(row["piece"] for row in settled))
-    several = len(pieces) > 1
-    header = ["estimator"]
-    for piece in pieces:
-        of_piece = f", {piece}" if several else ""
-        header += [f"{'within ' if not k else ''}{band:g}{of_piece}" for k, band in enumerate(BANDS)]
-    header += ["rms w1", "rms w2", "valid [%]", "valid, off by 0.05 [s]"]
-    window, runs = results.settings["success"]["window"], max(row["data_sets"] for row in left)
+def across(rows: pd.DataFrame, key: str, order: Sequence[object], columns: Sequence[str], title: str) -> pd.DataFrame:
+    """Return some columns for each value of a key, by estimator, those that are derived behind the others."""
+    wide = rows.pivot(index="estimator", columns=key, values=list(columns))
+    found = wide[[(column, value) for value in order for column in columns]]
+    derived = rows.drop_duplicates("estimator").sort_values("derived", kind="stable")["estimator"]
+    return found.loc[derived].set_axis([title.format(value, column) for column, value in found], axis=1)
+
+
+def paper_tables(results: Results) -> list[Section]:
+    """Return settling times and errors of one experiment of the paper, one table for each reading of the step."""
+    settled, left = settling(results), residuals(results)
+    pieces = settled["piece"].unique().tolist()
+    several, bands = len(pieces) > 1, [f"within_{band:g}" for band in BANDS]
+    window, runs = results.settings["success"]["window"], left["data_sets"].max()
     explained = (
         f"Time until both errors are below a band to stay{', each piece from its beginning' if several else ''}, to "
         f"0.01 s; root-mean-square errors over {window[0]:g} to {window[1]:g} s "
@@ -68,78 +67,73 @@ def paper_tables(results: Results) -> list[str]:
         "one was called valid with an error above 0.05). Whole records: error of the one estimate."
     )
     after = {"jump": "Phase w(t) t, as printed: it jumps. ", "continuous": "Phase the integral of w(t). "}
+    settled[bands] = settled[bands].apply(times)
+    settled["off"] = settled["valid_but_off_by_0.05"].map(partial(number, digits=3))
+    left["rms"], left["valid"] = (
+        left["rms"].map(partial(number, digits=2)),
+        left["valid_share"].map(partial(number, digits=3)),
+    )
     written = []
-    for reading in dict.fromkeys(row["reading"] for row in left):
-        times = by_estimator(settled, reading=reading)
-        rows = []
-        for estimator, tones in by_estimator(left, reading=reading).items():
-            cells, wrong = settling_cells({row["piece"]: row for row in times.get(estimator, [])}, pieces)
-            cells += [number(tone["rms"], 2) for tone in tones]
-            rows.append([named(estimator), *cells, number(tones[0]["valid_share"], 3), wrong])
-        written += [after.get(reading, "") + explained, table(header, rows)]
+    for reading, own in left.groupby("reading", sort=False):
+        of_reading = settled[settled["reading"] == reading]
+        table = across(own, "tone", [1, 2], ["rms"], "rms w{0}")
+        within = across(of_reading, "piece", pieces, bands, "{1}, {0}" if several else "{1}")
+        within.columns = [name.replace("within_", "within " if f"{BANDS[0]:g}" in name else "") for name in within]
+        first = own.groupby("estimator")["valid"].first()
+        wrong = of_reading.drop_duplicates("estimator").set_index("estimator")["off"]
+        table = within.reindex(table.index).join(table).assign(**{"valid [%]": first, "valid, off by 0.05 [s]": wrong})
+        table = table.fillna("-").rename(index=named).reset_index()
+        written.append(Section(sentences=[after.get(reading, "") + explained], frame=table))
     return written
 
 
-def settling_cells(found: dict[str, Any], pieces: list[str]) -> tuple[list[str], str]:
-    """When an estimator has settled in each piece and band, and how long it was wrong and called valid."""
-    if not found:
-        return ["-"] * (len(pieces) * len(BANDS)), "-"
-    cells = [time(found[piece][f"within_{band:g}"]) for piece in pieces for band in BANDS]
-    return cells, number(found[pieces[0]]["valid_but_off_by_0.05"], 3)
+def recovery_table(results: Results) -> Section:
+    """Return how soon the frequencies are right again after a step without noise."""
+    rows = recovery(results)
+    rows["median"] = times(rows["median"], 3)
+    table = across(rows, "reading", READINGS, ["median"], "{0} [s]").rename(index=named).reset_index()
+    said = "Time from the step until both errors are below 1e-6, to stay to the end, 60 s after the step."
+    return Section("Beyond the paper: recovery from the step without noise", [said], table)
 
 
-def recovery_table(results: Results) -> list[str]:
-    """How soon the frequencies are right again after a step without noise."""
-    rows = []
-    for estimator, readings in by_estimator(list(recovery(results))).items():
-        medians = {row["reading"]: row["median"] for row in readings}
-        rows.append([named(estimator), *(time(medians[reading], 3) for reading in READINGS)])
-    return [
-        "### Beyond the paper: recovery from the step without noise",
-        "Time from the step until both errors are below 1e-6, to stay to the end, 60 s after the step.",
-        table(["estimator", *(f"{name} [s]" for name in READINGS)], rows),
-    ]
+def noisy_recovery_table(results: Results) -> Section:
+    """Return how soon the frequencies are right again after a step in noise."""
+    rows = recovery(results)
+    said = (
+        f"White Gaussian noise of standard deviation 0.11547, {rows['data_sets'].max()} data sets for each reading. "
+        "Time from the step until both errors are below 0.02, to stay to the end, 60 s after the step. False alarms "
+        "over all data sets; rms error: median of the worse tone."
+    )
+    shown = pd.DataFrame({"median [s]": times(rows["median"]), "longest [s]": times(rows["longest"])})
+    shown["never"], shown["false alarms"] = rows["never"].map(str), rows["false_alarms"].map(partial(number, digits=3))
+    shown["rms error, 80 to 90 s"] = rows["rms"].map(partial(number, digits=2))
+    table = across(shown.join(rows[["estimator", "reading", "derived"]]), "reading", READINGS, [*shown], "{0}: {1}")
+    table.columns = [name if name.endswith(": median [s]") else name.partition(": ")[2] for name in table]
+    return Section("Beyond the paper: recovery from the step in noise", [said], table.rename(index=named).reset_index())
 
 
-def noisy_recovery_table(results: Results) -> list[str]:
-    """How soon the frequencies are right again after a step in noise."""
-    rows, header = [], ["estimator"]
-    measured = list(recovery(results))
-    for reading in READINGS:
-        header += [f"{reading}: median [s]", "longest [s]", "never", "false alarms", "rms error, 80 to 90 s"]
-    for estimator, readings in by_estimator(measured).items():
-        cells = [named(estimator)]
-        for row in sorted(readings, key=lambda row: READINGS.index(row["reading"])):
-            cells += [time(row["median"]), time(row["longest"]), str(row["never"])]
-            cells += [number(row["false_alarms"], 3), number(row["rms"], 2)]
-        rows.append(cells)
-    return [
-        "### Beyond the paper: recovery from the step in noise",
-        f"White Gaussian noise of standard deviation 0.11547, {max(row['data_sets'] for row in measured)} data sets "
-        "for each reading. Time from the step until both errors are below 0.02, to stay to the end, 60 s after the "
-        "step. False alarms over all data sets; rms error: median of the worse tone.",
-        table(header, rows),
-    ]
+def efficiency_table(results: Results) -> Section:
+    """Return errors over the Cramer-Rao bound, and the bias that is a part of them."""
+    rows = efficiency(results)
+    bounds = " and ".join(number(bound, 3) for bound in rows.drop_duplicates("tone")["bound"])
+    said = (
+        f"{rows['data_sets'][0]} data sets. The Cramer-Rao bound is that of Gaussian noise of the same variance: "
+        f"standard deviations of {bounds} rad/s. ± is one standard deviation of the Monte Carlo; valid: mean share of "
+        "the 20 s, for whole records share of the data sets."
+    )
+    shown = pd.DataFrame({"rms error / bound": _pairs(rows, "ratio", 3, 2), "bias": _pairs(rows, "bias", 2, 1)})
+    shown["standard deviation"] = rows["deviation"].map(partial(number, digits=2))
+    table = across(shown.join(rows[["estimator", "tone", "derived"]]), "tone", [1, 2], [*shown], "w{0}: {1}")
+    table.columns = [name if name.endswith("bound") else name.partition(": ")[2] for name in table]
+    valid = rows.drop_duplicates("estimator").set_index("estimator")["valid_share"].map(partial(number, digits=3))
+    table = table.assign(**{"valid [%]": valid}).rename(index=named).reset_index()
+    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [said], table)
 
 
-def efficiency_table(results: Results) -> list[str]:
-    """Errors over the Cramer-Rao bound, and the bias that is a part of them."""
-    found = by_estimator(list(efficiency(results)))
-    rows, tones = [], next(iter(found.values()))
-    for estimator, own in found.items():
-        cells = [named(estimator)]
-        for tone in own:
-            cells.append(f"{number(tone['ratio'], 3)} ± {number(tone['ratio_error'], 2)}")
-            cells.append(f"{number(tone['bias'], 2)} ± {number(tone['bias_error'], 1)}")
-            cells.append(number(tone["deviation"], 2))
-        rows.append([*cells, number(own[0]["valid_share"], 3)])
-    header: list[Any] = ["estimator"]
-    for tone in tones:
-        header += [f"w{tone['tone']}: rms error / bound", "bias", "standard deviation"]
-    return [
-        "### Beyond the paper: errors after 20 s of the noise of section VI-B",
-        f"{tones[0]['data_sets']} data sets. The Cramer-Rao bound is that of Gaussian noise of the same variance: "
-        f"standard deviations of {' and '.join(number(tone['bound'], 3) for tone in tones)} rad/s. ± is one standard "
-        "deviation of the Monte Carlo; valid: mean share of the 20 s, for whole records share of the data sets.",
-        table([*header, "valid [%]"], rows),
-    ]
+def _pairs(rows: pd.DataFrame, name: str, digits: int, of_error: int) -> pd.Series:
+    """Return values with their Monte Carlo errors as text."""
+    values, errors = (
+        rows[name].map(partial(number, digits=digits)),
+        rows[f"{name}_error"].map(partial(number, digits=of_error)),
+    )
+    return values + " ± " + errors

@@ -29,9 +29,10 @@ def reaches_the_paper(results: Results) -> Iterator[Claim]:
 
 def always_converges(results: Results) -> Iterator[Claim]:
     """The methods with redundant filters and those without an initial delay converge from everywhere."""
+    estimates = results.estimates
     for name in RELIABLE:
-        judged = [row["converged"] for row in results.rows if row["estimator"] == name]
-        if judged:
-            percent = 100.0 * sum(judged) / len(judged)
+        judged = estimates.loc[estimates["estimator"] == name, "converged"]
+        if len(judged):
+            percent = 100.0 * judged.sum() / len(judged)
             shown = f"{percent:.2f} % of {len(judged)}"
             yield within(f"{name} converges", percent, low=ALWAYS, shown=shown)

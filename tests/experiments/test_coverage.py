@@ -24,7 +24,7 @@ def found(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def summary(found):
-    return pd.DataFrame([line for results in found.experiments.values() for line in tables.coverage(results)])
+    return pd.concat([tables.coverage(results) for results in found.experiments.values()])
 
 
 def chosen(summary, row, formula):

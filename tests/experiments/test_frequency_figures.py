@@ -100,7 +100,7 @@ def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):
 def test_the_reference_is_the_worse_tone_over_all_data_sets(out, drawn):
     results = read_results(out, "finite-time-frequency/random")
     figures.figure_3(results)
-    errors = [row["measures"] for row in results.rows if row["estimator"] == "nonlinear_least_squares"]
+    errors = [row["measures"] for row in results.stored if row["estimator"] == "nonlinear_least_squares"]
     assert len(errors) == 2
     expected = max(np.sqrt(np.mean([e[f"rms_{k}"] ** 2 for e in errors])) for k in (1, 2))
     for axes in drawn[0].axes[3:]:

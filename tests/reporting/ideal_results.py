@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ctid_cli.reporting.expected_accuracy import long_record_variances
 from ctid_cli.reporting.results import Results
 from ctid_cli.running.plan import build_plan
+from ctid_cli.running.theory import long_record_variances
 from ctid_cli.specification.load import load_spec
 from ctid_cli.storage.manifest import Key, true_values
 from tests.storage.made_results import MadeResults

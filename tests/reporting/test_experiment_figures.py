@@ -5,8 +5,8 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.figures.experiment_plot import chosen_kind, experiment_drawing, kinds_of
-from ctid_cli.reporting.figures.settings import settings_in
-from ctid_cli.reporting.measures import measure_rows
+from ctid_cli.reporting.figures.settings import placed
+from ctid_cli.reporting.measures import measure_frame
 from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 
@@ -44,24 +44,23 @@ def drawn(results, *args, **options):
 
 
 def test_points_and_bars_are_the_measure_rows(results):
-    rows = [row for row in measure_rows(results, ["rmse"]) if row["n"]]
+    rows = measure_frame(results, ["rmse"])
     *panels, stairs = drawn(results, measure="rmse")
     for axes in panels:
         name = axes.get_title(loc="left")
-        own = [row for row in rows if row["parameter"] == name]
+        own = rows[rows["parameter"] == name]
         (found,) = points(axes)
-        assert found.tolist() == [row["value"] for row in own]
-        assert np.array(bars(axes)) == pytest.approx(np.array(sorted((row["low"], row["high"]) for row in own)))
+        assert found.tolist() == own["value"].tolist()
+        assert np.array(bars(axes)) == pytest.approx(own.sort_values("low")[["low", "high"]].to_numpy())
     assert [label.get_text() for label in stairs.get_yticklabels()] == ["SNR [dB]", "initial delay [s]"]
 
 
 def test_an_estimator_without_a_start_stands_under_every_start(results, estimate, add_estimator):
     add_estimator(results, "startless", {(snr, None): [estimate(8.0)] * 4 for snr in (5.0, 15.0)})
-    rows = measure_rows(results, ["percent"])
-    settings = settings_in(rows, results)
+    settings, rows = placed(measure_frame(results, ["percent"]), results)
     assert settings.points == [(5.0, 0.0), (5.0, "random"), (15.0, 0.0), (15.0, "random")]
-    own = [row for row in rows if row["method"] == "startless"]
-    assert [settings.row_at(point, own) for point in settings.points] == [own[0], own[0], own[1], own[1]]
+    own = rows[rows["method"] == "startless"]
+    assert own[["place", "snr_db"]].to_numpy().tolist() == [[0, 5.0], [1, 5.0], [2, 15.0], [3, 15.0]]
     panel, _ = drawn(results, measure="percent")
     assert [values.tolist() for values in points(panel)] == [[50.0, 25.0, 50.0, 50.0], [100.0] * 4]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.measures import default_measures, measure_rows, percentage_frame
+from ctid_cli.reporting.measures import default_measures, measure_frame, percentage_frame, records_of
 
 DELAYS = (8.1, 7.9, 8.4)
 
@@ -13,6 +13,10 @@ DELAYS = (8.1, 7.9, 8.4)
 def results(make_results, estimate):
     found = [estimate(delay) for delay in DELAYS]
     return make_results({(5.0, "0.0"): [*found, estimate(None, status="FAILED")], (15.0, "0.0"): found})
+
+
+def measure_rows(results, names):
+    return records_of(measure_frame(results, names))
 
 
 def rows_of(results, *names):

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 from ctid_cli.inference.monte_carlo import LARGEST_FACTOR, MEASURES
-from ctid_cli.reporting.measures import measure_rows
-from ctid_cli.reporting.parameter_errors import least_variances
+from ctid_cli.reporting.measures import measure_frame, records_of
+from ctid_cli.running.theory import least_variances
 from tests.reporting.ideal_results import estimate, plan_of, results_of
 
 # 8 / (p^2 + 2.8 p + 4) after 1.5 s.
@@ -139,13 +139,17 @@ WITHOUT = {"standard_error": 23, "error_ratio": 23}
 WITHOUT_MODEL = {"h2": 3, "hinf": 3, "response:2": 3, "fresh_fit": 3}
 
 
+def measure_rows(results, names):
+    return records_of(measure_frame(results, names))
+
+
 def found_in(row):
     return np.array([np.nan if row[key] is None else row[key] for key in ("value", "error", "low", "high")])
 
 
 @pytest.mark.parametrize("name", OF_ERRORS)
 def test_a_measure_of_errors_is_what_it_says(results, name):
-    (bounds,) = least_variances(results).values()
+    bounds = least_variances(results.plan, 0, 0)
     rows = measure_rows(results, [name])
     assert [row["parameter"] for row in rows] == list(NAMES)
     for k, row in enumerate(rows):

@@ -10,7 +10,7 @@ import pytest
 from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
-from ctid_cli.reporting.pages.question import formula_of, parts, polynomial
+from ctid_cli.reporting.pages.question import formula_of, polynomial
 from ctid_cli.storage.folder import SPEC
 from tests.reporting.parsed_page import Page
 
@@ -38,7 +38,7 @@ def test_a_page_says_all_that_it_should(page, results):
     assert page.tags["svg"] == 2
     assert "2 estimators on 8 data sets in 2 settings: 16 estimates, 1 of them failed." in page.text
     assert "percent of the data sets whose delay estimate lies within 1 % of the true delay" in page.text
-    failed = next(row["id"] for row in results.rows if row["status"] == "FAILED")
+    failed = next(row["id"] for row in results.stored if row["status"] == "FAILED")
     assert f"ctid export useful-redundancy/case1-regular --id {failed}" in page.text
     assert "Huong Ha" not in page.text  # nobody's method but td_srivc's
     assert "doi:10.1016/j.jprocont.2014.10.003" in page.text
@@ -100,10 +100,3 @@ def test_styles_are_those_of_print_and_phones():
     assert "@media print" in css
     assert "overflow-x: auto" in css
     assert "http" not in css
-
-
-def test_of_a_noise_the_polynomials_are_options():
-    noise = {"kind": "arma", "numerator": [1.0], "denominator": [1.0, -0.9], "variance": 0.02}
-    system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 0.5}
-    found = {part.title: part.frame["option"].tolist() for part in parts({"noise": noise, "system": system})}
-    assert found == {"System": ["delay"], "Noise (arma)": ["numerator", "denominator", "variance"]}

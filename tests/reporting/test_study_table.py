@@ -6,9 +6,9 @@ import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import render_markdown, render_text
+from ctid_cli.reporting.measures import records_of
 from ctid_cli.reporting.study import data_folder, load_study
 from ctid_cli.reporting.study_table import build_tables, made_by, pooled_frame, study_frame, study_sections
-from ctid_cli.reporting.table_result import records_of
 from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import load_spec
 from experiments.useful_redundancy.tables import failures, searches
@@ -177,7 +177,7 @@ def test_unknown_names_are_refused(tmp_path, name):
 
 
 def test_failing_estimates_are_listed_with_what_makes_them_again(mixed):
-    rows = list(failures(mixed))
+    rows = records_of(failures(mixed))
     assert [(r["method"], r["snr_db"], r["initial_delay"], r["replicate"], r["delay"]) for r in rows] == [
         ("other_profile", 5.0, None, 3, 5.0),
         ("redundancy", 5.0, "random", 3, 5.0),
@@ -193,7 +193,9 @@ def test_searches_are_counted_by_method_and_cell(make_results, add_estimator, es
     found = [estimate(8.0 if end > 5 else end, search_delay=end, switches=count) for end, count in ends]
     results = make_results({(5.0, "0.0"): [estimate(8.0), estimate(5.0)]})
     add_estimator(results, "as_printed", {(5.0, "0.0"): found[:2], (5.0, RANDOM): found[2:]})
-    existing, printed = ({key: row[key] for key in row if key != "median_seconds"} for row in searches(results))
+    existing, printed = (
+        {key: row[key] for key in row if key != "median_seconds"} for row in records_of(searches(results))
+    )
     alike = {"experiment": results.experiment, "snr_db": 5.0, "max_delay_step": None}
     nothing = {"search_percent": None, "switched": None, "most_switches": None}
     assert existing == alike | {"method": "existing", "n": 2, "percent": 50.0, **nothing}

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from ctid_cli.reporting.expected_accuracy import expected_accuracy
 from ctid_cli.reporting.surprises import surprises
+from ctid_cli.simulation.expected_accuracy import expected_accuracy
 from tests.reporting.ideal_results import estimate, plan_of, results_of
 
 # The input changes between the samples; four settings, two estimators, three parameters.

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from ctid_cli.inference.monte_carlo import wilson_interval
-from ctid_cli.reporting.measures import percentage_frame, settings_of
+from ctid_cli.reporting.measures import percentage_frame, records_of, settings_of
 from ctid_cli.reporting.results import differences
-from ctid_cli.reporting.table_result import experiment_table, joined, measure_table, records_of, success_sentence
+from ctid_cli.reporting.table_result import experiment_table, joined, measure_table, success_sentence
 from tests.reporting.made_frequencies import frequency_results, of_record, of_track
 
 RANDOM = "uniform(0, 9)"
@@ -81,7 +81,7 @@ def test_the_snr_is_a_key_of_an_experiment_that_does_not_sweep_it(make_results, 
 
 def test_several_initial_parameters_are_told_apart(make_results, estimate):
     results = make_results({(15.0, "0.0"): [estimate(8.0)], (15.0, RANDOM): [estimate(3.0)]}, snrs=(15.0,), swept=False)
-    assert "start" not in settings_of([percentage_frame(results)])
+    assert "start" not in settings_of(percentage_frame(results))
     starts = results.manifest["starts"]
     starts.clear()
     starts |= {"0.0": None, RANDOM: None, "none": None}

@@ -11,13 +11,13 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import quantile
 from ctid_cli.reporting.figures.measure_plot import PANELS
-from ctid_cli.reporting.figures.settings import Scale, Settings, settings_in, value_text
+from ctid_cli.reporting.figures.settings import Scale, Settings, placed, value_text
 from ctid_cli.reporting.figures.style import MIDDLE, Drawing, columns_for, look, panels_of, plain, size_for
-from ctid_cli.reporting.measures import Row, labelled_groups, parameter_unit
-from ctid_cli.reporting.parameter_errors import ParameterEstimates, estimates_by_group
+from ctid_cli.reporting.measures import label_frame, parameter_unit
 from ctid_cli.reporting.results import Results
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -27,41 +27,16 @@ CROWDED = 16
 REACH = 3.0
 
 
-def grouped_rows(results: Results) -> list[Row]:
-    """What every estimator found at every setting and start, as the value of a row that says which."""
-    found = {one.group: one for one in estimates_by_group(results)}
-    return [labels | {"value": found[group]} for group, labels in labelled_groups(results) if group in found]
-
-
-def estimated_names(rows: Sequence[Row], asked: Sequence[str] = ()) -> list[str]:
-    """Names of the parameters that any of the estimators has values of, or those that were asked for."""
-    names = dict.fromkeys(
-        name for row in rows for k, name in enumerate(row["value"].names) if row["value"].sample(k).errors.size
-    )
-    for name in asked:
-        if name not in names:
-            raise UsageError(f"no estimator has the parameter {name!r}; there are {', '.join(names)}")
-    return list(asked) or list(names)
-
-
-def _errors(estimates: ParameterEstimates, name: str) -> Array:
-    """Errors of a parameter, NaN where it has none, shape (R,)."""
-    if name not in estimates.names:
-        return np.full(estimates.runs, np.nan)
-    k = estimates.names.index(name)
-    return np.asarray(estimates.values[:, k] - estimates.truth[k])
-
-
-def _labelled(name: str, rows: Sequence[Row]) -> str:
-    unit = next((parameter_unit(name, row["value"].names) for row in rows if name in row["value"].names), "-")
-    return f"error of {plain(name)}" + ("" if unit == "-" else f" [{unit}]")
-
-
 def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
-    """Box plots of the errors of every parameter: quartiles, 5 and 95 %, and the median with its 95 % interval."""
-    rows = grouped_rows(results)
-    settings = settings_in(rows, results)
-    names = estimated_names(rows, asked)[:PANELS]
+    """Return box plots of the errors of each parameter: quartiles, 5 and 95 %, the median with its 95 % interval."""
+    errors = results.errors.dropna(subset="value")
+    known = errors["parameter"].unique().tolist()
+    for name in asked:
+        if name not in known:
+            raise UsageError(f"no estimator has the parameter {name!r}; there are {', '.join(known)}")
+    names = (list(asked) or known)[:PANELS]
+    settings, rows = placed(label_frame(results).loc[sorted(set(results.errors["group"]))], results)
+    boxes = rows[["method", "place"]].merge(errors, left_index=True, right_on="group")
     labels = ["\n".join(map(value_text, point)) for point in settings.points]
     scale = Scale([float(k) for k in range(len(labels))], False, labels)
     # Many boxes need the whole width.
@@ -70,8 +45,9 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
     def draw(figure: Figure) -> None:
         panels = panels_of(figure, len(names), columns)
         for axes, name in zip(panels, names, strict=True):
-            _draw_panel(axes, name, rows, settings)
-            axes.set_ylabel(_labelled(name, rows))
+            _draw_panel(axes, boxes[boxes["parameter"] == name], settings)
+            unit = parameter_unit(name, results.errors["parameter"].unique().tolist())
+            axes.set_ylabel(f"error of {plain(name)}" + ("" if unit == "-" else f" [{unit}]"))
             scale.apply(axes)
             axes.set_xlabel(", ".join(settings.titles))
         _legend(figure, settings)
@@ -81,18 +57,14 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
     return Drawing(*size_for(len(names), columns=columns), draw)
 
 
-def _draw_panel(axes: Axes, name: str, rows: Sequence[Row], settings: Settings) -> None:
+def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings) -> None:
     """Draw the boxes of one parameter; what lies far outside most boxes is counted at the edge."""
-    width = 0.7 / len(settings.methods)
-    boxes: list[tuple[float, int, Array]] = []
-    for k, method in enumerate(settings.methods):
-        own = [row for row in rows if row["method"] == method]
-        for place, point in enumerate(settings.points):
-            row = settings.row_at(point, own)
-            errors = np.zeros(0) if row is None else _errors(row["value"], name)
-            errors = errors[np.isfinite(errors)]
-            if errors.size:
-                boxes.append((place + width * (k - 0.5 * (len(settings.methods) - 1)), k, errors))
+    width, middle = 0.7 / len(settings.methods), 0.5 * (len(settings.methods) - 1)
+    boxes: list[tuple[float, int, Any]] = [
+        (float(str(place)) + width * (k - middle), k, own["value"].to_numpy())
+        for k, method in enumerate(settings.methods)
+        for place, own in rows[rows["method"] == method].groupby("place")
+    ]
     axes.axhline(0.0, color=MIDDLE, linewidth=0.7, zorder=0.5)
     axes.grid(False, axis="x")
     if not boxes:

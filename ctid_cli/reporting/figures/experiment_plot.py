@@ -9,22 +9,21 @@ from ctid_cli.reporting.figures.measure_plot import measure_drawing
 from ctid_cli.reporting.figures.style import Drawing, require_kind
 from ctid_cli.reporting.measures import asked_measures, default_measures
 from ctid_cli.reporting.results import Results
-from ctid_cli.storage.manifest import true_values
 
 Kind = Literal["measure", "box"]
 
 
 def kinds_of(results: Results) -> list[Kind]:
     """The figures that an experiment has, the most telling one first."""
-    if not results.rows:
+    if not len(results.stored):
         raise UsageError(f"{results.experiment} has no stored estimates yet; run it first")
     if results.settings.get("data") is not None:
         one = f"{results.experiment} is about one measured record, so that there is nothing to draw over data sets"
         raise UsageError(f"{one}; ctid fit draws a fit")
     kinds: list[Kind] = ["measure"]
-    if any(map(true_values, results.manifest["data_cells"])):
+    if results.is_simulated:
         kinds += ["box"]
-    alone = len(results.groups()) == 1 and "box" in kinds
+    alone = len(set(results.numbers.tolist())) == 1 and "box" in kinds
     return sorted(kinds, key=lambda kind: kind != "box") if alone else kinds
 
 

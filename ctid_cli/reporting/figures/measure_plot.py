@@ -7,20 +7,19 @@ plot, BMC Medical Research Methodology 14 (2014) 129). Bars and bands are 95 % i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctid_cli.arrays import Array
-from ctid_cli.reporting.figures.settings import Scale, Settings, scale_of, settings_in, value_text
+from ctid_cli.reporting.figures.settings import Scale, Settings, placed, scale_of, value_text
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count, number
-from ctid_cli.reporting.measures import Row, measure_of, measure_rows
+from ctid_cli.reporting.measures import measure_frame, measure_of
 from ctid_cli.reporting.results import Results
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -37,10 +36,11 @@ LABELLED = 24
 
 
 def measure_drawing(results: Results, measure: str) -> Drawing:
-    """A measure over what an experiment varies, one panel for each parameter."""
-    rows = [row for row in measure_rows(results, [measure]) if row["n"]]
-    settings = settings_in(rows, results)
-    names = list(dict.fromkeys(row["parameter"] for row in rows))[:PANELS]
+    """Return a measure over what an experiment varies, one panel for each parameter."""
+    frame = measure_frame(results, [measure])
+    frame = frame[frame["n"] > 0]
+    settings, rows = placed(frame, results)
+    names = frame["parameter"].unique().tolist()[:PANELS]
     scale, flights = scale_of(settings), len(settings.names) if len(settings.names) > 1 else 0
 
     def draw(figure: Figure) -> None:
@@ -57,21 +57,28 @@ def measure_drawing(results: Results, measure: str) -> Drawing:
                 scale.apply(axes)
                 axes.set_xlabel(", ".join(settings.titles))
         for axes, name in zip(panels, names, strict=True):
-            own = [row for row in rows if row["parameter"] == name]
+            own = rows[rows["parameter"] == name] if isinstance(name, str) else rows
             _draw_panel(axes, own, settings, scale)
             _label(axes, own, measure)
-        _legend(figure, rows, settings)
-        figure.suptitle(_title(results, measure, rows))
+        _legend(figure, frame, settings)
+        figure.suptitle(_title(results, measure, frame))
 
     return Drawing(*((7.5, 1.2 + NESTED * len(names) + FLIGHT * flights) if flights else size_for(len(names))), draw)
 
 
-def _draw_panel(axes: Axes, rows: Sequence[Row], settings: Settings, scale: Scale) -> None:
+def _draw_panel(axes: Axes, rows: pd.DataFrame, settings: Settings, scale: Scale) -> None:
+    """Draw the values of each method with their intervals."""
     for k, method in enumerate(settings.methods):
-        own = [row for row in rows if row["method"] == method]
-        found = [settings.row_at(point, own) for point in settings.points]
-        places = np.array(scale.shifted(k, len(settings.methods)))
-        _draw_series(axes, places, found, _breaks(settings), look(k), joined=bool(settings.names))
+        own = rows[rows["method"] == method].set_index("place").reindex(range(len(settings.points)))
+        value, low, high = own[["value", "low", "high"]].to_numpy(dtype=float).T
+        places, style = np.array(scale.shifted(k, len(settings.methods))), look(k)
+        # An interval without an end is not known; the value is drawn without a bar.
+        known = np.isfinite(value) & np.isfinite(low) & np.isfinite(high)
+        bars = np.abs(np.array([value - low, high - value]))[:, known]
+        axes.errorbar(places[known], value[known], bars, fmt="none", ecolor=style["color"], elinewidth=0.9, capsize=1.8)
+        axes.plot(places, value, **{**style, "linestyle": "none"}, markersize=4.0)
+        for part in np.split(np.arange(places.size), _breaks(settings)) if settings.names else ():
+            axes.plot(places[part], value[part], **{**style, "marker": "none"}, linewidth=0.9)
 
 
 def _breaks(settings: Settings) -> list[int]:
@@ -79,41 +86,19 @@ def _breaks(settings: Settings) -> list[int]:
     return [k for k, point in enumerate(settings.points) if k and point[:-1] != settings.points[k - 1][:-1]]
 
 
-def _draw_series(
-    axes: Axes,
-    places: Array,
-    found: Sequence[Row | None],
-    breaks: Sequence[int],
-    style: Mapping[str, Any],
-    *,
-    joined: bool = True,
-) -> None:
-    """Values with their intervals."""
-    value, low, high = (np.array([_number(row, key) for row in found]) for key in ("value", "low", "high"))
-    # An interval without an end is not known; the value is drawn without a bar.
-    known = np.isfinite(value) & np.isfinite(low) & np.isfinite(high)
-    bars = np.abs(np.array([value - low, high - value]))[:, known]
-    axes.errorbar(places[known], value[known], bars, fmt="none", ecolor=style["color"], elinewidth=0.9, capsize=1.8)
-    axes.plot(places, value, **{**style, "linestyle": "none"}, markersize=4.0)
-    for part in np.split(np.arange(places.size), breaks) if joined else ():
-        axes.plot(places[part], value[part], **{**style, "marker": "none"}, linewidth=0.9)
-
-
-def _number(row: Row | None, key: str) -> float:
-    return np.nan if row is None or row[key] is None else float(row[key])
-
-
-def _label(axes: Axes, rows: Sequence[Row], measure: str) -> None:
+def _label(axes: Axes, rows: pd.DataFrame, measure: str) -> None:
     """Title, unit and vertical scale of a panel."""
-    row, base = rows[0], measure.partition(":")[0]
-    unit = f" [{row['unit']}]" if row["unit"] not in ("", "-") else ""
-    axes.set_ylabel(f"{(measure if row['parameter'] is None else base).replace('_', ' ')}{unit}")
-    if row["parameter"] is not None:
-        axes.set_title(plain(str(row["parameter"])), loc="left")
+    (parameter, unit), base = rows[["parameter", "unit"]].iloc[0], measure.partition(":")[0]
+    of_parameter = isinstance(parameter, str)
+    axes.set_ylabel(
+        (base if of_parameter else measure).replace("_", " ") + (f" [{unit}]" if unit not in ("", "-") else "")
+    )
+    if of_parameter:
+        axes.set_title(plain(parameter), loc="left")
     if base in IDEAL:
         axes.axhline(IDEAL[base], color=DARK, linewidth=0.7, zorder=0.5)
-    values = [row["value"] for row in rows if row["value"] is not None]
-    if row["unit"] == "%" and base in ("percent", "coverage", "failures"):
+    values = rows["value"].dropna().tolist()
+    if unit == "%" and base in ("percent", "coverage", "failures"):
         low, high = axes.get_ylim()
         axes.set_ylim(max(low, -3.0), min(high, 103.0))
     elif values and base not in ("bias", "median_bias") and min(values) > 0 and max(values) > SPAN * min(values):
@@ -152,12 +137,12 @@ def _draw_stairs(axes: Axes, settings: Settings) -> None:
         side.set_color(LIGHT)
 
 
-def _legend(figure: Figure, rows: Sequence[Row], settings: Settings) -> None:
+def _legend(figure: Figure, rows: pd.DataFrame, settings: Settings) -> None:
     """Estimators, and how many of their estimates have no value."""
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], **look(k), markersize=4, linewidth=0.9, label=method + _lost(rows, method))
+        Line2D([], [], **look(k), markersize=4, linewidth=0.9, label=method + _lost(rows[rows["method"] == method]))
         for k, method in enumerate(settings.methods)
     ]
     longest = max(len(str(handle.get_label())) for handle in handles)
@@ -165,19 +150,16 @@ def _legend(figure: Figure, rows: Sequence[Row], settings: Settings) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def _lost(rows: Sequence[Row], method: str) -> str:
+def _lost(rows: pd.DataFrame) -> str:
     """How many estimates of an estimator failed, or have no value of some parameter."""
-    counts: dict[str | None, list[tuple[int, int, int]]] = {}
-    for row in rows:
-        if row["method"] == method:
-            counts.setdefault(row["parameter"], []).append((row["n"], row["failed"], row["without_value"]))
-    runs, failed, without = np.max([np.sum(own, axis=0) for own in counts.values()], axis=0)
+    sums = rows.groupby("parameter", dropna=False)[["n", "failed", "without_value"]].sum()
+    runs, failed, without = sums.max().tolist()
     notes = [f"{failed} of {runs} failed"] if failed else []
     notes += [f"{without} without a value"] if without > failed else []
     return f" ({', '.join(notes)})" if notes else ""
 
 
-def _title(results: Results, measure: str, rows: Sequence[Row]) -> str:
-    runs = [row["n"] for row in rows]
-    sets = count(max(runs), "data set") if min(runs) == max(runs) else f"{min(runs)} to {max(runs)} data sets"
+def _title(results: Results, measure: str, rows: pd.DataFrame) -> str:
+    least, most = rows["n"].min(), rows["n"].max()
+    sets = count(most, "data set") if least == most else f"{least} to {most} data sets"
     return f"{results.experiment}: {measure_of(measure, results).meaning}\n{sets} a point, 95 % intervals"

@@ -4,40 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ctid_cli.kinds import KINDS, resolve
 from ctid_cli.reporting.figures.style import plain
 from ctid_cli.reporting.layout import delay_label, number
-from ctid_cli.reporting.measures import Row, settings_of
+from ctid_cli.reporting.measures import settings_of
 from ctid_cli.reporting.results import Results
-from ctid_cli.signals.sampling import InstantsFile
-from ctid_cli.signals.sinusoids import SumOfSinusoids
-from ctid_cli.simulation.dataset import MeasuredSource
-from ctid_cli.specification.messages import option_docs
-from ctid_cli.specification.spec import ListedTimesSection, RegularDurationSection
-from ctid_cli.specification.system_sections import AdditiveSystemSection, LoopSection, StartsSection, SystemSection
+from ctid_cli.specification.reference import unit_of
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
-
-_SECTIONS = {
-    "system": SystemSection,
-    "starts": StartsSection,
-    "loop": LoopSection,
-    "signal": SumOfSinusoids,
-    "data": MeasuredSource,
-}
-#: Forms of the sampling that a key tells apart from others of the same kind.
-_SAMPLING_FORMS: dict[str, type] = {
-    "duration": RegularDurationSection,
-    "times": ListedTimesSection,
-    "file": InstantsFile,
-}
-#: Values of the settings that vary, in the order of their names.
-Point = tuple[Any, ...]
 
 
 class Settings(NamedTuple):
@@ -47,40 +25,39 @@ class Settings(NamedTuple):
     names: tuple[str, ...]
     #: Their titles with units.
     titles: tuple[str, ...]
-    points: list[Point]
+    #: Values of the settings at each place of a figure.
+    points: list[tuple[Any, ...]]
     methods: list[str]
 
-    def row_at(self, point: Point, rows: Sequence[Row]) -> Row | None:
-        """The row of a point; one that does not have a setting, such as an initial delay, is the same at all of its."""
-        at = list(zip(self.names, point, strict=True))
-        return next((row for row in rows if all(row[name] in (None, value) for name, value in at)), None)
 
-    def words(self, point: Point) -> str:
-        """A point as the title of a panel, without settings that it does not have."""
-        named = zip((title.partition(" [") for title in self.titles), point, strict=True)
-        known = ((title, value_text(value), unit) for (title, _, unit), value in named if value is not None)
-        return ", ".join(f"{title} {text} {unit.rstrip(']')}".strip() for title, text, unit in known)
+def placed(frame: pd.DataFrame, results: Results) -> tuple[Settings, pd.DataFrame]:
+    """Return what varies in the rows of an experiment, and the rows with their ``place``.
 
+    A row that lacks a setting, such as an initial delay, is the same at all values of it.
+    """
+    import pandas as pd
 
-def settings_in(rows: Sequence[Row], results: Results) -> Settings:
-    """What varies in the rows of an experiment."""
-    values = {name: _ordered(row[name] for row in rows) for name in [*settings_of(rows), "initial_delay"]}
+    values = {name: _ordered(frame[name]) for name in [*settings_of(frame), "initial_delay"]}
     varied = {name: found for name, found in values.items() if len(found) > 1}
-    methods = list(dict.fromkeys(row["method"] for row in rows))
     titles = tuple(title_of(name, results.settings) for name in varied)
-    every = Settings(tuple(varied), titles, list(itertools.product(*varied.values())), methods)
-    # Estimators of one name may differ in options that only some of them have: not every combination is planned.
-    return every._replace(points=[point for point in every.points if every.row_at(point, rows) is not None])
-
-
-def part_of(shown: Sequence[Any], found: Sequence[Any]) -> str:
-    """That there is more than what is shown."""
-    return f", the first {len(shown)} of {len(found)} settings" if len(shown) < len(found) else ""
+    points: list[tuple[Any, ...]] = []
+    parts: list[pd.DataFrame] = []
+    for point in itertools.product(*varied.values()):
+        own = frame
+        for name, value in zip(varied, point, strict=True):
+            column = own[name].map(_hashable)
+            own = own[column.isna() | (column == value)]
+        # Estimators of one name may differ in options that only some of them have: not every combination is planned.
+        if len(own):
+            parts.append(own.assign(place=len(points)))
+            points.append(point)
+    rows = pd.concat(parts).drop_duplicates([*({"parameter"} & {*frame}), "method", "place"])
+    return Settings((*varied,), titles, points, frame["method"].unique().tolist()), rows
 
 
 def _ordered(values: Any) -> list[Any]:
     """Values without repetition, numbers by size and before words."""
-    found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None]
+    found = [value for value in dict.fromkeys(map(_hashable, values)) if value is not None and value == value]
     return sorted(found, key=lambda value: (0, value) if _is_number(value) else (1, 0.0))
 
 
@@ -97,36 +74,16 @@ def value_text(value: Any) -> str:
     return plain(number(value))
 
 
-def documentation(section: str, content: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """What a section of a specification is, and the text about each of its keys; nothing of what is not our own."""
-    kind = content.get("kind")
-    if kind in KINDS.get(section, {}):
-        forms = [form for key, form in _SAMPLING_FORMS.items() if section == "sampling" and key in content]
-        target: type | None = forms[0] if forms else resolve(section, kind)
-    else:
-        target = AdditiveSystemSection if "additive" in content else _SECTIONS.get(section) if kind is None else None
-    if target is None:
-        return "", {}
-    return (target.__doc__ or "").strip().splitlines()[0].replace("``", ""), option_docs(target)
-
-
-def unit_in(text: str) -> str:
-    """The unit that the text about an option names; empty where it names none."""
-    unit = re.search(r"\[([^],…]+)\]", text)
-    return unit[1] if unit and unit[1] != "-" else ""
-
-
 def title_of(name: str, settings: Mapping[str, Any]) -> str:
     """The name of a swept setting with its unit."""
     if name == "initial_delay":
         return "initial delay [s]"
-    key = name.rpartition(".")[2]
+    key, title = name.rpartition(".")[2], "SNR" if name == "snr_db" else name.replace("_", " ")
     sections = [(section, item) for section, item in settings.items() if isinstance(item, Mapping)]
-    sections += [("estimator", item) for item in settings["estimators"].values()]
-    for section, content in sections:
-        if key in content and (unit := unit_in(documentation(section, content)[1].get(key, ""))):
-            return f"{'SNR' if name == 'snr_db' else name.replace('_', ' ')} [{unit}]"
-    return name.replace("_", " ")
+    sections += [("estimators", item) for item in settings["estimators"].values()]
+    units = (unit_of(section, key) for section, content in sections if key in content)
+    unit = next(filter(None, units), "")
+    return f"{title} [{unit}]" if unit else title
 
 
 class Scale(NamedTuple):

@@ -14,14 +14,13 @@ from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.experiment_plot import experiment_drawing, kinds_of, main_measure
 from ctid_cli.reporting.measures import SUCCESSES, default_measures
 from ctid_cli.reporting.pages.page import Chapter, write_page
-from ctid_cli.reporting.pages.question import estimators, formula_of, parts, references
+from ctid_cli.reporting.pages.question import formula_of, references
 from ctid_cli.reporting.paired_result import compare_estimators
 from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.status_result import first_line
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
 from ctid_cli.storage.folder import SPEC
-from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.status import public_sessions
 from ctid_cli.text import count
 
@@ -59,32 +58,34 @@ def _counts(results: Results) -> str:
     methods = len({part["name"] for part in manifest["estimators"]})
     sets = sum(cell["replicates"] for cell in manifest["data_cells"])
     cells = f" in {count(len(manifest['data_cells']), 'setting')}" if len(manifest["data_cells"]) > 1 else ""
-    estimates = count(len(results.rows), "estimate")
+    estimates = count(len(results.stored), "estimate")
     failed = f", {results.failed} of them failed" if results.failed else ", none of them failed"
     return f"{count(methods, 'estimator')} on {count(sets, 'data set')}{cells}: {estimates}{failed}"
 
 
 def _question(results: Results) -> Iterator[Section]:
-    """Return the data and the estimators as the specification describes them."""
+    """Return the equation of the system, the data sets, the rule of success, and the specification as written."""
     settings, seed = results.settings, results.manifest["seed"]
     yield Section(sentences=[formula_of(settings)] if formula_of(settings) else [])
-    yield from parts(settings)
     sizes = [cell["replicates"] for cell in results.manifest["data_cells"]]
     runs = " to ".join(map(str, dict.fromkeys((min(sizes), max(sizes)))))
     sets = "One measured record, the same for all estimators."
     if seed is not None:
-        sets = f"{runs} of each setting, seed {seed}. The same data sets for all estimators."
-    yield Section("Data sets", [sets])
-    if settings.get("success"):
-        rule = f"Counted: {success_sentence(settings)}. Estimates that failed count as not converged."
-        yield Section("Success", [rule])
-    yield from estimators(settings)
+        sets = f"{runs} data sets of each setting, seed {seed}. The same data sets for all estimators."
+    rule = f"Counted: {success_sentence(settings)}. Estimates that failed count as not converged."
+    yield Section(sentences=[sets, *([rule] if settings.get("success") else [])])
+    try:
+        text = (results.folder / SPEC).read_text(encoding="utf-8")
+    except OSError:
+        return
+    where, same = (" beside its record", "") if seed is None else ("", ": the same seed gives the same data sets")
+    yield Section("The specification", [f"Save it as a file{where} and run `ctid run FILE`{same}.", text + "\n"])
 
 
 def _tables(results: Results) -> list[Section]:
     """Return the tables of ``ctid table``, and the usual measures where they are not among them."""
     tables = [experiment_table(results)]
-    if any(map(true_values, results.manifest["data_cells"])):
+    if results.is_simulated:
         others = [name for name in MEASURES if name not in default_measures(results)]
         tables += [measure_table(results, others)] if others else []
     return [section for table in tables for section in table.shown]
@@ -131,33 +132,23 @@ def _outcomes(results: Results, out: Path) -> list[Section]:
 
 
 def _provenance(results: Results, sessions: list[dict[str, Any]]) -> Iterator[Section]:
-    """Return what computed the results, and the specification as it was written."""
+    """Return what computed the results."""
     seed = results.manifest["seed"]
     sown = "" if seed is None else f", seed {seed}"
     made = f"Specification {results.manifest['spec_hash'][:16]}{sown}; page by ctid {ctid_cli.__version__}."
     origins = [(each.code_version, each.platform, _versions(dict(each.packages))) for each in results.stored.origins]
     yield Section(sentences=[made], frame=pd.DataFrame(origins, columns=["code version", "platform", "libraries"]))
     if sessions:
-        frame = pd.DataFrame(
-            [
-                {
-                    "session": each.get("started"),
-                    "until": each.get("stopped"),
-                    "computed": each.get("computed"),
-                    "failed": each.get("failed"),
-                    "workers": each.get("jobs"),
-                    "Python and libraries": _versions(each.get("packages") or {}),
-                }
-                for each in sessions
-            ]
-        )
-        yield Section(frame=frame)
-    try:
-        text = (results.folder / SPEC).read_text(encoding="utf-8")
-    except OSError:
-        return
-    where, same = (" beside its record", "") if seed is None else ("", ": the same seed gives the same data sets")
-    yield Section("The specification", [f"Save it as a file{where} and run `ctid run FILE`{same}.", text + "\n"])
+        titles = {
+            "started": "session",
+            "stopped": "until",
+            "computed": "computed",
+            "failed": "failed",
+            "jobs": "workers",
+        }
+        shown = pd.DataFrame(sessions).reindex(columns=[*titles]).rename(columns=titles)
+        shown["Python and libraries"] = [_versions(each.get("packages") or {}) for each in sessions]
+        yield Section(frame=shown)
 
 
 def _versions(packages: Mapping[str, str]) -> str:

@@ -1,78 +1,14 @@
-"""What an experiment asks, in words: the system, what drives it, when it is sampled, who estimates, what counts."""
+"""What an experiment asks: the equation of its system, and the articles whose methods its estimators are."""
 
 import inspect
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ctid_cli.kinds import KINDS, resolve
-from ctid_cli.reporting.document import Section
-from ctid_cli.reporting.figures.settings import documentation, unit_in
 from ctid_cli.reporting.layout import number
 
-#: Sections of a specification as headings, in the order of the page.
-TITLES = {
-    "system": "System",
-    "signal": "Signal",
-    "data": "Measured record",
-    "excitation": "Input",
-    "loop": "Loop",
-    "sampling": "Sampling",
-    "noise": "Noise",
-    "disturbance": "Disturbance",
-    "starts": "Starts",
-}
-
 SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-#: What of a system is in its equation.
-IN_EQUATION = ("numerator", "denominator", "additive")
-
-
-def parts(settings: Mapping[str, Any]) -> Iterator[Section]:
-    """Return the data of an experiment, section by section."""
-    for section, title in TITLES.items():
-        content = settings.get(section)
-        if isinstance(content, Mapping):
-            yield _part(title, section, content)
-
-
-def estimators(settings: Mapping[str, Any]) -> Iterator[Section]:
-    """Return the estimators of an experiment."""
-    for name, content in settings["estimators"].items():
-        section = "estimator" if content.get("kind") in KINDS["estimator"] else "frequency_estimator"
-        yield _part(name, section, content)
-
-
-def _part(title: str, section: str, content: Mapping[str, Any]) -> Section:
-    """Return a section of a specification with a table of its options; custom components have no documented ones."""
-    import pandas as pd
-
-    kind = str(content.get("kind") or "")
-    summary, docs = documentation(section, content)
-    options = [
-        (name, _text(value), *_unit_and_meaning(docs.get(name, "")))
-        for name, value in content.items()
-        if name != "kind" and value is not None and not (section == "system" and name in IN_EQUATION)
-    ]
-    frame = pd.DataFrame(options, columns=["option", "value", "unit", "meaning"]) if options else None
-    if frame is not None and not frame["meaning"].any():
-        frame = frame[["option", "value"]]
-    named = f"{title} ({kind})" if kind not in ("", title) else title
-    return Section(named, [summary] if kind and summary else [], frame)
-
-
-def _unit_and_meaning(text: str) -> tuple[str, str]:
-    unit = unit_in(text)
-    meaning = text.replace(f" [{unit or '-'}]", "", 1)
-    return unit, meaning if not meaning or meaning.endswith(".") else f"{meaning}."
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name.replace('_', ' ')} {_text(item)}" for name, item in value.items() if item is not None)
-    if isinstance(value, list):
-        return ("; " if any(isinstance(item, Mapping | list) for item in value) else ", ").join(map(_text, value))
-    return str(value).lower() if isinstance(value, bool) else number(value, 15)
 
 
 def formula_of(settings: Mapping[str, Any]) -> str:

@@ -1,13 +1,11 @@
 """How accurate an estimator of a simulated experiment can be, by theory, by which formula, and in the long run."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ctid_cli.canonical import content_hash
 from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.inference.bounds import (
     EstimatedForm,
@@ -21,7 +19,6 @@ from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.plan import Plan
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.noise import Noise
 from ctid_cli.signals.sampling import RegularSampling
@@ -179,33 +176,3 @@ def _of_records(source: Any, estimated: EstimatedForm, why_no_limit: str) -> Exp
     sets = max(1, min(MOST_SETS, SET_SAMPLES // source.sampling.length))
     records = [source.dataset(replicate).record for replicate in range(sets)]
     return accuracy_of_records(estimated, source.system, records, source.noise, why_no_limit)
-
-
-def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
-    """Variances that the parameters of submodels approach on long records, by place of data cell and estimator.
-
-    The limit is taken whatever the number of samples of the cell: short records do not reach it.
-    """
-    found: dict[tuple[int, int], dict[str, float]] = {}
-    # Cells that differ in the number of samples or the seed have the same limit.
-    known: dict[str, dict[str, float]] = {}
-    for (k, cell), (j, part) in itertools.product(enumerate(plan.data_cells), enumerate(plan.estimators)):
-        sampling = {key: value for key, value in (cell.content.get("sampling") or {}).items() if key != "samples"}
-        content = {key: value for key, value in cell.content.items() if key != "seed"} | {"sampling": sampling}
-        same = content_hash([content, part.content])
-        if same not in known:
-            known[same] = _limit(cell.source, part.estimator, plan.terms)
-        if known[same]:
-            found[k, j] = known[same]
-    return found
-
-
-def _limit(source: Any, estimator: Any, terms: tuple[Term, ...] | None) -> dict[str, float]:
-    if not isinstance(source, SimulatedSource) or not isinstance(source.sampling, RegularSampling):
-        return {}
-    try:
-        expected = expected_accuracy(replace(source, sampling=replace(source.sampling, samples=LONG)), estimator, terms)
-    except DataError:
-        return {}
-    variances = (LONG * expected.parameters.covariance).diagonal()
-    return dict(zip(expected.parameters.names, variances.tolist(), strict=True)) if expected.limit else {}

@@ -1,0 +1,86 @@
+"""Variances that theory gives the estimates of a plan."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+from ctid_cli.canonical import content_hash
+from ctid_cli.errors import CtidError, DataError
+from ctid_cli.models.additive import Term
+from ctid_cli.running.plan import Plan, build_plan
+from ctid_cli.signals.sampling import RegularSampling
+from ctid_cli.simulation.dataset import SimulatedSource
+from ctid_cli.simulation.expected_accuracy import LONG, expected_accuracy
+from ctid_cli.specification.load import spec_from_canonical
+from ctid_cli.storage.manifest import true_values
+
+
+def readable_plan(settings: Mapping[str, Any]) -> Plan | None:
+    """Return the plan of stored results, unless it names code, which is not run to read, or is of another version."""
+    try:
+        # Custom measures are stored, and no part of the theory.
+        return build_plan(spec_from_canonical({**settings, "measures": None}))
+    except (CtidError, ValueError):
+        return None
+
+
+# Tables, sentences and figures of one page ask for the same; theory for coloured noise takes a second.
+@lru_cache(maxsize=1024)
+def least_variances(plan: Plan, cell: int, estimator: int) -> dict[str, float]:
+    """Return the variances of the parameters by theory, under their true names; empty without a theory."""
+    source = plan.data_cells[cell].source
+    if not isinstance(source, SimulatedSource):
+        return {}
+    try:
+        expected = expected_accuracy(source, plan.estimators[estimator].estimator, plan.terms).parameters
+    except DataError:
+        return {}
+    names = _true_names(expected.names, true_values({"content": plan.data_cells[cell].content}))
+    return {name: v for name, v in zip(names, expected.covariance.diagonal().tolist(), strict=True) if name is not None}
+
+
+def _true_names(estimated: Sequence[str], true: Iterable[str]) -> list[str | None]:
+    """Return the names that parameters have in the true system, None of those that it lacks.
+
+    Where the estimated numerator is longer than the true one, coefficients go together by their power.
+    """
+    true = list(true)
+    shift = sum(re.fullmatch(r"b\d+", name) is not None for name in estimated)
+    shift -= sum(re.fullmatch(r"b\d+", name) is not None for name in true)
+    moved = (f"b{int(name[1:]) - shift}" if re.fullmatch(r"b\d+", name) else name for name in estimated)
+    return [name if name in true else None for name in moved]
+
+
+def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
+    """Return N times the variances of parameters of submodels on long records, by place of data cell and estimator.
+
+    The limit is taken whatever the number of samples of the cell: short records do not reach it.
+    """
+    found: dict[tuple[int, int], dict[str, float]] = {}
+    # Cells that differ in the number of samples or the seed have the same limit.
+    known: dict[str, dict[str, float]] = {}
+    for (k, cell), (j, part) in itertools.product(enumerate(plan.data_cells), enumerate(plan.estimators)):
+        sampling = {key: value for key, value in (cell.content.get("sampling") or {}).items() if key != "samples"}
+        content = {key: value for key, value in cell.content.items() if key != "seed"} | {"sampling": sampling}
+        same = content_hash([content, part.content])
+        if same not in known:
+            known[same] = _limit(cell.source, part.estimator, plan.terms)
+        if known[same]:
+            found[k, j] = known[same]
+    return found
+
+
+def _limit(source: Any, estimator: Any, terms: tuple[Term, ...] | None) -> dict[str, float]:
+    if not isinstance(source, SimulatedSource) or not isinstance(source.sampling, RegularSampling):
+        return {}
+    try:
+        expected = expected_accuracy(replace(source, sampling=replace(source.sampling, samples=LONG)), estimator, terms)
+    except DataError:
+        return {}
+    variances = (LONG * expected.parameters.covariance).diagonal()
+    return dict(zip(expected.parameters.names, variances.tolist(), strict=True)) if expected.limit else {}

@@ -1,0 +1,125 @@
+"""Estimates by data cell, estimator and start, and the errors of their parameters, as tidy tables.
+
+Every estimate with a value for each parameter of the system counts, whether its iterations converged or not. An
+estimate that failed, or cannot be written in these parameters, has no error.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.inference import monte_carlo
+from ctid_cli.storage.estimates import Estimates
+from ctid_cli.storage.manifest import Manifest, true_values
+from ctid_cli.storage.truth import Found
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Columns of errors of parameters.
+COLUMNS = ("group", "parameter", "replicate", "true", "value", "standard_error", "quantile")
+
+
+def planned_groups(manifest: Manifest) -> pd.DataFrame:
+    """Return what is planned: the places of data cell and estimator in the plan, and the start; numbered from 0."""
+    import pandas as pd
+
+    cells, estimators = (range(len(manifest[part])) for part in ("data_cells", "estimators"))
+    rows = [
+        (cell, estimator, start)
+        for cell, estimator in itertools.product(cells, estimators)
+        for start in manifest["estimators"][estimator]["starts"]
+    ]
+    return pd.DataFrame(rows, columns=["cell", "estimator", "start"])
+
+
+def group_numbers(stored: Estimates) -> IndexArray:
+    """Return the number of the planned group that each estimate is in, shape (n,)."""
+    manifest = stored.manifest
+    groups = planned_groups(manifest).itertuples(index=False, name=None)
+    numbers = {group: number for number, group in enumerate(groups)}
+    cells = {cell["hash"]: k for k, cell in enumerate(manifest["data_cells"])}
+    estimators = {(part["hash"], part["name"]): k for k, part in enumerate(manifest["estimators"])}
+    starts, found = stored.column("start"), np.empty(len(stored), dtype=int)
+    for block in stored.blocks:
+        own = slice(block.first, block.last)
+        labels, places = np.unique(starts[own], return_inverse=True)
+        at = cells[block.cell["hash"]], estimators[block.hash, block.estimator["name"]]
+        found[own] = np.array([numbers[(*at, label.decode())] for label in labels.tolist()])[places]
+    return found
+
+
+def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
+    """Return a row for each parameter of each estimate of a simulated system, from the numbers of their groups.
+
+    Columns: ``group``, ``parameter``, ``replicate``; ``true``; ``value``: estimate minus true value, NaN where the
+    estimate does not count; its ``standard_error``, NaN where there is none; ``quantile``, standard errors to each side
+    of the 95 % interval [-]. A delay that is no estimate, always the same and without an error, has no rows.
+    """
+    import pandas as pd
+
+    groups = planned_groups(stored.manifest)
+    truths = [true_values(cell) for cell in stored.manifest["data_cells"]]
+    members = {number: stored.chosen(numbers == number) for number in np.unique(numbers).tolist()}
+    cells = groups["cell"].to_dict()
+    found = {number: rows.found(tuple(truths[cells[number]])) for number, rows in members.items()}
+    parts, given = [], _given_delays(groups, truths, found)
+    for number, (values, errors, quantiles) in found.items():
+        truth = truths[cells[number]]
+        kept = np.array([name != "delay" or groups["estimator"][number] not in given for name in truth], dtype=bool)
+        names, true = np.array([*truth], dtype=object)[kept], np.array([*truth.values()])[kept]
+        values, errors, quantiles = values[:, kept], errors[:, kept], quantiles[:, kept]
+        values[~monte_carlo.complete(values)] = np.nan
+        # Results of before quantiles were stored, and estimators that give none.
+        quantiles = np.where(np.isnan(quantiles), monte_carlo.QUANTILE, quantiles)
+        replicates = members[number].column("replicate")
+        parts.append(errors_of_group(number, replicates, names, true, values, errors, quantiles))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=COLUMNS)
+
+
+def errors_of_group(
+    number: int,
+    replicates: IndexArray,
+    names: Sequence[str],
+    true: Array,
+    values: Array,
+    errors: Array | None = None,
+    quantiles: Array | None = None,
+) -> pd.DataFrame:
+    """Return the rows of one group, from values, standard errors and quantiles, each shape (n, p)."""
+    import pandas as pd
+
+    n, p = values.shape
+    none, expected = np.full_like(values, np.nan), np.repeat(true, n)
+    columns = (
+        np.full(n * p, number),
+        np.repeat(np.asarray(names, dtype=object), n),
+        np.tile(replicates, p),
+        expected,
+        values.T.ravel() - expected,
+        (none if errors is None else errors).T.ravel(),
+        (none if quantiles is None else quantiles).T.ravel(),
+    )
+    return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)))
+
+
+def _given_delays(groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]) -> set[int]:
+    """Return the places of the estimators whose delay is no estimate."""
+    delays: dict[int, list[Array]] = {}
+    for number, (values, errors, _) in found.items():
+        cell, estimator = groups.iloc[number, :2].tolist()
+        if "delay" in truths[cell]:
+            k = list(truths[cell]).index("delay")
+            delays.setdefault(estimator, []).append(np.array([values[:, k], errors[:, k]]))
+    given = set()
+    for estimator, parts in delays.items():
+        values, errors = np.hstack(parts)
+        known = values[np.isfinite(values)]
+        if np.isnan(errors).all() and (known == known[:1]).all():
+            given.add(estimator)
+    return given
