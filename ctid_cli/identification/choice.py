@@ -1,0 +1,91 @@
+"""What is chosen of a model and of the treatment of its records where nothing is given, and why."""
+
+from dataclasses import dataclass, field
+
+from ctid_cli.estimation.common import Fixed
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification.candidates import MOST_POLES, Span
+from ctid_cli.identification.criterion import Ranking
+from ctid_cli.inference.response_test import AnswerTest
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+
+
+@dataclass(frozen=True)
+class Given:
+    """What of a model and of the treatment of its records is given; what is None is chosen.
+
+    Parameters
+    ----------
+    poles, zeros : int or tuple of int, optional
+        Number, or least and greatest number, of poles (integrators not among them) and zeros.
+    integrators : int, optional
+        Poles at the origin; chosen among 0 and 1, and 0 where a number of poles is given.
+    delay_bounds : tuple of float, optional
+        Least and greatest delay [s]; two equal numbers are a known delay.
+    initial_state : {"rest", "estimate", "periodic"}, optional
+        State before the record.
+    offset : {"none", "remove", "estimate", "drift"}, optional
+        Offset of the output.
+    input_before : float or "first", optional
+        Input before the first sample of a record that begins at rest [input unit].
+    hold : {"auto", "zoh", "foh", "band-limited"}, default "auto"
+        The input between its samples.
+    loss : {"squares", "huber", "tukey"}, default "squares"
+        What output errors count in the fit; the choice is made with their squares.
+    fixed : tuple of Fixed, optional
+        Known parameters of the fit.
+    """
+
+    poles: int | tuple[int, int] | None = None
+    zeros: int | tuple[int, int] | None = None
+    integrators: int | None = None
+    delay_bounds: tuple[float, float] | None = None
+    initial_state: InitialState | None = None
+    offset: Offset | None = None
+    input_before: InputBefore = None
+    hold: AskedHold = "auto"
+    loss: LossKind = "squares"
+    fixed: tuple[Fixed, ...] | None = None
+
+    @property
+    def span(self) -> Span:
+        """Structures that are admitted."""
+        poles, zeros = (
+            (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
+        )
+        none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
+        free = (0,) if none else (0, 1)
+        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to choose."""
+        return isinstance(self.poles, int) and isinstance(self.zeros, int) and self.hold != "auto" and not any(
+            each is None for each in (self.delay_bounds, self.initial_state, self.offset)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A structure and a treatment, and the candidates that they were chosen from.
+
+    Parameters
+    ----------
+    options : DelayProfile
+        What is to be fitted.
+    records : tuple of Record
+        The records with the hold that was chosen.
+    ranking : Ranking
+        All structures of the grid, the best first.
+    answer : AnswerTest
+        Whether a response of the outputs to the inputs is seen at all.
+    sentences : tuple of str
+        One for each choice, with its criterion and that of the runner-up.
+    """
+
+    options: DelayProfile
+    records: tuple[Record, ...] = field(repr=False)
+    ranking: Ranking = field(repr=False)
+    answer: AnswerTest
+    sentences: tuple[str, ...]

@@ -1,0 +1,183 @@
+"""The choice of delay range, treatment, hold and structure, in this order, by one criterion.
+
+Range, treatment and hold are chosen with a few small structures; then the grid of structures is fitted once. Where an
+estimated state is compared with rest, all candidates are fitted to the samples after the greatest delay, which are all
+that an unknown input before the record leaves to an estimated state.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification import sentences
+from ctid_cli.identification.candidates import Setting, grid, small_models, with_hold
+from ctid_cli.identification.choice import Choice, Given
+from ctid_cli.identification.criterion import Candidate, Ranking, ranked
+from ctid_cli.identification.parts import FEW, MANY, parts_of
+from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
+from ctid_cli.inference.input_response import analyse_response
+from ctid_cli.inference.response_test import response_test
+from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, InputBefore
+
+#: Greatest delay that is tried unless the record shows a later response, as shares of the record.
+LATEST, LATER = 0.1, 0.5
+#: The range of the delay reaches so many times beyond that of a small model, and so many samples further: the delay of
+#: a model with too few poles is too long.
+REACH, FURTHER = 1.5, 3
+#: A delay beyond this share of the range is at its end.
+AT_END = 0.9
+
+
+def choose(records: Record | Sequence[Record], given: Given | None = None) -> Choice:
+    """Choose what is not given of the structure of a model and of the treatment of its records.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        One for each experiment.
+    given : Given, optional
+        What is given; by default nothing.
+
+    Returns
+    -------
+    Choice
+        The options to fit, the candidates, and a sentence for each choice.
+
+    Raises
+    ------
+    DataError
+        If a record cannot be used.
+    OptionError
+        If what is given does not go together.
+    """
+    several = [records] if isinstance(records, Record) else list(records)
+    return _Choosing(several, given or Given()).choice()
+
+
+class _Choosing:
+    """The steps of a choice."""
+
+    def __init__(self, records: list[Record], given: Given) -> None:
+        self.records, self.given, self.span = records, given, given.span
+        whole = given.initial_state == "periodic"
+        self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
+        self.many, _ = (records, True) if whole else parts_of(records, MANY)
+        self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
+        self.said: list[str] = []
+
+    def choice(self) -> Choice:
+        """Return what is chosen."""
+        delays, latest = self._delays()
+        setting = self._offset(self._state(delays), delays)
+        setting = self._hold(setting, delays)
+        if not parts_of(self.records, MANY).from_start:
+            setting = setting._replace(initial_state="estimate", input_before=None)
+        ranking = grid(self.many, setting, self.span, delays)
+        while self.given.delay_bounds is None and ranking.best.fit.model.delay > AT_END * delays[1] and delays[1] < latest:
+            delays = 0.0, _rounded(min(2.0 * delays[1], latest))
+            ranking = grid(self.many, setting, self.span, delays)
+        best = ranking.best
+        options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
+        measured = best.options.prepare([with_hold(record, setting.hold) for record in self.many]).laid_out
+        answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
+        self.said += sentences.of_grid(ranking, delays, self.given)
+        held = tuple(with_hold(record, setting.hold) for record in self.records)
+        return Choice(options, held, ranking, answer, tuple(self.said))
+
+    # --- the steps -------------------------------------------------------------------------------------
+
+    def _delays(self) -> tuple[tuple[float, float], float]:
+        """Return the range of the delay, and how far it may be extended [s]."""
+        given = self.given.delay_bounds
+        if given is not None:
+            return given, given[1]
+        length = min(record.duration for record in self.few)
+        interval = max(float(np.median(np.diff(record.t))) for record in self.few)
+        hints = [analyse_response(record).delay for record in self.few]
+        seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
+        latest = min(max(LATEST * length, seen), LATER * length)
+        models = self._compared([self._setting(*state) for state in self._states(latest)], (0.0, latest))
+        reach = REACH * models.best.fit.model.delay + FURTHER * interval
+        return (0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), latest))), latest
+
+    def _state(self, delays: tuple[float, float]) -> Setting:
+        states = self._states(delays[1])
+        settings = [self._setting(*state) for state in states]
+        if len(settings) == 1:
+            unsure = states[0][0] == "rest" and self.given.initial_state is None
+            self.said += [sentences.rest_assumed(settings[0])] * unsure
+            return settings[0]
+        models, why = self._compared(settings, delays), ""
+        best = models.best
+        later = self._common(settings, delays)
+        if best.options.initial_state == "rest" and later is not self.few:
+            likely = beginning_is_likely(best, models.noise, self.few, delays[1])
+            if not likely:
+                best = next(each for each in models.candidates if each.options.initial_state == "estimate")
+        self.said.append(sentences.of_state(models, best, self.records))
+        return next(each for each in settings if _is(best, each))
+
+    def _offset(self, setting: Setting, delays: tuple[float, float]) -> Setting:
+        if self.given.offset is not None:
+            return setting
+        models = self._compared([setting, setting._replace(offset="none")], delays)
+        self.said.append(sentences.of_offset(models))
+        return setting._replace(offset=models.best.options.offset)
+
+    def _hold(self, setting: Setting, delays: tuple[float, float]) -> Setting:
+        holds = self._holds()
+        if len(holds) == 1:
+            return setting
+        models = self._compared([setting._replace(hold=hold) for hold in holds], delays)
+        self.said.append(sentences.of_hold(models))
+        return setting._replace(hold=models.best.hold)
+
+    # --- what they share -------------------------------------------------------------------------------
+
+    def _setting(self, state: InitialState, before: InputBefore) -> Setting:
+        return Setting(self.first_hold, state, before, self.given.offset or "estimate")
+
+    def _states(self, latest: float) -> list[State]:
+        if not self.from_start:
+            return [("estimate", None)]
+        found = states_of(self.few, self.given)
+        determined = excited_after(self.few, latest)
+        return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
+
+    def _holds(self) -> list[Hold]:
+        """Return the holds to compare: an input that jumps between levels shows that it is held."""
+        if self.given.hold != "auto" or {input_moves(record).kind for record in self.records} != {"continuous"}:
+            return [self.first_hold]
+        if not all(np.array_equal(record.input.t, record.t) for record in self.records):
+            return [self.records[0].input.hold]
+        regular = all(record.interval is not None for record in self.few)
+        return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
+
+    def _common(self, settings: Sequence[Setting], delays: tuple[float, float]) -> list[Record]:
+        """Return the records with the samples that all settings can use."""
+        if all(setting.initial_state != "estimate" for setting in settings):
+            return self.few
+        return without_beginning(self.few, delays[1])
+
+    def _compared(self, settings: Sequence[Setting], delays: tuple[float, float]) -> Ranking:
+        found = small_models(self._common(settings, delays), settings, self.span, delays)
+        if not found:
+            raise DataError(f"{self.records[0].name}: there are too few samples for any model")
+        return ranked(found)
+
+
+def _is(candidate: Candidate, setting: Setting) -> bool:
+    options = candidate.options
+    return (options.initial_state, options.input_before) == (setting.initial_state, setting.input_before)
+
+
+def _rounded(delay: float) -> float:
+    """Return a delay with three digits, so that it is the same when it is typed."""
+    return float(f"{delay:.3g}")
