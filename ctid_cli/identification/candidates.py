@@ -1,7 +1,7 @@
 """Fits of many structures to the same records, each found from the smaller ones that it contains."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from ctid_cli.errors import DataError
@@ -49,11 +49,11 @@ class Span(NamedTuple):
             for zeros in range(self.zeros[0], min(self.zeros[1], order - int(delay_free)) + 1):
                 yield poles, zeros
 
-    def few(self, integrators: int, delay_free: bool) -> list[tuple[int, int]]:
+    def small(self, integrators: int, delay_free: bool, most: int) -> list[tuple[int, int]]:
         """Return the structures that settings of records are compared with: small ones, or else the smallest."""
         orders = range(1, MOST_POLES + max(self.integrators) + 1)
         found = [(n, each) for n in orders for each in self.structures(n, integrators, delay_free)]
-        small = [each for n, each in found if (n, each[1]) in SMALL]
+        small = [each for n, each in found if (n, each[1]) in SMALL[:most]]
         return small or [each for _, each in found[:1]]
 
 
@@ -72,12 +72,18 @@ class Structures:
     options: DelayProfile
     measured: MeasuredRecords
     search: StructureSearch
+    found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, records: Sequence[Record], setting: Setting, integrators: int, delays: tuple[float, float]
+        cls,
+        records: Sequence[Record],
+        setting: Setting,
+        integrators: int,
+        delays: tuple[float, float],
+        near: "Structures | None" = None,
     ) -> "Structures":
-        """Lay records out."""
+        """Lay records out; searches start from what another setting near this one has led to, if any."""
         hold, state, before, offset = setting
         least = int(not integrators)
         options = DelayProfile(
@@ -87,29 +93,48 @@ class Structures:
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
         box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
-        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK))
+        pilot = None if near is None else near.search
+        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK, pilot=pilot))
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
+        if (poles, zeros) in self.found:
+            return self.found[poles, zeros]
         options, measured, free = replace(self.options, poles=poles, zeros=zeros), self.measured, self.search.box.delay_free
         structure = Structure(options.order, zeros, delay=free)
         size = structure.size - options.integrators + measured.layout_of(options.order, free).own * len(self.records)
         if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
             return None
         found = fitted(measured.with_structure(structure), best_of_orders(self.search, poles, zeros), None, None)
-        return Candidate(options, self.hold, found, size)
+        self.found[poles, zeros] = Candidate(options, self.hold, found, size)
+        return self.found[poles, zeros]
 
 
-def small_models(
-    records: Sequence[Record], settings: Iterable[Setting], span: Span, delays: tuple[float, float]
-) -> list[Candidate]:
-    """Fit a few structures in several settings of the records."""
-    found = []
-    for setting in settings:
-        for integrators in span.integrators:
-            structures = Structures.of(records, setting, integrators, delays)
-            found += [structures.fit(*each) for each in span.few(integrators, structures.search.box.delay_free)]
-    return [each for each in found if each is not None]
+class SmallModels:
+    """A few structures in several settings of the same records."""
+
+    def __init__(self, records: Sequence[Record], span: Span, delays: tuple[float, float], most: int) -> None:
+        self.records, self.span, self.delays, self.most = records, span, delays, most
+        self._structures: dict[tuple[Setting, int], Structures] = {}
+
+    def compared(self, settings: Sequence[Setting], near: Setting | None = None) -> Ranking:
+        """Rank the structures in some settings, which all use the same samples."""
+        found = [each for setting in settings for each in self._fitted(setting, near)]
+        if not found:
+            raise DataError(f"{self.records[0].name}: there are too few samples for a model")
+        return ranked(found)
+
+    def _fitted(self, setting: Setting, near: Setting | None) -> Iterator[Candidate]:
+        for integrators in self.span.integrators:
+            key = setting, integrators
+            if key not in self._structures:
+                pilot = None if near is None else self._structures[near, integrators]
+                self._structures[key] = Structures.of(self.records, *key, self.delays, pilot)
+            structures = self._structures[key]
+            for each in self.span.small(integrators, structures.search.box.delay_free, self.most):
+                candidate = structures.fit(*each)
+                if candidate is not None:
+                    yield candidate
 
 
 def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:

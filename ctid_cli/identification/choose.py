@@ -5,18 +5,16 @@ estimated state is compared with rest, all candidates are fitted to the samples 
 that an unknown input before the record leaves to an estimated state.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import get_args
 
 import numpy as np
 
-from ctid_cli.errors import DataError
-from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import Setting, grid, small_models, with_hold
+from ctid_cli.identification.candidates import Setting, SmallModels, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Candidate, Ranking, ranked
+from ctid_cli.identification.criterion import Candidate, Ranking
 from ctid_cli.identification.parts import FEW, MANY, parts_of
 from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
 from ctid_cli.inference.input_response import analyse_response
@@ -68,17 +66,14 @@ class _Choosing:
         self.records, self.given, self.span = records, given, given.span
         whole = given.initial_state == "periodic"
         self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
-        self.many, _ = (records, True) if whole else parts_of(records, MANY)
+        self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
         self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
         self.said: list[str] = []
 
     def choice(self) -> Choice:
         """Return what is chosen."""
         delays, latest = self._delays()
-        setting = self._offset(self._state(delays), delays)
-        setting = self._hold(setting, delays)
-        if not parts_of(self.records, MANY).from_start:
-            setting = setting._replace(initial_state="estimate", input_before=None)
+        setting = self._setting(delays)
         ranking = grid(self.many, setting, self.span, delays)
         while self.given.delay_bounds is None and ranking.best.fit.model.delay > AT_END * delays[1] and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
@@ -103,46 +98,50 @@ class _Choosing:
         hints = [analyse_response(record).delay for record in self.few]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
         latest = min(max(LATEST * length, seen), LATER * length)
-        models = self._compared([self._setting(*state) for state in self._states(latest)], (0.0, latest))
+        settings = self._settings(latest)
+        span = self.span._replace(integrators=self.span.integrators[:1])
+        models = SmallModels(self._common(settings, latest), span, (0.0, latest), most=2).compared(settings)
         reach = REACH * models.best.fit.model.delay + FURTHER * interval
         return (0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), latest))), latest
 
-    def _state(self, delays: tuple[float, float]) -> Setting:
-        states = self._states(delays[1])
-        settings = [self._setting(*state) for state in states]
-        if len(settings) == 1:
-            unsure = states[0][0] == "rest" and self.given.initial_state is None
-            self.said += [sentences.rest_assumed(settings[0])] * unsure
-            return settings[0]
-        models, why = self._compared(settings, delays), ""
+    def _setting(self, delays: tuple[float, float]) -> Setting:
+        """Return state, offset and hold."""
+        settings, offset, holds = self._settings(delays[1]), self.given.offset, self._holds()
+        common = self._common(settings, delays[1])
+        models = SmallModels(common, self.span, delays, most=3)
+        setting = settings[0]
+        if len(settings) > 1:
+            setting = self._state(models.compared(settings), settings, common, delays[1])
+        elif self.given.initial_state is None:
+            self.said.append(sentences.rest_assumed(setting) if self.from_start else sentences.STATE_OF_PART)
+        if offset is None:
+            compared = models.compared([setting, setting._replace(offset="none")], setting)
+            self.said.append(sentences.of_offset(compared))
+            setting = setting._replace(offset=compared.best.options.offset)
+        if len(holds) > 1:
+            compared = models.compared([setting._replace(hold=hold) for hold in holds], setting)
+            self.said.append(sentences.of_hold(compared))
+            setting = setting._replace(hold=compared.best.hold)
+        return setting if self.all_from_start else setting._replace(initial_state="estimate", input_before=None)
+
+    def _state(
+        self, models: Ranking, settings: Sequence[Setting], common: Sequence[Record], length: float
+    ) -> Setting:
         best = models.best
-        later = self._common(settings, delays)
-        if best.options.initial_state == "rest" and later is not self.few:
-            likely = beginning_is_likely(best, models.noise, self.few, delays[1])
-            if not likely:
+        if best.options.initial_state == "rest" and common is not self.few:
+            if not beginning_is_likely(best, models.noise, self.few, length):
                 best = next(each for each in models.candidates if each.options.initial_state == "estimate")
-        self.said.append(sentences.of_state(models, best, self.records))
+        self.said.append(sentences.of_state(models, best))
         return next(each for each in settings if _is(best, each))
 
-    def _offset(self, setting: Setting, delays: tuple[float, float]) -> Setting:
-        if self.given.offset is not None:
-            return setting
-        models = self._compared([setting, setting._replace(offset="none")], delays)
-        self.said.append(sentences.of_offset(models))
-        return setting._replace(offset=models.best.options.offset)
+    # --- what there is to compare ----------------------------------------------------------------------
 
-    def _hold(self, setting: Setting, delays: tuple[float, float]) -> Setting:
-        holds = self._holds()
-        if len(holds) == 1:
-            return setting
-        models = self._compared([setting._replace(hold=hold) for hold in holds], delays)
-        self.said.append(sentences.of_hold(models))
-        return setting._replace(hold=models.best.hold)
-
-    # --- what they share -------------------------------------------------------------------------------
-
-    def _setting(self, state: InitialState, before: InputBefore) -> Setting:
-        return Setting(self.first_hold, state, before, self.given.offset or "estimate")
+    def _settings(self, latest: float) -> list[Setting]:
+        """Return the states that can be compared, with an offset."""
+        return [
+            Setting(self.first_hold, state, before, self.given.offset or "estimate")
+            for state, before in self._states(latest)
+        ]
 
     def _states(self, latest: float) -> list[State]:
         if not self.from_start:
@@ -160,17 +159,11 @@ class _Choosing:
         regular = all(record.interval is not None for record in self.few)
         return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
 
-    def _common(self, settings: Sequence[Setting], delays: tuple[float, float]) -> list[Record]:
+    def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
         """Return the records with the samples that all settings can use."""
         if all(setting.initial_state != "estimate" for setting in settings):
             return self.few
-        return without_beginning(self.few, delays[1])
-
-    def _compared(self, settings: Sequence[Setting], delays: tuple[float, float]) -> Ranking:
-        found = small_models(self._common(settings, delays), settings, self.span, delays)
-        if not found:
-            raise DataError(f"{self.records[0].name}: there are too few samples for any model")
-        return ranked(found)
+        return without_beginning(self.few, latest)
 
 
 def _is(candidate: Candidate, setting: Setting) -> bool:

@@ -1,12 +1,14 @@
 """What is said of each choice: the criterion against the runner-up."""
 
-from collections.abc import Sequence
-
 from ctid_cli.identification.candidates import Setting
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
-from ctid_cli.signals.record import Record
 from ctid_cli.text import count
+
+#: What is said where the beginning of a record is not looked at.
+STATE_OF_PART = (
+    "State before the record: estimated (--initial-state estimate); of a record this long the first samples hardly count."
+)
 
 
 def spelled(candidate: Candidate) -> str:
@@ -26,7 +28,7 @@ def rest_assumed(setting: Setting) -> str:
     )
 
 
-def of_state(models: Ranking, best: Candidate, records: Sequence[Record]) -> str:
+def of_state(models: Ranking, best: Candidate) -> str:
     """Return the state, and by how much it is better than another."""
     if best is not models.best:
         return (
