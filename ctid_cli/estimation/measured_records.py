@@ -1,9 +1,10 @@
 r"""Measured records laid out for estimation: delay, initial state, offset, several experiments, and what is refused.
 
-.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + e_k
+.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + d (t_k-t_0) + e_k
 
 ``C/A`` applied to an impulse at the first used instant ``t_s`` spans every free response of A, so the n coefficients of
-C are the initial state, whatever happened before. C and the offset c belong to one experiment each, the rest is common.
+C are the initial state, whatever happened before. C, the offset c and the drift d belong to one experiment each, the
+rest is common.
 """
 
 from collections.abc import Sequence
@@ -46,7 +47,8 @@ class Layout:
     structure: Structure
     experiments: int = 1
     initial_state: bool = False
-    offset: bool = False
+    #: Terms of a trend of the output: none, a constant (its offset), or a constant and a slope (its drift).
+    offset: int = 0
     #: Poles at the origin: that many of the last coefficients of the denominator are zero.
     integrators: int = 0
 
@@ -67,7 +69,7 @@ class Layout:
         for k in range(self.experiments):
             tail = f"_{k + 1}" if self.experiments > 1 else ""
             names += [f"x{i}{tail}" for i in range(1, self.structure.poles + 1)] * self.initial_state
-            names += [f"offset{tail}"] * self.offset
+            names += [f"{name}{tail}" for name in ("offset", "drift")[: self.offset]]
         return tuple(names)
 
     def theta(self, model: TransferFunction) -> Array:
@@ -83,8 +85,8 @@ class Layout:
     def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
         """Initial state and offset of one experiment."""
         first = self.first(experiment)
-        own = theta[first : first + self.own]
-        return own[: self.structure.poles * self.initial_state], float(own[-1]) if self.offset else 0.0
+        state, trend = np.split(theta[first : first + self.own], [self.own - self.offset])
+        return state, float(trend[0]) if self.offset else 0.0
 
     def first(self, experiment: int) -> int:
         """Where the parameters of an experiment begin."""
@@ -107,7 +109,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     powers = np.linalg.inv(numerators(*sections))
     direct = b[0] if m == n else 0.0
     output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
-    columns = Columns.of(n, second=True, free=layout.initial_state, offset=layout.offset)
+    columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.offset)
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
@@ -129,8 +131,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
             alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
             driven_alone[:, :n] = -powers.T
             alone[:, first : first + n] = powers.T
-        if layout.offset:
-            wanted[-1, first + layout.own - 1] = 1.0
+        wanted[columns.trends, first + layout.own - layout.offset : first + layout.own] = np.eye(layout.offset)
         states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
         rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
@@ -182,7 +183,7 @@ class MeasuredRecords:
         self.treatment, self.known = treatment, known
         free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
         # The free response of an integrator is a constant.
-        offset = treatment.offset == "estimate" and not (free_state and integrators)
+        offset = {"estimate": 1, "drift": 2}.get(treatment.offset, 0) * (not (free_state and integrators))
         self.layout = Layout(structure, len(records), free_state, offset, integrators)
         for record in records:
             self._check_input(record)
@@ -269,7 +270,7 @@ class MeasuredRecords:
     @cached_property
     def centred(self) -> FilterData:
         """The first record without its means, for starts that know no offset and no initial state."""
-        if self.treatment.offset != "estimate":
+        if not self.layout.offset:
             return self.data[0]
         return self._lay_out(without_means(self.records[0])[0])
 
@@ -325,7 +326,7 @@ class MeasuredRecords:
         theta = layout.theta(found.model)
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
-            theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
+            theta[first : first + layout.own] = [*state, *found.trends[k]][: layout.own]
         return layout, theta
 
     def simulated(self, found: Optimum) -> list[Array]:

@@ -185,8 +185,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record: at rest (zero input before the first sample), estimated with the model, or the steady
         state of an input that repeats the record for ever.
-    offset : {"none", "remove", "estimate"}, default "none"
-        Constant offset of the output: none, means of input and output subtracted first, or estimated with the model.
+    offset : {"none", "remove", "estimate", "drift"}, default "none"
+        Constant offset of the output: none, means of input and output subtracted first, or estimated with the model;
+        ``drift`` estimates a slope besides [output unit/s], the offset being that at the first instant.
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
         (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.
@@ -259,6 +260,10 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         if self.integrators and self.offset == "remove":
             raise OptionError(
                 "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
+            )
+        if self.integrators and self.offset == "drift":
+            raise OptionError(
+                "offset", "offset drift is a slope, which the output of an integrating system has by itself; use estimate"
             )
         if self.integrators and self.initial_state == "periodic":
             raise OptionError(

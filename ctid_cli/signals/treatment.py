@@ -15,7 +15,7 @@ ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
 OutputHold = Literal["zoh", "foh"]
 #: The state of the system before the record.
 InitialState = Literal["rest", "estimate", "periodic"]
-#: A constant that the output has beside the answer to the input.
-Offset = Literal["none", "remove", "estimate"]
+#: A constant that the output has beside the response to the input; with a drift, a constant and a slope.
+Offset = Literal["none", "remove", "estimate", "drift"]
 #: What output errors count: their squares, or less where they are large.
 LossKind = Literal["squares", "huber", "tukey"]
