@@ -51,7 +51,7 @@ class StateOptions:
     """Treatment of the initial state and of offsets."""
 
     initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest"
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none"
+    offset: Annotated[Offset, typer.Option("--offset", help="Offset of the output (not input), or its drift.")] = "none"
 
 
 @dataclass(frozen=True)
@@ -217,6 +217,11 @@ def check_integrators(integrators: int, offset: Offset, instead: str = "--offset
             "--offset remove subtracts the mean of the output, which is no offset of a system that integrates; use "
             f"{instead} estimate"
         )
+    if integrators and offset == "drift":
+        raise UsageError(
+            "--offset drift is a slope of the output, which a system that integrates has by itself; use "
+            f"{instead} estimate"
+        )
 
 
 def _refuse_unable(asked: Asked) -> None:
@@ -230,8 +235,8 @@ def _refuse_unable(asked: Asked) -> None:
         )
     if asked.treatment.loss != "squares":
         raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
-    if asked.treatment.offset == "estimate":
-        raise UsageError(f"--offset estimate is not there for {what}; use --offset remove")
+    if asked.treatment.offset in ("estimate", "drift"):
+        raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
     if asked.loop and asked.treatment.hold not in ("auto", "zoh"):
         raise UsageError(
             f"--hold {asked.treatment.hold} does not go with --loop: a discrete controller holds its input (zoh)"

@@ -1,9 +1,10 @@
 r"""Measured records laid out for estimation: delay, initial state, offset, several experiments, and what is refused.
 
-.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + e_k
+.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + d (t_k-t_0) + e_k
 
 ``C/A`` applied to an impulse at the first used instant ``t_s`` spans every free response of A, so the n coefficients of
-C are the initial state, whatever happened before. C and the offset c belong to one experiment each, the rest is common.
+C are the initial state, whatever happened before. C, the offset c and the drift d belong to one experiment each, the
+rest is common.
 """
 
 from collections.abc import Sequence

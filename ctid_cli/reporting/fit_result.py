@@ -49,6 +49,7 @@ TREATMENTS = {
     "rest": "at rest before the record",
     "estimate": "estimated with the model",
     "periodic": "steady state of an input that repeats the record",
+    "drift": "constant and slope estimated with the model",
     "none": "none",
     "remove": "means of input and output subtracted",
 }
