@@ -89,3 +89,30 @@ class Choice:
     ranking: Ranking = field(repr=False)
     answer: AnswerTest
     sentences: tuple[str, ...]
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is a model: a response is seen, and the best candidate describes it."""
+        return self.answer.seen
+
+    @property
+    def why_none(self) -> str:
+        """Why there is none."""
+        evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
+        return (
+            "There is no model here: the output is not seen to answer to the input "
+            f"(p = {self.answer.p_value:.2g}).{evidence}"
+        )
+
+    def words(self) -> list[str]:
+        """Return the choice as the options of ``ctid fit``."""
+        options = self.options
+        found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
+        found += ["--integrators", f"{options.integrators}"] if options.integrators else []
+        low, high = options.delay_bounds
+        found += ["--delay", f"{low:g}:{high:g}" if low < high else f"{low:g}"]
+        found += ["--initial-state", options.initial_state, "--offset", options.offset]
+        if options.initial_state == "rest" and options.offset != "remove":
+            before = options.input_before
+            found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
+        return [*found, "--hold", self.records[0].input.hold]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
@@ -78,11 +79,14 @@ class Ranking:
 
 def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Return candidates by their criterion; all must have been fitted to the same samples."""
-    residuals = min(candidates, key=lambda each: each.fit.cost).fit.residuals
-    count = sum(block.size for block in residuals)
-    noise = fit_noise_model(residuals, penalty=float(np.log(count)))
+    noise = noise_of(min(candidates, key=lambda each: each.fit.cost).fit.residuals)
     judged = [replace(each, criterion=_criterion(each, noise)) for each in candidates]
     return Ranking(tuple(sorted(judged, key=lambda each: each.criterion)), noise)
+
+
+def noise_of(residuals: Sequence[Array]) -> NoiseModel:
+    """Return the autoregressive model of residuals that has the least BIC."""
+    return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 
 def _criterion(candidate: Candidate, noise: NoiseModel) -> float:

@@ -147,7 +147,9 @@ class StoredFit:
 
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None
-        fit, options, record = self.result.fit, self.result.options, self.validation.record
+        fit, record = self.result.fit, self.validation.record
+        own = self.result.validation
+        options = self.result.options if own is None or own.options is None else own.options
         laid_out = laid_out_validation(options, record)
         return {"record": record, "applied": options._applied(fit, laid_out)}
 

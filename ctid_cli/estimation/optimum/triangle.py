@@ -68,7 +68,7 @@ class Columns(NamedTuple):
 
     @property
     def powers(self) -> slice:
-        """Powers of the time since the first used sample."""
+        """Powers of the time since the first instant."""
         return slice(self.u + 2 + self.free, self.size)
 
 
@@ -84,7 +84,7 @@ def rows_of(
         if columns.free:
             rows[columns.free_states] = form.free(elapsed[done : done + len(forced)] - elapsed[0], second)
         for row, power in zip(rows[columns.powers], columns.trend, strict=True):
-            row[:] = (elapsed[done : done + len(forced)] - elapsed[0]) ** power if power else 1.0
+            row[:] = (elapsed[done : done + len(forced)] - data.t[0]) ** power if power else 1.0
         done += len(forced)
         yield rows
 
