@@ -259,9 +259,7 @@ class MeasuredRecords:
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
         layout, integrators = self.layout, self.treatment.integrators
-        return Problem(
-            data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators
-        )
+        return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
 
     def part(self) -> "MeasuredRecords | None":
         """The liveliest parts of long records, each from a state of its own; None where they tell too little."""

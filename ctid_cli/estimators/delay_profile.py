@@ -266,12 +266,18 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                 "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
             )
         if self.integrators and self.offset == "drift":
-            raise OptionError("offset", "offset drift goes without integrators, whose estimated offset is a drift; use estimate")
+            raise OptionError(
+                "offset", "offset drift goes without integrators, whose estimated offset is a drift; use estimate"
+            )
         if not (self.input_before in (None, "first") or np.isfinite(self.input_before)):
-            raise OptionError("input_before", f"input_before must be a finite number or first; got {self.input_before!r}")
+            raise OptionError(
+                "input_before", f"input_before must be a finite number or first; got {self.input_before!r}"
+            )
         if self.input_before is not None and (self.initial_state != "rest" or self.offset == "remove"):
             given = f"got initial_state {self.initial_state} and offset {self.offset}"
-            raise OptionError("input_before", f"input_before goes with initial_state rest and no removed means; {given}")
+            raise OptionError(
+                "input_before", f"input_before goes with initial_state rest and no removed means; {given}"
+            )
         if self.integrators and self.initial_state == "periodic":
             raise OptionError(
                 "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"

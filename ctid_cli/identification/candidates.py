@@ -100,7 +100,11 @@ class Structures:
         """Fit a structure; None where there are too few samples."""
         if (poles, zeros) in self.found:
             return self.found[poles, zeros]
-        options, measured, free = replace(self.options, poles=poles, zeros=zeros), self.measured, self.search.box.delay_free
+        options, measured, free = (
+            replace(self.options, poles=poles, zeros=zeros),
+            self.measured,
+            self.search.box.delay_free,
+        )
         structure = Structure(options.order, zeros, delay=free)
         size = structure.size - options.integrators + measured.layout_of(options.order, free).own * len(self.records)
         if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
@@ -154,5 +158,7 @@ def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[
         if order >= FEWEST_TRIED and found and order - ranked(found).best.options.order >= BEYOND:
             break
     if not found:
-        raise DataError("no structure of the range can be fitted: the record is too short for it, or it has no structure")
+        raise DataError(
+            "no structure of the range can be fitted: the record is too short for it, or it has no structure"
+        )
     return ranked(found)

@@ -61,8 +61,11 @@ class Given:
     @property
     def settled(self) -> bool:
         """Whether nothing is left to choose."""
-        return isinstance(self.poles, int) and isinstance(self.zeros, int) and self.hold != "auto" and not any(
-            each is None for each in (self.delay_bounds, self.initial_state, self.offset)
+        return (
+            isinstance(self.poles, int)
+            and isinstance(self.zeros, int)
+            and self.hold != "auto"
+            and not any(each is None for each in (self.delay_bounds, self.initial_state, self.offset))
         )
 
 
@@ -76,6 +79,8 @@ class Choice:
         What is to be fitted.
     records : tuple of Record
         The records with the hold that was chosen.
+    fitted : tuple of Record
+        The same, or parts of long ones, to which the candidates were fitted.
     ranking : Ranking
         All structures of the grid, the best first.
     answer : AnswerTest
@@ -86,6 +91,7 @@ class Choice:
 
     options: DelayProfile
     records: tuple[Record, ...] = field(repr=False)
+    fitted: tuple[Record, ...] = field(repr=False)
     ranking: Ranking = field(repr=False)
     answer: AnswerTest
     sentences: tuple[str, ...]

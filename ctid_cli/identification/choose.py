@@ -75,16 +75,19 @@ class _Choosing:
         delays, latest = self._delays()
         setting = self._setting(delays)
         ranking = grid(self.many, setting, self.span, delays)
-        while self.given.delay_bounds is None and ranking.best.fit.model.delay > AT_END * delays[1] and delays[1] < latest:
+        while (
+            self.given.delay_bounds is None and ranking.best.fit.model.delay > AT_END * delays[1] and delays[1] < latest
+        ):
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = grid(self.many, setting, self.span, delays)
         best = ranking.best
         options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
-        measured = best.options.prepare([with_hold(record, setting.hold) for record in self.many]).laid_out
+        fitted = tuple(with_hold(record, setting.hold) for record in self.many)
+        measured = best.options.prepare(fitted).laid_out
         answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
         self.said += sentences.of_grid(ranking, delays, self.given)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, ranking, answer, tuple(self.said))
+        return Choice(options, held, fitted, ranking, answer, tuple(self.said))
 
     # --- the steps -------------------------------------------------------------------------------------
 
@@ -124,9 +127,7 @@ class _Choosing:
             setting = setting._replace(hold=compared.best.hold)
         return setting if self.all_from_start else setting._replace(initial_state="estimate", input_before=None)
 
-    def _state(
-        self, models: Ranking, settings: Sequence[Setting], common: Sequence[Record], length: float
-    ) -> Setting:
+    def _state(self, models: Ranking, settings: Sequence[Setting], common: Sequence[Record], length: float) -> Setting:
         best = models.best
         if best.options.initial_state == "rest" and common is not self.few:
             if not beginning_is_likely(best, models.noise, self.few, length):

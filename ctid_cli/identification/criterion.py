@@ -10,13 +10,18 @@ A noise model for each candidate would not do: what too small a model misses is 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.inference.criteria import (
+    InformationCriteria,
+    information_criteria,
+    innovations_count,
+    squared_innovations,
+)
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.signals.treatment import Hold
 
@@ -41,6 +46,8 @@ class Candidate:
         Number of parameters, those of each record included.
     criterion : float
         The criterion; only differences between candidates mean anything.
+    criteria : InformationCriteria
+        AICc, BIC and FPE of the innovations.
     """
 
     options: DelayProfile
@@ -48,6 +55,7 @@ class Candidate:
     fit: MeasuredFit
     size: int
     criterion: float = float("nan")
+    criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
 
     @property
     def name(self) -> str:
@@ -80,8 +88,8 @@ class Ranking:
 def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Return candidates by their criterion; all must have been fitted to the same samples."""
     noise = noise_of(min(candidates, key=lambda each: each.fit.cost).fit.residuals)
-    judged = [replace(each, criterion=_criterion(each, noise)) for each in candidates]
-    return Ranking(tuple(sorted(judged, key=lambda each: each.criterion)), noise)
+    judged = sorted((_judged(each, noise) for each in candidates), key=lambda each: each.criterion)
+    return Ranking(tuple(judged), noise)
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:
@@ -89,13 +97,16 @@ def noise_of(residuals: Sequence[Array]) -> NoiseModel:
     return fit_noise_model(residuals, penalty=float(np.log(sum(block.size for block in residuals))))
 
 
-def _criterion(candidate: Candidate, noise: NoiseModel) -> float:
-    fit = candidate.fit
+def _judged(candidate: Candidate, noise: NoiseModel) -> Candidate:
+    fit, size = candidate.fit, candidate.size
     count = innovations_count(fit.residuals, noise)
     squared = squared_innovations(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities], noise)
-    return penalised(squared, count, candidate.size)
+    criteria = information_criteria(squared, count, size)
+    return replace(candidate, criterion=penalised(squared, count, size), criteria=criteria)
 
 
 def penalised(squared: float, count: int, parameters: int) -> float:
     """Return the criterion of squared innovations."""
-    return count * float(np.log(max(squared, np.finfo(float).tiny) / count)) + PENALTY * parameters * float(np.log(count))
+    return count * float(np.log(max(squared, np.finfo(float).tiny) / count)) + PENALTY * parameters * float(
+        np.log(count)
+    )

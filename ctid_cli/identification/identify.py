@@ -3,19 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from ctid_cli.errors import DataError
 from ctid_cli.estimators import identification
-from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.identification import Identification, Validation, laid_out_validation, validated
+from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_submodels import Options
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
-from ctid_cli.identification.criterion import noise_of, penalised
-from ctid_cli.identification.treatment import states_of
-from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.validation import judged_on, laid_out_for
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
 from ctid_cli.signals.record import Record
 
@@ -84,37 +79,10 @@ def identify(
     choice = choose(several, given)
     if given.poles is None and not choice.seen:
         raise DataError(f"{choice.why_none} Give the number of poles (--poles) to fit a model all the same.")
-    if validation is not None:
-        validation = with_hold(validation, choice.records[0].input.hold)
-        # Before the fit takes its time.
-        laid_out_validation(_own_of(choice.options, given, validation)[0], validation)
+    other = None if validation is None else with_hold(validation, choice.records[0].input.hold)
+    if other is not None:
+        # Refused before the fit takes its time.
+        laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
     found = replace(found, choices=choice.sentences)
-    return found if validation is None else replace(found, validation=_validated(found, given, validation))
-
-
-def _own_of(options: DelayProfile, given: Given, record: Record) -> list[DelayProfile]:
-    """Return what may be assumed of state and offset of another record."""
-    offsets = [given.offset] if given.offset is not None else ["estimate", "none"]
-    return [
-        replace(options, initial_state=state, input_before=before, offset=offset)
-        for state, before in states_of([record], given)
-        for offset in offsets
-    ]
-
-
-def _validated(found: Identification, given: Given, record: Record) -> Validation:
-    """Judge a model on a record with the state and offset that describe it best there."""
-    tried = _own_of(found.options, given, record)
-    laid_out = [laid_out_validation(options, record) for options in tried]
-    applied = [options._applied(found.fit, each) for options, each in zip(tried, laid_out, strict=True)]
-    common = np.logical_and.reduce([each.used[0] for each in applied])
-    left = [each.residuals[0][common[each.used[0]]] for each in applied]
-    noise = noise_of([min(left, key=lambda e: float(e @ e))])
-    sizes = [each.layout.own for each in laid_out]
-    scores = [
-        penalised(squared_innovations([e], [np.zeros((e.size, 0))], noise), innovations_count([e], noise), size)
-        for e, size in zip(left, sizes, strict=True)
-    ]
-    best = int(np.argmin(scores))
-    return replace(validated(applied[best], record), options=tried[best])
+    return found if other is None else replace(found, validation=judged_on(other, choice.options, found.fit, given))

@@ -6,9 +6,7 @@ from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
 from ctid_cli.text import count
 
 #: What is said where the beginning of a record is not looked at.
-STATE_OF_PART = (
-    "State before the record: estimated (--initial-state estimate); of a record this long the first samples hardly count."
-)
+STATE_OF_PART = "State before the record: estimated (--initial-state estimate); of a record this long the first samples hardly count."
 
 
 def spelled(candidate: Candidate) -> str:

@@ -33,7 +33,8 @@ def states_of(records: Sequence[Record], given: Given) -> list[State]:
     if state is not None and state != "rest":
         return [(state, None)]
     if given.offset == "remove":
-        return [("rest", None)] + [("estimate", None)] * (state is None)
+        both: list[State] = [("rest", None), ("estimate", None)]
+        return both if state is None else both[:1]
     first = [float(record.input.values[0]) for record in records]
     varies = all(np.ptp(record.input.values) > 0.0 for record in records)
     levels: list[InputBefore] = ["first"] if before is None else [before]

@@ -126,9 +126,7 @@ def autoregress(columns: Array, coefficients: Array) -> None:
                 columns[t, j] -= coefficients[i] * columns[t - i, j]
 
 
-def fit_noise_model(
-    blocks: Sequence[Array], max_order: int | None = None, penalty: float = 2.0
-) -> NoiseModel:
+def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None, penalty: float = 2.0) -> NoiseModel:
     """Yule-Walker model of the noise, of the order that Akaike's criterion chooses, or that with another penalty.
 
     The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero; no product reaches from one experiment

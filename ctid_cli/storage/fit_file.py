@@ -186,7 +186,7 @@ def load_fit(
     >>> from ctid_cli import DelayProfile, Record, identify, load_fit, save_fit
     >>> t = 0.1 * np.arange(200)
     >>> record = Record.from_arrays(t, np.sign(np.sin(t)), np.sin(t) + 0.1 * np.cos(9 * t))
-    >>> fit = identify(DelayProfile(poles=1, zeros=0, delay_bounds=(0, 2)), [record])
+    >>> fit = identify([record], DelayProfile(poles=1, zeros=0, delay_bounds=(0, 2)))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     save_fit(fit, f"{folder}/fit.json")
     ...     again = load_fit(f"{folder}/fit.json")

@@ -34,7 +34,9 @@ def numerator_of(size, known):
 def test_projection_with_known_numerators_is_that_of_dense_matrices(zeros, known, treatment):
     free_response, offset = treatment
     record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3)
-    problem = Problem((filter_data(record),), zeros, free_response, (0,) * offset, (0.0,), numerator_of(zeros + 1, known))
+    problem = Problem(
+        (filter_data(record),), zeros, free_response, (0,) * offset, (0.0,), numerator_of(zeros + 1, known)
+    )
     delay = Delay(0.0 if zeros == 3 else 0.37, -1)
     shared, own = columns_of(record, DENOMINATOR, zeros, delay.seconds, free_response, offset)
     given = sum(value * shared[:, k] for k, value in known.items())

@@ -46,7 +46,9 @@ def test_projection_is_that_of_dense_matrices(case, treatment, zeros, delay):
     record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3, **case)
     problem = problem_of(record, zeros, **treatment)
     found = project(problem, SPEED, DAMPING, Delay(delay, -1)).squared_error
-    dense = squared_error(record, DENOMINATOR, zeros, delay, problem.free_response, bool(problem.trend), problem.periods[0])
+    dense = squared_error(
+        record, DENOMINATOR, zeros, delay, problem.free_response, bool(problem.trend), problem.periods[0]
+    )
     np.testing.assert_allclose(found, dense, rtol=1e-8)
 
 
