@@ -238,8 +238,8 @@ class MeasuredRecords:
             return
         if low < high or self.treatment.initial_state != "estimate":
             raise DataError(
-                f"{named(record)}the input is constant ({first:g}) over the whole record; if the record begins with its "
-                "step, give another level of the input before it: input_before (--input-before VALUE)"
+                f"{named(record)}the input is constant ({first:g}) over the whole record; if the record begins with "
+                "its step, give the level of the input before it: input_before (--input-before VALUE)"
             )
 
     def _lay_out(self, record: Record) -> FilterData:

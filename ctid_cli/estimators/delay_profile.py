@@ -186,8 +186,8 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         State before the record: at rest (zero input before the first sample), estimated with the model, or the steady
         state of an input that repeats the record for ever.
     offset : {"none", "remove", "estimate", "drift"}, default "none"
-        Offset of the output: none, means of input and output subtracted first, a constant estimated with the model, or a
-        constant and a slope estimated with it.
+        Offset of the output: none, means of input and output subtracted first, or a constant estimated with the model;
+        ``drift`` estimates a slope besides [output unit/s], the offset being that at the first instant.
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
         (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.

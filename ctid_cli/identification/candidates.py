@@ -42,6 +42,12 @@ class Span(NamedTuple):
     zeros: tuple[int, int] = (0, MOST_POLES)
     integrators: tuple[int, ...] = (0, 1)
 
+    @classmethod
+    def only(cls, options: DelayProfile) -> "Span":
+        """Return the span of one structure."""
+        poles, zeros = options.poles, options.zeros
+        return cls((poles, poles), (zeros, zeros), (options.integrators,))
+
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
         """Yield poles and zeros of all structures with so many poles in all."""
         poles = order - integrators
@@ -117,7 +123,9 @@ class Structures:
 class SmallModels:
     """A few structures in several settings of the same records."""
 
-    def __init__(self, records: Sequence[Record], span: Span, delays: tuple[float, float], most: int) -> None:
+    def __init__(
+        self, records: Sequence[Record], span: Span, delays: tuple[float, float], most: int = len(SMALL)
+    ) -> None:
         self.records, self.span, self.delays, self.most = records, span, delays, most
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
@@ -132,7 +140,7 @@ class SmallModels:
         for integrators in self.span.integrators:
             key = setting, integrators
             if key not in self._structures:
-                pilot = None if near is None else self._structures[near, integrators]
+                pilot = None if near is None else self._structures.get((near, integrators))
                 self._structures[key] = Structures.of(self.records, *key, self.delays, pilot)
             structures = self._structures[key]
             for each in self.span.small(integrators, structures.search.box.delay_free, self.most):

@@ -12,9 +12,9 @@ from typing import get_args
 import numpy as np
 
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import Setting, SmallModels, grid, with_hold
+from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Candidate, Ranking
+from ctid_cli.identification.criterion import Ranking
 from ctid_cli.identification.parts import FEW, MANY, parts_of
 from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
 from ctid_cli.inference.input_response import analyse_response
@@ -22,7 +22,6 @@ from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import InitialState, InputBefore
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
@@ -31,6 +30,8 @@ LATEST, LATER = 0.1, 0.5
 REACH, FURTHER = 1.5, 3
 #: A delay beyond this share of the range is at its end.
 AT_END = 0.9
+#: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
+TIE = 1e-3
 
 
 def choose(records: Record | Sequence[Record], given: Given | None = None) -> Choice:
@@ -73,23 +74,34 @@ class _Choosing:
     def choice(self) -> Choice:
         """Return what is chosen."""
         delays, latest = self._delays()
-        setting = self._setting(delays)
-        ranking = grid(self.many, setting, self.span, delays)
-        while (
-            self.given.delay_bounds is None and ranking.best.fit.model.delay > AT_END * delays[1] and delays[1] < latest
-        ):
+        setting = self._setting(self.span, delays)
+        ranking = self._grid(setting, delays)
+        # Small models may miss so much that a state makes up for it, or that their delay is far too long.
+        span = Span.only(ranking.best.options)
+        again = self._range_of(ranking, delays), self._setting(span, self._range_of(ranking, delays))
+        if again != (delays, setting):
+            delays, setting = again
+            ranking = self._grid(setting, delays)
+        while self.given.delay_bounds is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
-            ranking = grid(self.many, setting, self.span, delays)
+            ranking = self._grid(setting, delays)
         best = ranking.best
         options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
+        if not self.all_from_start:
+            options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
         measured = best.options.prepare(fitted).laid_out
         answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
-        self.said += sentences.of_grid(ranking, delays, self.given)
+        said = (*self.said, *sentences.of_grid(ranking, delays, self.given))
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, fitted, ranking, answer, tuple(self.said))
+        return Choice(options, held, fitted, ranking, answer, said)
 
-    # --- the steps -------------------------------------------------------------------------------------
+    def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
+        if not self.all_from_start:
+            setting = setting._replace(initial_state="estimate", input_before=None)
+        return grid(self.many, setting, self.span, delays)
+
+    # --- the range of the delay ------------------------------------------------------------------------
 
     def _delays(self) -> tuple[tuple[float, float], float]:
         """Return the range of the delay, and how far it may be extended [s]."""
@@ -97,43 +109,60 @@ class _Choosing:
         if given is not None:
             return given, given[1]
         length = min(record.duration for record in self.few)
-        interval = max(float(np.median(np.diff(record.t))) for record in self.few)
         hints = [analyse_response(record).delay for record in self.few]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
         latest = min(max(LATEST * length, seen), LATER * length)
         settings = self._settings(latest)
-        span = self.span._replace(integrators=self.span.integrators[:1])
-        models = SmallModels(self._common(settings, latest), span, (0.0, latest), most=2).compared(settings)
-        reach = REACH * models.best.fit.model.delay + FURTHER * interval
-        return (0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), latest))), latest
+        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        return self._range_of(models, (0.0, latest)), latest
 
-    def _setting(self, delays: tuple[float, float]) -> Setting:
-        """Return state, offset and hold."""
-        settings, offset, holds = self._settings(delays[1]), self.given.offset, self._holds()
+    def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
+        """Return the range that the delay of the best model asks for, within another; that one where it is given."""
+        if self.given.delay_bounds is not None:
+            return delays
+        interval = max(float(np.median(np.diff(record.t))) for record in self.few)
+        reach = REACH * ranking.best.fit.model.delay + FURTHER * interval
+        return 0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), delays[1]))
+
+    # --- state, offset and hold ------------------------------------------------------------------------
+
+    def _setting(self, span: Span, delays: tuple[float, float]) -> Setting:
+        """Return state, offset and hold, as structures of a span show them."""
+        self.said = []
+        settings = self._settings(delays[1])
+        rests = [each for each in settings if each.initial_state == "rest"]
+        if len(rests) > 1:
+            # The level before the record is told by all samples, the first ones above all.
+            level = SmallModels(self.few, span, delays).compared(rests).best.options.input_before
+            settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
         common = self._common(settings, delays[1])
-        models = SmallModels(common, self.span, delays, most=3)
+        models = SmallModels(common, span, delays)
         setting = settings[0]
         if len(settings) > 1:
-            setting = self._state(models.compared(settings), settings, common, delays[1])
+            setting = self._state(models.compared(settings), settings, delays[1])
         elif self.given.initial_state is None:
             self.said.append(sentences.rest_assumed(setting) if self.from_start else sentences.STATE_OF_PART)
-        if offset is None:
+        if self.given.offset is None:
             compared = models.compared([setting, setting._replace(offset="none")], setting)
             self.said.append(sentences.of_offset(compared))
             setting = setting._replace(offset=compared.best.options.offset)
+        holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds], setting)
             self.said.append(sentences.of_hold(compared))
             setting = setting._replace(hold=compared.best.hold)
-        return setting if self.all_from_start else setting._replace(initial_state="estimate", input_before=None)
+        return setting
 
-    def _state(self, models: Ranking, settings: Sequence[Setting], common: Sequence[Record], length: float) -> Setting:
-        best = models.best
-        if best.options.initial_state == "rest" and common is not self.few:
-            if not beginning_is_likely(best, models.noise, self.few, length):
-                best = next(each for each in models.candidates if each.options.initial_state == "estimate")
-        self.said.append(sentences.of_state(models, best))
-        return next(each for each in settings if _is(best, each))
+    def _state(self, models: Ranking, settings: Sequence[Setting], length: float) -> Setting:
+        """Return rest unless the estimated state is better, or the first samples are not those of rest."""
+        rest, estimated = (
+            next(each for each in models.candidates if each.options.initial_state == setting.initial_state)
+            for setting in settings
+        )
+        at_rest = rest.criterion <= estimated.criterion + TIE
+        likely = not at_rest or beginning_is_likely(rest, models.noise, self.few, length)
+        self.said.append(sentences.of_state(rest, estimated, likely))
+        return settings[0] if at_rest and likely else settings[1]
 
     # --- what there is to compare ----------------------------------------------------------------------
 
@@ -167,9 +196,8 @@ class _Choosing:
         return without_beginning(self.few, latest)
 
 
-def _is(candidate: Candidate, setting: Setting) -> bool:
-    options = candidate.options
-    return (options.initial_state, options.input_before) == (setting.initial_state, setting.input_before)
+def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
+    return ranking.best.fit.model.delay > AT_END * delays[1]
 
 
 def _rounded(delay: float) -> float:

@@ -7,9 +7,9 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators import identification
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_submodels import Options
+from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
-from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.validation import judged_on, laid_out_for
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
 from ctid_cli.signals.record import Record

@@ -26,15 +26,16 @@ def rest_assumed(setting: Setting) -> str:
     )
 
 
-def of_state(models: Ranking, best: Candidate) -> str:
-    """Return the state, and by how much it is better than another."""
-    if best is not models.best:
+def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
+    """Return the state, and by how much it is better than the other; or that the first samples are not those of rest."""
+    if not likely:
         return (
             "State before the record: estimated, as the first samples are not those of a system at rest "
             "(--initial-state estimate)."
         )
-    other = models.runner_up("initial_state", "input_before")
-    return f"State before the record: {_state(best)}; {_below(models, other, '' if other is None else _state(other))}."
+    best, other = sorted((rest, estimated), key=lambda each: each.criterion)
+    fall = other.criterion - best.criterion
+    return f"State before the record: {_state(best)}; the criterion is {fall:.3g} below that of {_state(other)}."
 
 
 def _state(candidate: Candidate) -> str:

@@ -16,8 +16,8 @@ from ctid_cli.signals.treatment import InitialState, InputBefore
 #: Share of the range of the input that it must still cross after the greatest delay, for an estimated state to leave
 #: the gain determined.
 EXCITED = 0.5
-#: Rest is refused where the first samples are, with it, this unlikely.
-UNLIKELY = 1e-3
+#: Rest is refused where the first samples are, with it, this unlikely: to estimate a state in vain costs little.
+UNLIKELY = 1e-2
 
 
 #: A state before the records, and the input that goes with it.
@@ -65,14 +65,15 @@ def without_beginning(records: Sequence[Record], length: float) -> list[Record]:
 def beginning_is_likely(best: Candidate, noise: NoiseModel, records: Sequence[Record], length: float) -> bool:
     """Whether a model from rest, fitted to what comes later, explains the first samples of the records too.
 
-    Their squared innovations over the variance are chi-square.
+    Their squared innovations over the variance, and the first error over that of the noise, are chi-square.
     """
     held = [with_hold(record, best.hold) for record in records]
     errors = best.options.prepare(held).laid_out.errors_of(best.fit.model).residuals
     later = np.concatenate([noise.innovations(e)[noise.order :] for e in best.fit.residuals])
+    deviation, power = float(later.std()), max(float(noise.first_autocovariances[0]), np.finfo(float).tiny)
     squared, count = 0.0, 0
     for record, e in zip(records, errors, strict=True):
         first = int(np.count_nonzero(record.valid & (record.t < record.t[0] + length * (1 - 1e-9))))
-        new = noise.innovations(e)[noise.order : first]
-        squared, count = squared + float(new @ new), count + new.size
-    return not count or chi_square_tail(count, squared / float(np.mean(later**2))) > UNLIKELY
+        new = noise.innovations(e)[max(noise.order, 1) : first] / deviation
+        squared, count = squared + float(new @ new) + float(e[0] ** 2) / power, count + new.size + 1
+    return chi_square_tail(count, squared) > UNLIKELY

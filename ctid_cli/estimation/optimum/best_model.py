@@ -32,8 +32,8 @@ class Optimum:
     numerator: Array
     denominator: Array
     delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, zeros without it;
-    #: and those of the powers of time.
+    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, zeros without
+    #: it; and those of the powers of time.
     free_responses: Array
     trends: Array
     squared_error: float
