@@ -133,7 +133,7 @@ class SmallModels:
         """Rank the structures in some settings, which all use the same samples."""
         found = [each for setting in settings for each in self._fitted(setting, near)]
         if not found:
-            raise DataError(f"{self.records[0].name}: there are too few samples for a model")
+            raise DataError(f"{self.records[0].name}: too few usable samples for a model's parameters")
         return ranked(found)
 
     def _fitted(self, setting: Setting, near: Setting | None) -> Iterator[Candidate]:
@@ -150,7 +150,7 @@ class SmallModels:
 
 
 def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:
-    """Fit structures of ever more poles, until the best lies inside or there are no more; see ``Span`` for the limits."""
+    """Fit structures of ever more poles, until the best lies inside or there are no more."""
     families = [Structures.of(records, setting, integrators, delays) for integrators in span.integrators]
     found: list[Candidate] = []
     most = span.poles[1] + max(span.integrators)
@@ -166,7 +166,5 @@ def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[
         if order >= FEWEST_TRIED and found and order - ranked(found).best.options.order >= BEYOND:
             break
     if not found:
-        raise DataError(
-            "no structure of the range can be fitted: the record is too short for it, or it has no structure"
-        )
+        raise DataError(f"{records[0].name}: too few usable samples for a model's parameters; take a longer record")
     return ranked(found)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.candidates import MOST_POLES, Span
@@ -58,14 +59,23 @@ class Given:
         free = (0,) if none else (0, 1)
         return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
 
-    @property
-    def settled(self) -> bool:
-        """Whether nothing is left to choose."""
-        return (
-            isinstance(self.poles, int)
-            and isinstance(self.zeros, int)
-            and self.hold != "auto"
-            and not any(each is None for each in (self.delay_bounds, self.initial_state, self.offset))
+    def check(self) -> None:
+        """Refuse what does not go together, with an OptionError."""
+        delays = self.delay_bounds or (0.0, 1.0)
+        (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
+        integrators = max(self.span.integrators)
+        if isinstance(self.poles, tuple) and fewest_zeros > most + integrators - int(delays[0] < delays[1]):
+            raise OptionError("zeros", f"no structure has at least {fewest_zeros} zeros and at most {most} poles")
+        # A single structure is checked as such.
+        poles, zeros = (self.poles, fewest_zeros) if isinstance(self.poles, int) else (max(least, 1), 0)
+        DelayProfile(
+            *(poles, zeros, delays),
+            initial_state=self.initial_state or "rest",
+            offset=self.offset or "none",
+            loss=self.loss,
+            fixed=self.fixed,
+            integrators=self.integrators or 0,
+            input_before=self.input_before,
         )
 
 

@@ -11,6 +11,7 @@ from typing import get_args
 
 import numpy as np
 
+from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
@@ -57,7 +58,12 @@ def choose(records: Record | Sequence[Record], given: Given | None = None) -> Ch
         If what is given does not go together.
     """
     several = [records] if isinstance(records, Record) else list(records)
-    return _Choosing(several, given or Given()).choice()
+    given = given or Given()
+    given.check()
+    if given.delay_bounds is not None:
+        for record in several:
+            check_greatest_delay(record, given.delay_bounds[1])
+    return _Choosing(several, given).choice()
 
 
 class _Choosing:

@@ -30,11 +30,11 @@ def identify(
     records : Record or sequence of Record
         One for each experiment.
     options : DelayProfile, MeasuredSubmodels or Given, optional
-        An estimator, of which nothing is chosen, or what is given; by default everything is chosen, the hold of the input
-        too where it is known at the samples of the output.
+        An estimator, of which nothing is chosen, or what is given; by default everything is chosen, the hold of the
+        input too where it is known at the samples of the output.
     validation : Record, optional
-        Another record of the same system, which never enters the choice. Its state and offset are chosen on it, with the
-        model fixed, unless they are given.
+        Another record of the same system, which never enters the choice. Its state and offset are chosen on it, with
+        the model fixed, unless they are given.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         What the noise is taken for: white unless the residuals are not, white, or coloured with standard errors and
         Student's t, or coloured with the intervals of a bootstrap-t.
@@ -57,8 +57,8 @@ def identify(
 
     Notes
     -----
-    All is chosen by one criterion, BIC of the innovations with a noise model that all candidates share and each parameter
-    counted 1.5 times; see :func:`~ctid_cli.identification.choose.choose`.
+    All is chosen by one criterion, BIC of the innovations with a noise model that all candidates share and each
+    parameter counted 1.5 times; see :func:`~ctid_cli.identification.choose.choose`.
 
     Examples
     --------

@@ -6,7 +6,9 @@ from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
 from ctid_cli.text import count
 
 #: What is said where the beginning of a record is not looked at.
-STATE_OF_PART = "State before the record: estimated (--initial-state estimate); of a record this long the first samples hardly count."
+STATE_OF_PART = (
+    "State before the record: estimated (--initial-state estimate); the choice is made on a part of this long record."
+)
 
 
 def spelled(candidate: Candidate) -> str:
@@ -21,13 +23,13 @@ def rest_assumed(setting: Setting) -> str:
     """Return that no other state could be tried."""
     level = "its first value" if setting.input_before == "first" else f"{setting.input_before or 0:g}"
     return (
-        f"State before the record: at rest with the input at {level}, which is assumed: the input does not change enough "
-        "after the longest delay to estimate a state besides (--initial-state, --input-before)."
+        f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
+        "enough after the longest delay to estimate a state besides (--initial-state, --input-before)."
     )
 
 
 def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
-    """Return the state, and by how much it is better than the other; or that the first samples are not those of rest."""
+    """Return the state, and by how much it is better than the other."""
     if not likely:
         return (
             "State before the record: estimated, as the first samples are not those of a system at rest "
