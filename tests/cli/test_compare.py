@@ -136,7 +136,7 @@ def test_inputs_are_not_overwritten(ctid, home, tmp_path):
 def test_models_are_compared_from_python_with_one_treatment(home):
     record = read_measurement(home / "record.csv").record
     options = DelayProfile(2, 0, (0.0, 3.0), offset="estimate")
-    fits = [identify(options, [record]), options.fit(record, None)]
+    fits = [identify([record], options), options.fit(record, None)]
     other = read_measurement(home / "other.csv").record
     own, plain = compare(fits, other)
     assert (own.offset, plain.offset) == ("estimate", "none")

@@ -110,9 +110,9 @@ def test_an_identification_is_shown_as_by_the_command(tmp_path, ctid):
     y = simulate(TransferFunction([2], [1, 1]), u, t) + 0.1 * rng.standard_normal(t.size)
     pd.DataFrame({"t": t, "u": u.values, "y": y}).to_csv(tmp_path / "record.csv", index=False)
     printed = ctid("fit", tmp_path / "record.csv", "--poles", 1, "--out", tmp_path).stdout
-    found = identify(DelayProfile(1, 0, (0.0, 0.0), nested=True), [read_record(tmp_path / "record.csv")])
+    found = identify(read_record(tmp_path / "record.csv"), Given(poles=1))
     # The file names no units either.
-    assert found.summary().split("\n\n")[2:4] == printed.split("\n\n")[3:5]
+    assert found.summary().split("\n\n")[3:5] == printed.split("\n\n")[3:5]
     assert len(found.plot().axes) == 4
     assert found._repr_html_().count("<table>") == 4
 
