@@ -34,6 +34,11 @@ class Setting(NamedTuple):
     input_before: InputBefore
     offset: Offset
 
+    @property
+    def state(self) -> tuple[InitialState, InputBefore]:
+        """The state before the records."""
+        return self.initial_state, self.input_before
+
 
 class Span(NamedTuple):
     """Least and greatest number of poles (integrators not among them) and of zeros, and the numbers of integrators."""
@@ -129,24 +134,29 @@ class SmallModels:
         self.records, self.span, self.delays, self.most = records, span, delays, most
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
-    def compared(self, settings: Sequence[Setting], near: Setting | None = None) -> Ranking:
+    def compared(self, settings: Sequence[Setting]) -> Ranking:
         """Rank the structures in some settings, which all use the same samples."""
-        found = [each for setting in settings for each in self._fitted(setting, near)]
+        found = [each for setting in settings for each in self._fitted(setting)]
         if not found:
             raise DataError(f"{self.records[0].name}: too few usable samples for a model's parameters")
         return ranked(found)
 
-    def _fitted(self, setting: Setting, near: Setting | None) -> Iterator[Candidate]:
+    def _fitted(self, setting: Setting) -> Iterator[Candidate]:
         for integrators in self.span.integrators:
-            key = setting, integrators
-            if key not in self._structures:
-                pilot = None if near is None else self._structures.get((near, integrators))
-                self._structures[key] = Structures.of(self.records, *key, self.delays, pilot)
-            structures = self._structures[key]
+            structures = self._laid_out(setting, integrators)
             for each in self.span.small(integrators, structures.search.box.delay_free, self.most):
                 candidate = structures.fit(*each)
                 if candidate is not None:
                     yield candidate
+
+    def _laid_out(self, setting: Setting, integrators: int) -> Structures:
+        """Lay records out; another hold or offset has its minima near those that are known."""
+        key = setting, integrators
+        if key not in self._structures:
+            pairs = ((one, number) for one, number in self._structures if one.state == setting.state)
+            alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, alike)
+        return self._structures[key]
 
 
 def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:

@@ -12,6 +12,7 @@ from typing import get_args
 import numpy as np
 
 from ctid_cli.estimation.common import check_greatest_delay
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
@@ -141,34 +142,33 @@ class _Choosing:
             # The level before the record is told by all samples, the first ones above all.
             level = SmallModels(self.few, span, delays).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
-        common = self._common(settings, delays[1])
-        models = SmallModels(common, span, delays)
-        setting = settings[0]
-        if len(settings) > 1:
-            setting = self._state(models.compared(settings), settings, delays[1])
-        elif self.given.initial_state is None:
-            self.said.append(sentences.rest_assumed(setting) if self.from_start else sentences.STATE_OF_PART)
+        models = SmallModels(self._common(settings, delays[1]), span, delays)
         if self.given.offset is None:
-            compared = models.compared([setting, setting._replace(offset="none")], setting)
-            self.said.append(sentences.of_offset(compared))
-            setting = setting._replace(offset=compared.best.options.offset)
+            settings += [each._replace(offset="none") for each in settings]
+        best = self._treated(models.compared(settings), delays[1])
+        setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
         holds = self._holds()
         if len(holds) > 1:
-            compared = models.compared([setting._replace(hold=hold) for hold in holds], setting)
+            compared = models.compared([setting._replace(hold=hold) for hold in holds])
             self.said.append(sentences.of_hold(compared))
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
-    def _state(self, models: Ranking, settings: Sequence[Setting], length: float) -> Setting:
-        """Return rest unless the estimated state is better, or the first samples are not those of rest."""
-        rest, estimated = (
-            next(each for each in models.candidates if each.options.initial_state == setting.initial_state)
-            for setting in settings
-        )
-        at_rest = rest.criterion <= estimated.criterion + TIE
-        likely = not at_rest or beginning_is_likely(rest, models.noise, self.few, length)
-        self.said.append(sentences.of_state(rest, estimated, likely))
-        return settings[0] if at_rest and likely else settings[1]
+    def _treated(self, models: Ranking, length: float) -> DelayProfile:
+        """Return state and offset: rest, unless the estimated state or the first samples speak against it."""
+        rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
+        chosen = models
+        if rest is not None and estimated is not None:
+            at_rest = rest.best.criterion <= estimated.best.criterion + TIE
+            likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.few, length)
+            chosen = rest if at_rest and likely else estimated
+            self.said.append(sentences.of_state(rest.best, estimated.best, likely))
+        elif self.given.initial_state is None:
+            options = models.best.options
+            self.said.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
+        if self.given.offset is None:
+            self.said.append(sentences.of_offset(chosen))
+        return chosen.best.options
 
     # --- what there is to compare ----------------------------------------------------------------------
 

@@ -76,6 +76,15 @@ class Ranking:
         """The candidate of the least criterion."""
         return self.candidates[0]
 
+    def of(self, **options: object) -> "Ranking | None":
+        """Return the candidates with these options; None where there are none."""
+        found = [
+            each
+            for each in self.candidates
+            if all(getattr(each.options, name) == value for name, value in options.items())
+        ]
+        return Ranking(tuple(found), self.noise) if found else None
+
     def runner_up(self, *names: str) -> Candidate | None:
         """Return the first candidate whose hold or options of these names are not those of the best; None without."""
 

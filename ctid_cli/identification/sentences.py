@@ -1,6 +1,6 @@
 """What is said of each choice: the criterion against the runner-up."""
 
-from ctid_cli.identification.candidates import Setting
+from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
 from ctid_cli.text import count
@@ -19,9 +19,9 @@ def spelled(candidate: Candidate) -> str:
     return f"{count(options.poles, 'pole')}, {zeros}{besides}"
 
 
-def rest_assumed(setting: Setting) -> str:
+def rest_assumed(options: DelayProfile) -> str:
     """Return that no other state could be tried."""
-    level = "its first value" if setting.input_before == "first" else f"{setting.input_before or 0:g}"
+    level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
     return (
         f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
         "enough after the longest delay to estimate a state besides (--initial-state, --input-before)."

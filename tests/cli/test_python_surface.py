@@ -11,9 +11,9 @@ import pytest
 import ctid_cli
 from ctid_cli import (
     CtidError,
-    DelayProfile,
     Flag,
     FrequencyTrack,
+    Given,
     HeldSignal,
     Record,
     SpecError,
