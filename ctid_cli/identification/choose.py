@@ -99,9 +99,10 @@ class _Choosing:
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
         measured = best.options.prepare(fitted).laid_out
         answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
-        said = (*self.said, *sentences.of_grid(ranking, delays, self.given))
+        said = [*self.said, *sentences.of_grid(ranking, delays, self.given)]
+        said += [sentences.of_criterion(ranking)] * bool(said)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
-        return Choice(options, held, fitted, ranking, answer, said)
+        return Choice(options, held, fitted, ranking, answer, tuple(said))
 
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:

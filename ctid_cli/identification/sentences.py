@@ -68,17 +68,22 @@ def of_hold(models: Ranking) -> str:
 
 
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list[str]:
-    """Return the structure, the range of the delay and the criterion."""
-    best, order = ranking.best, ranking.noise.order
+    """Return the structure and the range of the delay."""
+    best = ranking.best
     other = ranking.runner_up("poles", "zeros", "integrators")
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best)}; {_below(ranking, other, other.name)}.")
     if given.delay_bounds is None:
         found.append(f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {best.fit.model.delay:.4g}.")
-    noise = f"one autoregressive noise model of order {order}" if order else "white noise"
-    found.append(f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times.")
     return found
+
+
+def of_criterion(ranking: Ranking) -> str:
+    """Return the criterion."""
+    order = ranking.noise.order
+    noise = f"one autoregressive noise model of order {order}" if order else "white noise"
+    return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."
 
 
 def _below(models: Ranking, other: Candidate | None, name: str) -> str:
