@@ -33,9 +33,11 @@ from .estimators.delay_profile import DelayProfile as DelayProfile
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
 from .estimation.common import Fixed as Fixed
-from .estimators.order_search import FittedOrder as FittedOrder, OrderSearch as OrderSearch
-from .estimators.order_search import search_orders as search_orders
-from .estimators.identification import Identification as Identification, identify as identify
+from .estimators.identification import Identification as Identification
+from .identification.choice import Choice as Choice, Given as Given
+from .identification.choose import choose as choose
+from .identification.criterion import Candidate as Candidate
+from .identification.identify import identify as identify
 
 # Results
 from .inference.fit import Fit as Fit, Status as Status

@@ -25,21 +25,15 @@ def check(
     is wrong with these data, the worst first; then a structure to begin with, by a short search of at most four poles.
     Columns are found by their usual names (t, u, y) unless named.
     """
-    from ctid_cli.reporting.order_proposal import proposed_by_check
+    from ctid_cli.identification.choice import Given
+    from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.record_findings import check_record_quality
     from ctid_cli.reporting.record_result import RecordCheckResult
 
-    measured, why = columns.read(file, "zoh" if hold == "auto" else hold), ""
+    measured = columns.read(file, "zoh" if hold == "auto" else hold)
     units = measured.time_unit or "s", measured.input_unit or "", measured.output_unit or ""
     report = check_record_quality(measured.record, *units)
-    if hold == "auto" and report.worst != "problem":
-        from ctid_cli.reporting.hold_choice import hold_for_check
-
-        chosen, reason = hold_for_check(measured.record, report)
-        if chosen != "zoh":
-            measured, why = columns.read(file, chosen), f"{reason} "
-    proposal = proposed_by_check(measured.record, report)
-    proposal = proposal and proposal._replace(sentence=why + proposal.sentence)
-    emit(RecordCheckResult(measured, report, proposal), form.form)
+    choice = None if report.worst == "problem" else choose(measured.record, Given(hold=hold))
+    emit(RecordCheckResult(measured, report, choice if choice and choice.seen else None), form.form)
     if strict and report.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,16 +13,16 @@ import typer
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import Asked, LoopOptions, ModelOptions, TreatmentOptions, estimator_of
+from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 
 if TYPE_CHECKING:
     from ctid_cli.estimators.identification import Identification
-    from ctid_cli.estimators.measured_submodels import Options
+    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+    from ctid_cli.identification.choice import Given
     from ctid_cli.reporting.fit_result import FitResult
     from ctid_cli.reporting.records import Records
-    from ctid_cli.signals.treatment import Hold
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def fit(
     ],
     model: ModelOptions,
     loop: LoopOptions,
-    treatment: TreatmentOptions,
+    treatment: FitOptions,
     columns: RecordOptions,
     form: FormatOptions,
     writing: WritingOptions,
@@ -75,15 +75,21 @@ def fit(
     """Fit a transfer function with a delay to measured records.
 
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
-    fit.svg. The delay is searched over its whole range: no start is needed.
+    fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and
+    offset are chosen by one criterion where they are not given.
     """
     from ctid_cli.reporting.fit_result import FitResult
 
     _check_draws(bootstrap)
     loop.check()
-    options, hold, choices = _chosen(files, model, loop, treatment, columns)
-    records = _records(files, validate, hold, loop, columns)
-    result = FitResult(_identified(options, records, bootstrap), records, choices)
+    asked = Asked(model, treatment, loop.counts)
+    options = options_of(asked)
+    if asked.iterated and len(files) > 1:
+        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+    records = _records(files, validate, loop, columns, treatment)
+    found = _identified(options, records, bootstrap)
+    other = None if found.validation is None else found.validation.record
+    result = FitResult(found, records.with_data(found.records, other))
     contents = writing.contents(result, given_command(context))
     refuse_overwriting([*files, *([validate] if validate else [])], contents)
     write_files(contents)
@@ -97,51 +103,13 @@ def _check_draws(bootstrap: int | None) -> None:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
 
 
-def _chosen(
-    files: Sequence[Path], model: ModelOptions, loop: LoopOptions, treatment: TreatmentOptions, columns: RecordOptions
-) -> tuple[Options, Hold, list[str]]:
-    """Return the estimator and the hold, with a sentence for each choice that was not the user's."""
-    from ctid_cli.reporting.order_proposal import propose_structure
-    from ctid_cli.reporting.records import Records
-
-    if not model.open:
-        asked = Asked(model, model.bounds or (0.0, 0.0), treatment, loop.counts)
-        options = estimator_of(asked)
-        if asked.iterated and len(files) > 1:
-            raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-        hold, why = _hold(files, model, loop, treatment, columns)
-        return options, hold, [why] if why else []
-    if loop.loop is not None or model.fix or model.integrators or treatment.loss != "squares":
-        raise UsageError("--poles is missing: with --loop, --fix, --integrators or --loss it must be given")
-    bounds = model.bounds
-    hold, why = _hold(files, model, loop, treatment, columns)
-    first = Records([columns.read(file, hold) for file in files])
-    state = treatment.initial_state, treatment.offset
-    found = propose_structure(first.data, model.zeros, bounds, *state, first.units.time)
-    options = estimator_of(Asked(replace(model, poles=found.poles, zeros=found.zeros), found.delay_bounds, treatment))
-    return options, hold, [*([why] if why else []), found.sentence]
-
-
-def _hold(
-    files: Sequence[Path], model: ModelOptions, loop: LoopOptions, treatment: TreatmentOptions, columns: RecordOptions
-) -> tuple[Hold, str]:
-    """Return the hold that is given, or the best for one fraction in open loop, and a sentence."""
-    from ctid_cli.reporting.hold_choice import chosen_hold
-
-    if treatment.hold != "auto":
-        return treatment.hold, ""
-    if loop.loop is not None or model.model != "fraction" or model.integrators:
-        return "zoh", ""
-    records = [columns.read(file, "zoh").record for file in files]
-    return chosen_hold(records, model.poles, model.zeros, model.bounds, treatment.initial_state, treatment.offset)
-
-
 def _records(
-    files: Sequence[Path], validate: Path | None, hold: Hold, loop: LoopOptions, columns: RecordOptions
+    files: Sequence[Path], validate: Path | None, loop: LoopOptions, columns: RecordOptions, treatment: FitOptions
 ) -> Records:
     """Read the records, in their loop; a DataError where their units differ."""
     from ctid_cli.reporting.records import Records
 
+    hold = "zoh" if treatment.hold == "auto" else treatment.hold
     measured = [loop.applied(columns.read(file, hold, reference=loop.reference)) for file in files]
     other = None
     if validate is not None:
@@ -152,11 +120,11 @@ def _records(
     return records
 
 
-def _identified(options: Options, records: Records, bootstrap: int | None) -> Identification:
+def _identified(options: MeasuredSubmodels | Given, records: Records, bootstrap: int | None) -> Identification:
     """Fit, with a bar of progress where it takes long."""
-    from ctid_cli.estimators.identification import identify
+    from ctid_cli.identification.identify import identify
 
     validation = None if records.validation is None else records.validation.record
-    with FitProgress(sum(record.n_samples for record in records.data)) as progress:
+    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
         noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
-        return identify(options, records.data, validation, *noise)
+        return identify(records.data, options, validation, *noise)

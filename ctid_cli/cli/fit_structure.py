@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,20 +13,22 @@ import typer
 
 from ctid_cli.cli._common import span
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, InitialState, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.common import Fixed
-    from ctid_cli.estimators.measured_submodels import Options
+    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+    from ctid_cli.identification.choice import Given
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
+HoldOption = Annotated[AskedHold, typer.Option("--hold", help="The input between its samples; else chosen.")]
 
 
 @dataclass(frozen=True)
-class DelayOptions:
+class StructureOptions:
     """Range of the delay, and poles at the origin."""
 
     delay: Annotated[
@@ -33,12 +36,15 @@ class DelayOptions:
         typer.Option(
             "--delay",
             metavar="LOW:HIGH|VALUE",
-            help="Range or value [time unit]; else 0, of an order search as ctid check says.",
+            help="Range or value [time unit]; else chosen.",
         ),
     ] = None
     integrators: Annotated[
-        int, typer.Option("--integrators", help="Poles at the origin besides; of a sum, in its first submodel.")
-    ] = 0
+        int | None,
+        typer.Option(
+            "--integrators", help="Poles at the origin besides; of a sum, in its first submodel; else chosen."
+        ),
+    ] = None
 
     @property
     def bounds(self) -> tuple[float, float] | None:
@@ -47,21 +53,41 @@ class DelayOptions:
 
 
 @dataclass(frozen=True)
-class StateOptions:
+class TreatmentOptions:
     """Treatment of the initial state and of offsets."""
 
-    initial_state: Annotated[InitialState, typer.Option("--initial-state", help="State before the record.")] = "rest"
-    offset: Annotated[Offset, typer.Option("--offset", help="Constant offset of the output (not input).")] = "none"
+    initial_state: Annotated[
+        InitialState | None, typer.Option("--initial-state", help="State before the record; else chosen.")
+    ] = None
+    input_before: Annotated[
+        str | None,
+        typer.Option(
+            "--input-before", metavar="VALUE|first", help="Input before the first sample, at rest; else chosen."
+        ),
+    ] = None
+    offset: Annotated[
+        Offset | None, typer.Option("--offset", help="Offset of the output, or its drift; else chosen.")
+    ] = None
+
+    @property
+    def level(self) -> InputBefore:
+        """The input before the first sample; None where it is not given."""
+        if self.input_before in (None, "first"):
+            return "first" if self.input_before else None
+        try:
+            return float(self.input_before or "")
+        except ValueError:
+            raise UsageError(f"--input-before must be a number or first; got {self.input_before!r}") from None
 
 
 @dataclass(frozen=True)
-class ModelOptions(DelayOptions):
+class ModelOptions(StructureOptions):
     """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
     poles: Annotated[
-        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else by an order search.")
+        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else chosen.")
     ] = None
-    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles.")] = None
+    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles; else chosen.")] = None
     model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction"
     terms: Annotated[
         str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
@@ -69,11 +95,6 @@ class ModelOptions(DelayOptions):
     fix: Annotated[
         list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
     ] = None
-
-    @property
-    def open(self) -> bool:
-        """Whether the degrees are to be searched."""
-        return self.poles is None and self.model == "fraction" and self.terms is None
 
 
 @dataclass(frozen=True)
@@ -119,20 +140,19 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class TreatmentOptions(StateOptions):
+class FitOptions(TreatmentOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares"
-    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto"
+    hold: HoldOption = "auto"
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What the command line says of the model, with the range of its delay."""
+    """What the command line says of the model."""
 
     model: ModelOptions
-    delay: tuple[float, float]
-    treatment: TreatmentOptions
+    treatment: FitOptions
     #: Whether the loop that the record was taken in is given, and counts.
     loop: bool = False
 
@@ -141,50 +161,81 @@ class Asked:
         """Whether the estimator is that of submodels, which knows the delay and takes one record."""
         return self.model.model == "additive" or self.loop
 
+    @property
+    def delay(self) -> tuple[float, float]:
+        """The range of the delay of submodels."""
+        return self.model.bounds or (0.0, 0.0)
 
-def estimator_of(asked: Asked) -> Options:
-    """The estimator; a UsageError says which options do not go together."""
-    _refuse_other_form(asked)
-    if asked.iterated:
-        _refuse_unable(asked)
+    @property
+    def integrators(self) -> int:
+        """Poles at the origin."""
+        return self.model.integrators or 0
+
+
+@contextlib.contextmanager
+def as_usage_errors() -> Iterator[None]:
+    """Turn what options of an estimator refuse into a message about the command line."""
     try:
-        return _submodels(asked) if asked.iterated else _fraction(asked)
+        yield
     except ValueError as error:
         raise UsageError(re.sub(r"^fixed\b", "--fix", str(error))) from None
 
 
-def _fraction(asked: Asked) -> Options:
-    from ctid_cli.estimators.delay_profile import DelayProfile
+def options_of(asked: Asked) -> MeasuredSubmodels | Given:
+    """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
+    _refuse_other_form(asked)
+    if not asked.iterated:
+        return _given(asked)
+    _refuse_unable(asked)
+    with as_usage_errors():
+        return _submodels(asked)
 
-    assert asked.model.poles is not None
-    return DelayProfile(
-        *(asked.model.poles, asked.model.zeros or 0, asked.delay),
-        initial_state=asked.treatment.initial_state,
-        offset=asked.treatment.offset,
-        loss=asked.treatment.loss,
-        nested=True,
-        fixed=_fixed(asked.model.fix),
-        integrators=asked.model.integrators,
+
+def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold) -> Given:
+    """Return what is given of the choice."""
+    from ctid_cli.identification.choice import Given
+
+    if structure.integrators is not None:
+        check_integrators(structure.integrators, treatment.offset or "none")
+    return Given(
+        integrators=structure.integrators,
+        delay_bounds=structure.bounds,
+        initial_state=treatment.initial_state,
+        offset=treatment.offset,
+        input_before=treatment.level,
+        hold=hold,
     )
 
 
-def _submodels(asked: Asked) -> Options:
+def _given(asked: Asked) -> Given:
+    model, treatment = asked.model, asked.treatment
+    fixed = _fixed(model.fix)
+    if fixed and model.poles is None:
+        raise UsageError("--poles is missing: with --fix it must be given")
+    # The names of known parameters are those of a number of zeros.
+    zeros = 0 if fixed and model.zeros is None else model.zeros
+    given = given_of(model, treatment, treatment.hold)
+    return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed)
+
+
+def _submodels(asked: Asked) -> MeasuredSubmodels:
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.models.additive import Term
 
     if asked.model.terms is None:
-        assert asked.model.poles is not None
-        terms: tuple[Term, ...] = (Term(asked.model.poles, asked.model.zeros or 0, asked.model.integrators),)
+        if asked.model.poles is None:
+            raise UsageError("--poles is missing: with --loop it must be given")
+        terms: tuple[Term, ...] = (Term(asked.model.poles, asked.model.zeros or 0, asked.integrators),)
     else:
-        first, *others = _terms(asked.model.terms, asked.model.integrators)
+        first, *others = _terms(asked.model.terms, asked.integrators)
         terms = (first, *others)
     return MeasuredSubmodels(
         terms,
         asked.delay[0],
         "closed_loop" if asked.loop else "open_loop",
-        asked.treatment.initial_state,
-        asked.treatment.offset,
-        factored=asked.model.model == "additive" or asked.model.integrators > 0,
+        asked.treatment.initial_state or "rest",
+        asked.treatment.offset or "none",
+        factored=asked.model.model == "additive" or asked.integrators > 0,
         fixed=_fixed(asked.model.fix),
     )
 
@@ -201,9 +252,8 @@ def _refuse_other_form(asked: Asked) -> None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
     elif asked.model.terms is not None:
         raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
-    check_integrators(
-        asked.model.integrators, asked.treatment.offset, "--initial-state" if asked.iterated else "--offset"
-    )
+    instead = "--initial-state" if asked.iterated else "--offset"
+    check_integrators(asked.integrators, asked.treatment.offset or "none", instead)
 
 
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
@@ -217,6 +267,11 @@ def check_integrators(integrators: int, offset: Offset, instead: str = "--offset
             "--offset remove subtracts the mean of the output, which is no offset of a system that integrates; use "
             f"{instead} estimate"
         )
+    if integrators and offset == "drift":
+        raise UsageError(
+            "--offset drift is a slope of the output, which a system that integrates has by itself; use "
+            f"{instead} estimate"
+        )
 
 
 def _refuse_unable(asked: Asked) -> None:
@@ -228,15 +283,17 @@ def _refuse_unable(asked: Asked) -> None:
         raise UsageError(
             f"--delay {low:g}:{high:g} cannot be searched for {what}: {why}; give one value, --delay VALUE"
         )
+    if asked.treatment.input_before is not None:
+        raise UsageError(f"--input-before is not there for {what}; use --initial-state estimate")
     if asked.treatment.loss != "squares":
         raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
-    if asked.treatment.offset == "estimate":
-        raise UsageError(f"--offset estimate is not there for {what}; use --offset remove")
+    if asked.treatment.offset in ("estimate", "drift"):
+        raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
     if asked.loop and asked.treatment.hold not in ("auto", "zoh"):
         raise UsageError(
             f"--hold {asked.treatment.hold} does not go with --loop: a discrete controller holds its input (zoh)"
         )
-    if asked.loop and asked.model.fix and asked.model.model == "fraction" and not asked.model.integrators:
+    if asked.loop and asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
         raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
 
 

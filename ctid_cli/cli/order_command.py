@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from ctid_cli.canonical import plain
-from ctid_cli.cli._common import InputHold, emit, guarded, span, write_files
+from ctid_cli.cli._common import emit, guarded, span, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions
-from ctid_cli.cli.fit_structure import DelayOptions, StateOptions, check_integrators
+from ctid_cli.cli._progress import FitProgress
+from ctid_cli.cli.fit_structure import HoldOption, StructureOptions, TreatmentOptions, as_usage_errors, given_of
 from ctid_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from ctid_cli.reporting.order_result import OrderSearchResult
-    from ctid_cli.reporting.records import Records
 
 
 @guarded
@@ -24,66 +22,48 @@ def order(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
     ],
-    delay: DelayOptions,
-    state: StateOptions,
+    structure: StructureOptions,
+    treatment: TreatmentOptions,
     columns: RecordOptions,
     form: FormatOptions,
-    poles: Annotated[str, typer.Option("--poles", metavar="LOW:HIGH", help="Numbers of poles, 1 to 12.")] = "1:6",
-    zeros: Annotated[str, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = "0:3",
-    hold: InputHold = "zoh",
+    poles: Annotated[
+        str | None,
+        typer.Option("--poles", metavar="LOW:HIGH", help="Numbers of poles, 1 to 12; else as many as needed."),
+    ] = None,
+    zeros: Annotated[str | None, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = None,
+    hold: HoldOption = "auto",
     validate: Annotated[
         Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record too.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for order.json and order.svg.")] = Path("."),
 ) -> None:
-    """Say how many poles and zeros measured records ask for.
+    """Show the structures that ctid fit chooses from.
 
-    Fits all structures of a range, ranks them by BIC, and says which one to take and why, or that there is no model
-    here. Residuals that are not white are made so first, by one noise model for all. Writes order.json and order.svg.
+    Fits structures with ever more poles until the best lies inside, ranks them by the criterion that ctid fit uses, and
+    marks the one that it takes; or says that there is no model here. Writes order.json and order.svg.
     """
+    from ctid_cli.identification.choose import choose
+    from ctid_cli.reporting.order_result import OrderSearchResult
     from ctid_cli.reporting.records import Records
 
-    check_integrators(delay.integrators, state.offset)
-    ranges = _range("--poles", poles, int(not delay.integrators)), _range("--zeros", zeros, 0)
-    bounds = delay.bounds
-    measurements = [columns.read(file, hold) for file in files]
-    records = Records(measurements, None if validate is None else columns.read_whole(validate, hold))
-    result = _searched(records, ranges, bounds, state, delay.integrators)
+    ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
+    given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
+    measurements = [columns.read(file, "zoh") for file in files]
+    records = Records(measurements, None if validate is None else columns.read_whole(validate, "zoh"))
+    # Units that differ are refused before anything is computed.
+    records.units  # noqa: B018
+    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
+        choice = choose(records.data, given)
+        result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]
     content = json.dumps(plain({**result.content(), "written": list(map(str, written))}), allow_nan=False)
     write_files({written[0]: content.encode() + b"\n", written[1]: result.drawing().saved()})
     emit(result, form.form, written)
 
 
-def _searched(
-    records: Records,
-    ranges: tuple[tuple[int, int], tuple[int, int]],
-    bounds: tuple[float, float] | None,
-    state: StateOptions,
-    integrators: int,
-) -> OrderSearchResult:
-    """Return the search, over the delays that ``ctid check`` suggests where none are given."""
-    from ctid_cli.estimators.order_search import search_orders
-    from ctid_cli.reporting.order_proposal import proposed_delay
-    from ctid_cli.reporting.order_result import OrderSearchResult
-
-    choice = ""
-    if bounds is None:
-        bounds, choice = proposed_delay(records.data, records.units.time)
-    try:
-        found = search_orders(
-            *(records.data, *ranges, bounds),
-            initial_state=state.initial_state,
-            offset=state.offset,
-            validation=None if records.validation is None else records.validation.record,
-            integrators=integrators,
-        )
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    return OrderSearchResult(found, records, choice)
-
-
-def _range(name: str, text: str, least: int) -> tuple[int, int]:
+def _range(name: str, text: str | None, least: int) -> tuple[int, int] | None:
+    if text is None:
+        return None
     found = span(text, int)
     if found is None or not least <= found[0] <= found[1] <= 12:
         raise UsageError(

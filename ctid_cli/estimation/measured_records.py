@@ -1,9 +1,10 @@
 r"""Measured records laid out for estimation: delay, initial state, offset, several experiments, and what is refused.
 
-.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + e_k
+.. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + d (t_k-t_0) + e_k
 
 ``C/A`` applied to an impulse at the first used instant ``t_s`` spans every free response of A, so the n coefficients of
-C are the initial state, whatever happened before. C and the offset c belong to one experiment each, the rest is common.
+C are the initial state, whatever happened before. C, the offset c and the drift d belong to one experiment each, the
+rest is common.
 """
 
 from collections.abc import Sequence
@@ -33,8 +34,10 @@ from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
-from ctid_cli.signals.treatment import InitialState, Offset, OutputHold
+from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
+#: Parameters of the powers of time that the output has beside the response.
+TREND_NAMES = ("offset", "drift", "drift2", "drift3")
 #: Random starts, this number and as many again for each pole.
 RANDOM_STARTS = 2
 
@@ -46,14 +49,15 @@ class Layout:
     structure: Structure
     experiments: int = 1
     initial_state: bool = False
-    offset: bool = False
+    #: Powers of time.
+    trend: tuple[int, ...] = ()
     #: Poles at the origin: that many of the last coefficients of the denominator are zero.
     integrators: int = 0
 
     @property
     def own(self) -> int:
         """Number of parameters that belong to one experiment."""
-        return self.structure.poles * self.initial_state + int(self.offset)
+        return self.structure.poles * self.initial_state + len(self.trend)
 
     @property
     def size(self) -> int:
@@ -67,7 +71,7 @@ class Layout:
         for k in range(self.experiments):
             tail = f"_{k + 1}" if self.experiments > 1 else ""
             names += [f"x{i}{tail}" for i in range(1, self.structure.poles + 1)] * self.initial_state
-            names += [f"offset{tail}"] * self.offset
+            names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
         return tuple(names)
 
     def theta(self, model: TransferFunction) -> Array:
@@ -84,7 +88,8 @@ class Layout:
         """Initial state and offset of one experiment."""
         first = self.first(experiment)
         own = theta[first : first + self.own]
-        return own[: self.structure.poles * self.initial_state], float(own[-1]) if self.offset else 0.0
+        states = self.structure.poles * self.initial_state
+        return own[:states], float(own[states]) if self.trend[:1] == (0,) else 0.0
 
     def first(self, experiment: int) -> int:
         """Where the parameters of an experiment begin."""
@@ -107,7 +112,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     powers = np.linalg.inv(numerators(*sections))
     direct = b[0] if m == n else 0.0
     output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
-    columns = Columns.of(n, second=True, free=layout.initial_state, offset=layout.offset)
+    columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.trend)
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
@@ -129,8 +134,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
             alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
             driven_alone[:, :n] = -powers.T
             alone[:, first : first + n] = powers.T
-        if layout.offset:
-            wanted[-1, first + layout.own - 1] = 1.0
+        wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
         states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
         rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
@@ -149,6 +153,8 @@ class Treatment(NamedTuple):
     bridge: bool = False
     #: Poles at the origin, counted among those of the structure.
     integrators: int = 0
+    #: Input before the first sample of a record that begins at rest [input unit].
+    input_before: InputBefore = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,20 +187,23 @@ class MeasuredRecords:
         self.structure = structure
         self.treatment, self.known = treatment, known
         free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
-        # The free response of an integrator is a constant.
-        offset = treatment.offset == "estimate" and not (free_state and integrators)
-        self.layout = Layout(structure, len(records), free_state, offset, integrators)
+        # Integrators make powers of time of an offset of their input; the lower ones are their free responses.
+        highest = {"estimate": integrators, "drift": 1}.get(treatment.offset, -1)
+        trend = tuple(range(integrators if free_state else 0, highest + 1))
+        self.layout = Layout(structure, len(records), free_state, trend, integrators)
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
         bridged = [_bridged(record) if treatment.bridge else record for record in records]
-        centred = [without_means(record) if removed else (record, 0.0, 0.0) for record in bridged]
+        level = treatment.input_before
+        centred = [without_means(record) if removed else above_level(record, level) for record in bridged]
         self.records = [one for one, _, _ in centred]
         self.input_offsets = [u0 for _, u0, _ in centred]
         self.offsets = [y0 for _, _, y0 in centred]
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
-            check_record(record, data, self.layout.size, self.layout.initial_state)
+            may_be_constant = self.layout.initial_state or treatment.input_before is not None
+            check_record(record, data, self.layout.size, may_be_constant)
         each = zip(records, self.offsets, self.data, strict=True)
         #: Outputs at the used samples as they were measured, less their means where those are removed.
         self.outputs = [record.y[used_samples(data, record)] - y0 for record, y0, data in each]
@@ -224,12 +233,13 @@ class MeasuredRecords:
         low, high = self.treatment.delay_bounds
         if high > 0:
             check_greatest_delay(record, high)
-        if np.ptp(record.input.values) > 0.0:
+        first, before = float(record.input.values[0]), self.treatment.input_before
+        if np.ptp(record.input.values) > 0.0 or before not in (None, "first", first):
             return
-        constant = f"{named(record)}the input is constant ({record.input.values[0]:g}) over the whole record"
         if low < high or self.treatment.initial_state != "estimate":
             raise DataError(
-                f"{constant}: only a free response tells anything; give a known delay and initial_state 'estimate'"
+                f"{named(record)}the input is constant ({first:g}) over the whole record; if the record begins with "
+                "its step, give the level of the input before it: input_before (--input-before VALUE)"
             )
 
     def _lay_out(self, record: Record) -> FilterData:
@@ -249,9 +259,7 @@ class MeasuredRecords:
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
         layout, integrators = self.layout, self.treatment.integrators
-        return Problem(
-            data, self.structure.zeros, layout.initial_state, layout.offset, periods, integrators=integrators
-        )
+        return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
 
     def part(self) -> "MeasuredRecords | None":
         """The liveliest parts of long records, each from a state of its own; None where they tell too little."""
@@ -262,14 +270,14 @@ class MeasuredRecords:
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
         cut = [_cut(record, part) for record, part in zip(self.records, parts, strict=True)]
         with suppress(DataError):
-            own = treatment._replace(initial_state="estimate", offset=offset, bridge=False)
+            own = treatment._replace(initial_state="estimate", offset=offset, bridge=False, input_before=None)
             return MeasuredRecords(cut, self.structure, own)
         return None
 
     @cached_property
     def centred(self) -> FilterData:
         """The first record without its means, for starts that know no offset and no initial state."""
-        if self.treatment.offset != "estimate":
+        if self.treatment.offset not in ("estimate", "drift"):
             return self.data[0]
         return self._lay_out(without_means(self.records[0])[0])
 
@@ -325,7 +333,7 @@ class MeasuredRecords:
         theta = layout.theta(found.model)
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
-            theta[first : first + layout.own] = [*state, found.offsets[k]][: layout.own]
+            theta[first : first + layout.own] = [*state, *found.trends[k]]
         return layout, theta
 
     def simulated(self, found: Optimum) -> list[Array]:
@@ -347,7 +355,8 @@ class MeasuredRecords:
         Among the models that are admissible without them: in a smaller set the cost might be higher.
         """
         problem, bounds = self.problem, self.treatment.delay_bounds
-        more = problem._replace(free_response=problem.free_response or initial_state, offset=problem.offset or offset)
+        trend = problem.trend or (0,) * offset
+        more = problem._replace(free_response=problem.free_response or initial_state, trend=trend)
         box = box_of(problem, bounds)
         return local_minimum(more, self.free_poles(model), model.delay, bounds, box=box, known=self.known).squared_error
 
@@ -404,6 +413,15 @@ def _cut(record: Record, part: slice) -> Record:
     """Some samples of a record whose input is known at them."""
     t, signal = record.t[part], record.input
     return Record(t, record.y[part], HeldSignal(t, signal.values[part], signal.hold), name=record.name)
+
+
+def above_level(record: Record, before: InputBefore) -> tuple[Record, float, float]:
+    """Record whose input counts from the level before its first sample, that level, and zero for its output."""
+    signal = record.input
+    level = float(signal.values[0]) if before == "first" else float(before or 0.0)
+    if not level:
+        return record, 0.0, 0.0
+    return replace(record, input=HeldSignal(signal.t, signal.values - level, signal.hold)), level, 0.0
 
 
 def without_means(record: Record) -> tuple[Record, float, float]:

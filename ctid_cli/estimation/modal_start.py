@@ -130,7 +130,7 @@ class _Search:
         self.direct = any(term.zeros == term.order for term in terms)
         # Of one period the state at the first sample is unknown, too.
         unknown = problem.initial_state != "rest"
-        self.problem = Problem((data,), 0, unknown, False, (0.0,), integrators=self.integrators)
+        self.problem = Problem((data,), 0, unknown, (), (0.0,), integrators=self.integrators)
         self.box = box_of(self.problem, delays)
 
     def descent(self, poles: int) -> Descent:

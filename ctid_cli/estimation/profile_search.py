@@ -108,9 +108,13 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
     cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
     treatment = measured.treatment
     # What filters see must be the answer to the input alone, or to one that is known from the start of the window on.
-    at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset != "estimate"
+    at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset not in ("estimate", "drift")
     # With integrators they leave the mean out, and nothing is known at rest.
-    if (at_rest or treatment.integrators) and len(measured.records) == 1 and measured.structure.delay:
+    if (
+        (at_rest or (treatment.integrators and not any(measured.layout.trend)))
+        and len(measured.records) == 1
+        and measured.structure.delay
+    ):
         yield _search_levels(cost)
     yield _search_samples(cost)
 

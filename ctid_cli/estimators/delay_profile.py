@@ -23,7 +23,7 @@ from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset, OutputHold
+from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
 
 class Starts(NamedTuple):
@@ -185,8 +185,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record: at rest (zero input before the first sample), estimated with the model, or the steady
         state of an input that repeats the record for ever.
-    offset : {"none", "remove", "estimate"}, default "none"
-        Constant offset of the output: none, means of input and output subtracted first, or estimated with the model.
+    offset : {"none", "remove", "estimate", "drift"}, default "none"
+        Offset of the output: none, means of input and output subtracted first, or a constant estimated with the model;
+        ``drift`` estimates a slope besides [output unit/s], the offset being that at the first instant.
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
         (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.
@@ -209,8 +210,11 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         the admissible models that have them. A known delay is given in ``delay_bounds``.
     integrators : int, default 0
         Poles at the origin besides ``poles``, which may then be 0: the model is ``B/(p^l A)``, and the last l
-        coefficients of its denominator are known to be zero. With an estimated initial state the offset of the output
-        is part of it; an offset of the input is a ramp of the output, which no ``offset`` treats.
+        coefficients of its denominator are known to be zero. An estimated offset is then that of the input too: powers
+        of time up to l, of which an estimated initial state has all but the last.
+    input_before : float or "first", optional
+        Constant input before the first sample [input unit], with which the system is at rest, or "first" for the first
+        value of each record; None is zero. It is subtracted from the input.
 
     Raises
     ------
@@ -253,12 +257,26 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     bootstrap_draws: int = DRAWS
     fixed: tuple[Fixed, ...] | None = None
     integrators: int = 0
+    input_before: InputBefore = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.integrators and self.offset == "remove":
             raise OptionError(
                 "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
+            )
+        if self.integrators and self.offset == "drift":
+            raise OptionError(
+                "offset", "offset drift goes without integrators, whose estimated offset is a drift; use estimate"
+            )
+        if not (self.input_before in (None, "first") or np.isfinite(self.input_before)):
+            raise OptionError(
+                "input_before", f"input_before must be a finite number or first; got {self.input_before!r}"
+            )
+        if self.input_before is not None and (self.initial_state != "rest" or self.offset == "remove"):
+            given = f"got initial_state {self.initial_state} and offset {self.offset}"
+            raise OptionError(
+                "input_before", f"input_before goes with initial_state rest and no removed means; {given}"
             )
         if self.integrators and self.initial_state == "periodic":
             raise OptionError(
@@ -292,6 +310,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                 self.hold_output,
                 bridge=self.loss != "squares",
                 integrators=self.integrators,
+                input_before=self.input_before,
             ),
             KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING,
         )

@@ -13,7 +13,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators import identification_warnings as warnings
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
 from ctid_cli.estimators.measured_submodels import LaidOut, MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.estimators.residual_causes import another_delay, another_order
@@ -57,6 +57,8 @@ class Validation(DeferredFields):
     #: ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
     r2: float
     count: int
+    #: Treatment of state and offset, where it was chosen for this record.
+    options: DelayProfile | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +91,8 @@ class Identification(DeferredFields, FittedModel, Shown):
         The model on another record.
     records : tuple of Record
         What it was estimated from.
+    choices : tuple of str
+        What was chosen where nothing was given, and why, one sentence each.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("records",)
@@ -106,6 +110,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     warnings: tuple[str, ...]
     validation: Validation | None = None
     records: tuple[Record, ...] = field(default_factory=tuple)
+    choices: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"

@@ -117,7 +117,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.offset == "estimate":
+        if self.offset in ("estimate", "drift"):
             raise OptionError("offset", "submodels have no offset to estimate; use remove, or none")
         if not self.factored and (len(self.terms) > 1 or self.fixed or self.terms[0].integrators):
             raise OptionError("factored", "only one term without integrators and known parameters is one fraction")

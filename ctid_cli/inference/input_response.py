@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -101,7 +101,11 @@ def output_bandwidth(record: Record) -> float:
     of a fit as a function of the delay all the same. After an input of three steps or fewer, the bandwidth is
     that of a first-order system as fast as the answer.
     """
-    return analyse_response(record).bandwidth
+    moves = input_moves(record)
+    if moves.kind == "constant" and record.input.values[0]:
+        # A step at the first sample.
+        moves = replace(moves, kind="steps", changes=record.t[:1])
+    return analyse_response(record, moves).bandwidth
 
 
 def analyse_response(record: Record, moves: InputMoves | None = None) -> InputResponse:

@@ -126,8 +126,8 @@ def autoregress(columns: Array, coefficients: Array) -> None:
                 columns[t, j] -= coefficients[i] * columns[t - i, j]
 
 
-def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> NoiseModel:
-    """Yule-Walker model of the noise, of the order that Akaike's criterion chooses.
+def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None, penalty: float = 2.0) -> NoiseModel:
+    """Yule-Walker model of the noise, of the order that Akaike's criterion chooses, or that with another penalty.
 
     The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero; no product reaches from one experiment
     into another. An ARMA noise is approximated: the order grows with the record.
@@ -152,7 +152,7 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None) -> No
             break
         coefficients = np.append(coefficients, 0.0)
         coefficients = coefficients + reflection * coefficients[::-1]
-        criterion = count * np.log(variance) + 2 * order
+        criterion = count * np.log(variance) + penalty * order
         if criterion < best_criterion:
             best_criterion = criterion
             best = NoiseModel(coefficients, covariances[: order + 1], variance, partial[:order])

@@ -46,6 +46,8 @@ class Units:
             return self.time
         if name.startswith("offset"):
             return self.output
+        if name.startswith("drift"):
+            return self._over_time(self.output, 1 if name[5:6] in ("", "_") else int(name[5]))
         k = int(name[1:].split("_")[0])
         unit, power = {"a": ("1", k), "b": (self.gain, poles - zeros + k)}.get(name[0], (self.output, k - 1))
         return self._over_time(unit, power)

@@ -49,6 +49,7 @@ def fit_content(fitted: Identification, records: Records) -> dict[str, Any]:
         "initial_state": {"treatment": options.initial_state, "values": fit.initial_states},
         "offset": {"treatment": options.offset, "output": fit.offsets, "input": fit.input_offsets},
         "modes": _modes(fit, units),
+        "choices": fitted.choices,
         "warnings": fitted.warnings,
         "notes": [note for measurement in measurements for note in measurement.notes],
         "derived": [picked(row, DERIVED_KEYS) for row in derived_of(fitted, units)],

@@ -49,6 +49,7 @@ TREATMENTS = {
     "rest": "at rest before the record",
     "estimate": "estimated with the model",
     "periodic": "steady state of an input that repeats the record",
+    "drift": "constant and slope estimated with the model",
     "none": "none",
     "remove": "means of input and output subtracted",
 }
@@ -65,8 +66,6 @@ class FitResult(Result):
 
     fitted: Identification
     records: Records
-    #: What was chosen where nothing was given, and why.
-    choices: Sequence[str] = ()
 
     @classmethod
     def of(cls, fitted: Identification) -> FitResult:
@@ -83,7 +82,7 @@ class FitResult(Result):
         """Return records, settings, parameters, derived quantities, diagnostics and warnings."""
         warnings = [f"- {warning}" for warning in self.fitted.warnings]
         return [
-            *(Section(sentences=[choice]) for choice in self.choices),
+            *([Section("Chosen:", [f"- {choice}" for choice in self.fitted.choices])] if self.fitted.choices else []),
             self.data(),
             Section(frame=pairs(self.settings())),
             self.parameters(),
@@ -134,7 +133,10 @@ class FitResult(Result):
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
         if isinstance(options, MeasuredSubmodels):
             yield from _iteration(self.fitted, options, first)
-        yield "initial state", f"{TREATMENTS[options.initial_state]} (--initial-state {options.initial_state})"
+        yield (
+            "initial state",
+            f"{TREATMENTS[options.initial_state]}{_before(self.fitted)} (--initial-state {options.initial_state})",
+        )
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
         yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
         if fit.weighting is not None:
@@ -148,7 +150,7 @@ class FitResult(Result):
         yield "", "y measured, x simulated, over the samples used"
         if validation is not None:
             text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
-            text += f"{count(validation.count, 'sample')}; initial state and offset treated in the same way"
+            text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
             yield "validation", text
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
         yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
@@ -237,6 +239,13 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     labels = measurement.label("input", units.input), measurement.label("output", units.output)
     columns = f"input {labels[0]}, output {labels[1]}"
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
+
+
+def _before(result: Identification) -> str:
+    """Return the input before the record, where it is not zero."""
+    before = getattr(result.options, "input_before", None)
+    levels = ", ".join(f"{level:.6g}" for level in result.fit.input_offsets)
+    return "" if before is None else f", with the input at {levels} (--input-before {before})"
 
 
 def _offset(result: Identification, units: Units) -> str:

@@ -1,4 +1,4 @@
-"""The figure of an order search: what each structure gains."""
+"""The figure of the structures of a choice: what each gains."""
 
 from __future__ import annotations
 
@@ -6,41 +6,46 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctid_cli.estimators.order_search import OrderSearch
+from ctid_cli.identification.choice import Choice
 from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def order_drawing(found: OrderSearch, title: str) -> Drawing:
-    """Root mean square error, and BIC above the least, over the number of poles; a line for each number of zeros."""
+def order_drawing(choice: Choice, title: str) -> Drawing:
+    """Root mean square error, and the criterion above the least, over all poles; a line for each number of zeros.
+
+    Structures with an integrator are drawn with open marks.
+    """
 
     def draw(figure: Figure) -> None:
         error, criterion = figure.subplots(1, 2)
-        by_size = sorted(found.orders, key=lambda each: each.options.poles)
-        for zeros in sorted({each.options.zeros for each in by_size}):
-            own = [each for each in by_size if each.options.zeros == zeros]
-            poles = [each.options.poles for each in own]
+        best = choice.ranking.best
+        by_size = sorted(choice.ranking.candidates, key=lambda each: each.options.order)
+        families = sorted({(each.options.zeros, each.options.integrators) for each in by_size})
+        for zeros, integrators in families:
+            own = [each for each in by_size if (each.options.zeros, each.options.integrators) == (zeros, integrators)]
+            poles = [each.options.order for each in own]
             look = dict(LOOKS[zeros % len(LOOKS)], markersize=5, linewidth=1.0)
-            label = f"{zeros} zero{'s' * (zeros != 1)}"
+            look |= {"fillstyle": "none", "linestyle": ":"} if integrators else {}
+            label = f"{zeros} zero{'s' * (zeros != 1)}{', integrator' * bool(integrators)}"
             error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
-            above = np.array([each.criteria.bic - found.best.criteria.bic for each in own])
+            above = np.array([each.criterion - best.criterion for each in own])
             criterion.plot(poles, above, label=label, **look)
-        best = found.recommended
-        if best is not None:
-            at = best.options.poles, 0.0
-            criterion.plot(*at, "o", color=MARK, markersize=13, fillstyle="none", label="recommended")
+        if choice.seen:
+            at = best.options.order, 0.0
+            criterion.plot(*at, "o", color=MARK, markersize=13, fillstyle="none", label="chosen")
         error.set_yscale("log")
         # Linear where structures differ by little, logarithmic beyond.
         criterion.set_yscale("symlog", linthresh=10.0)
         error.set_ylabel("root mean square output error")
-        criterion.set_ylabel("BIC above the least")
+        criterion.set_ylabel("criterion above the least")
         for axes in (error, criterion):
-            axes.set_xlabel("poles")
-            axes.set_xticks(sorted({each.options.poles for each in by_size}))
+            axes.set_xlabel("poles, integrators included")
+            axes.set_xticks(sorted({each.options.order for each in by_size}))
         handles, labels = criterion.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 6), frameon=False)
         error.set_title(plain(title), loc="left")
 
     return Drawing(7.5, 3.7, draw)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ctid_cli.identification.choice import Choice
 from ctid_cli.inference.record_check import RecordReport
 from ctid_cli.reporting.document import Result, Section
-from ctid_cli.reporting.order_proposal import Proposal
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.table import ROLES, USUAL_NAMES, split_header
 from ctid_cli.text import count
@@ -29,7 +29,7 @@ class RecordCheckResult(Result):
 
     measurement: Measurement
     report: RecordReport
-    proposal: Proposal | None
+    proposal: Choice | None
 
     def sections(self) -> list[Section]:
         """Return findings, numbers, and how to go on."""
@@ -43,7 +43,7 @@ class RecordCheckResult(Result):
             Section("", [head, self.verdict, *measurement.notes]),
             Section("", found),
             Section(frame=self.to_frame(), formats=dict.fromkeys(NUMBERS, ".4g")),
-            Section("", [] if self.proposal is None else [self.proposal.sentence]),
+            Section("", [] if self.proposal is None else self.proposal.sentences),
             Section("", further),
         ]
 
@@ -82,27 +82,19 @@ class RecordCheckResult(Result):
             name = split_header(getattr(measurement, role))[0]
             if name.lower() not in USUAL_NAMES[role][:2] and Path(report.name).suffix.lower() != ".mat":
                 words += [f"--{role}", name]
-        poles, zeros = (1, 0) if proposal is None else (proposal.poles, proposal.zeros)
-        bounds = report.suggested_delay if proposal is None else proposal.delay_bounds
-        options = [
-            ("--poles", poles, None),
-            ("--zeros", zeros, None),
-            ("--delay", bounds and "{:g}:{:g}".format(*bounds), None),
-            ("--hold", measurement.record.input.hold, "zoh"),
-            ("--from", _instant(measurement.start), None),
-            ("--to", _instant(measurement.stop), None),
-            ("--offset", report.suggested_offset, "none"),
-            ("--initial-state", report.suggested_initial_state, "rest"),
-        ]
-        for option, value, usual in options:
-            words += [] if value in (None, usual) else [option, str(value)]
+        words += [] if proposal is None else proposal.words()
+        for option, value in (("--from", _instant(measurement.start)), ("--to", _instant(measurement.stop))):
+            words += [] if value is None else [option, str(value)]
         return shlex.join(words)
 
     def content(self) -> dict[str, Any]:
         """Return numbers, findings and proposal for JSON."""
         content = asdict(self.report)
         proposal = self.proposal
-        proposed = proposal and {"poles": proposal.poles, "zeros": proposal.zeros, "reason": proposal.sentence}
+        proposed = proposal and {
+            **{name: getattr(proposal.options, name) for name in ("poles", "zeros", "integrators")},
+            "reason": " ".join(proposal.sentences),
+        }
         columns = {
             role: {"column": getattr(self.measurement, role), "unit": getattr(self.measurement, f"{role}_unit")}
             for role in ROLES

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,14 @@ class Records:
     def data(self) -> list[Record]:
         """The records themselves."""
         return [each.record for each in self.measurements]
+
+    def with_data(self, data: Sequence[Record], validation: Record | None) -> Records:
+        """Return the same files with their records as they were taken."""
+        pairs = zip(self.measurements, data, strict=True)
+        other = self.validation
+        if other is not None and validation is not None:
+            other = replace(other, record=validation)
+        return Records([replace(each, record=record) for each, record in pairs], other)
 
     @cached_property
     def units(self) -> Units:

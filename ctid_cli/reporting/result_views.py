@@ -59,7 +59,7 @@ class SingleFit(Result):
     def plot(self) -> Any:
         """Refuse: there is no record to draw."""
         what = f"a single {type(self.fit).__name__} does not hold the record that it would be drawn with"
-        raise UsageError(f"{what}; identify(DelayProfile(...), [record]).plot() does")
+        raise UsageError(f"{what}; identify(record).plot() does")
 
     def _parameters(self) -> list[UncertainValue]:
         values, errors, reach = self.fit.parameters, self.fit.standard_errors, self.fit.quantiles

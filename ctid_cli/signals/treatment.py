@@ -15,7 +15,10 @@ ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
 OutputHold = Literal["zoh", "foh"]
 #: The state of the system before the record.
 InitialState = Literal["rest", "estimate", "periodic"]
-#: A constant that the output has beside the answer to the input.
-Offset = Literal["none", "remove", "estimate"]
+#: A constant, or a constant and a slope, that the output has beside the response to the input.
+Offset = Literal["none", "remove", "estimate", "drift"]
+#: The constant input before the first sample of a record that begins at rest [input unit]: a value, the first one of
+#: the record, or None for zero.
+InputBefore = float | Literal["first"] | None
 #: What output errors count: their squares, or less where they are large.
 LossKind = Literal["squares", "huber", "tukey"]

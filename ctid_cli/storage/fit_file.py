@@ -147,7 +147,9 @@ class StoredFit:
 
     def _applied(self) -> dict[str, Any]:
         assert self.validation is not None
-        fit, options, record = self.result.fit, self.result.options, self.validation.record
+        fit, record = self.result.fit, self.validation.record
+        own = self.result.validation
+        options = self.result.options if own is None or own.options is None else own.options
         laid_out = laid_out_validation(options, record)
         return {"record": record, "applied": options._applied(fit, laid_out)}
 
@@ -184,7 +186,7 @@ def load_fit(
     >>> from ctid_cli import DelayProfile, Record, identify, load_fit, save_fit
     >>> t = 0.1 * np.arange(200)
     >>> record = Record.from_arrays(t, np.sign(np.sin(t)), np.sin(t) + 0.1 * np.cos(9 * t))
-    >>> fit = identify(DelayProfile(poles=1, zeros=0, delay_bounds=(0, 2)), [record])
+    >>> fit = identify([record], DelayProfile(poles=1, zeros=0, delay_bounds=(0, 2)))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     save_fit(fit, f"{folder}/fit.json")
     ...     again = load_fit(f"{folder}/fit.json")

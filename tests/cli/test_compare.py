@@ -56,7 +56,7 @@ def test_exported_code_builds_the_model(ctid, home, tmp_path, options):
 def test_models_are_compared_from_python_with_one_treatment(home):
     record, other = read_record("record.csv"), read_record("other.csv")
     options = DelayProfile(2, 0, (0.0, 3.0), offset="estimate")
-    fits = [identify(options, [record]), options.fit(record, None)]
+    fits = [identify([record], options), options.fit(record, None)]
     own, plain = compare(fits, other)
     assert (own.offset, plain.offset) == ("estimate", "none")
     assert own.fit_percent > plain.fit_percent + 20

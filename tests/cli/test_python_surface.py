@@ -11,9 +11,9 @@ import pytest
 import ctid_cli
 from ctid_cli import (
     CtidError,
-    DelayProfile,
     Flag,
     FrequencyTrack,
+    Given,
     SpecError,
     TransferFunction,
     identify,
@@ -79,9 +79,9 @@ def test_mistakes_are_named(tmp_path):
 
 def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     record = write(tmp_path / "record.csv", rows())
-    printed = ctid("fit --poles 1 --hold zoh --out", tmp_path, record).stdout
-    found = identify(DelayProfile(1, 0, (0.0, 0.0), nested=True), [read_record(record)])
-    assert found.summary().split("\n\n")[2:4] == printed.split("\n\n")[2:4]
+    printed = ctid("fit --poles 1 --out", tmp_path, record).stdout
+    found = identify(read_record(record), Given(poles=1))
+    assert found.summary().split("\n\n")[3:5] == printed.split("\n\n")[3:5]
     assert len(found.plot().axes) == 4
     assert found._repr_html_().count("<table>") == 4
     fit = found.fit

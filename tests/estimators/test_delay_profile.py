@@ -46,7 +46,7 @@ def record_of(model=SYSTEM, *, n=600, seed=0, noise=0.0, irregular=False, offset
 def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irregular):
     rng = np.random.default_rng(3)
     data = [filter_data(record_of(n=80, seed=k, noise=0.1, irregular=irregular), 1.0) for k in range(2)]
-    layout = Layout(structure, 2, initial_state=True, offset=True)
+    layout = Layout(structure, 2, initial_state=True, offset=1)
     problem = Problem(tuple(data), structure.zeros, True, True, (0.0, 0.0))
     n, m = structure.poles, structure.zeros
     a = np.poly([-0.8, -1.0 + 2.0j, -1.0 - 2.0j][-n:]).real[1:] if n > 1 else np.array([1.3])

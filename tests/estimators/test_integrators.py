@@ -7,7 +7,6 @@ from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed, Start
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
-from ctid_cli.estimators.order_search import search_orders
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
@@ -83,14 +82,6 @@ def test_instrumental_variables_end_at_the_same_estimate(initial_state):
     submodel = MeasuredSubmodels((Term(1, 0, 1),), 0.73, initial_state=initial_state).fit(record)
     np.testing.assert_allclose(ours.model.numerator, submodel.model.numerator, rtol=1e-4)
     np.testing.assert_allclose(ours.model.denominator, submodel.model.denominator, rtol=1e-4)
-
-
-def test_orders_are_searched_beside_integrators():
-    record = integrating(6, [1.5], [1, 0.5, 0], free=lambda t: 2.0 + 0.0 * t)
-    found = search_orders(record, (0, 2), (0, 1), (0, 2), initial_state="estimate", integrators=1)
-    assert (found.best.options.poles, found.best.options.zeros) == (1, 0)
-    assert found.of(0, 0) is not None
-    assert found.of(0, 1) is None
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from ctid_cli.inference.criteria import information_criteria, r_squared, r_t_squared, young_information_criterion
+from ctid_cli.inference.criteria import (
+    cross_validated_errors,
+    information_criteria,
+    r_squared,
+    r_t_squared,
+    young_information_criterion,
+)
 
 
 def test_information_criteria_by_hand():
@@ -43,3 +49,13 @@ def test_young_information_criterion_by_hand():
     assert young_information_criterion(e, y, np.array([2.0, 0.0]), covariance) == np.inf
     assert np.isnan(young_information_criterion(e, y, np.array([2.0, 1.0]), np.full((2, 2), np.nan)))
     assert np.isnan(young_information_criterion(e, np.ones(4), np.array([2.0, -4.0]), covariance))
+
+
+def test_cross_validation_of_linear_least_squares_is_that_of_fits_without_each_block():
+    rng = np.random.default_rng(1)
+    psi, y = rng.standard_normal((50, 3)), rng.standard_normal(50)
+    e = y - psi @ np.linalg.lstsq(psi, y, rcond=None)[0]
+    (left,) = cross_validated_errors([e], [psi])
+    rest = np.arange(50) >= 5
+    without = np.linalg.lstsq(psi[rest], y[rest], rcond=None)[0]
+    np.testing.assert_allclose(left[:5], y[:5] - psi[:5] @ without)

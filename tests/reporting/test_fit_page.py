@@ -36,7 +36,7 @@ def fitted():
     """A fit with everything, its records and its page."""
     measured, other = [measurement(0, HOSTILE)], measurement(1, "other.csv")
     options = DelayProfile(2, 0, (0, 2), initial_state="estimate", offset="estimate")
-    result = identify(options, [item.record for item in measured], other.record)
+    result = identify([item.record for item in measured], options, other.record)
     return result, measured, other
 
 
@@ -106,7 +106,7 @@ def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
     t = 0.1 * np.arange(200)
     record = Record.from_arrays(t, np.repeat(rng.choice([-1.0, 1.0], 40), 5), rng.standard_normal(200), name="noise")
     measured = [Measurement.of(record)]
-    result = identify(DelayProfile(1, 0, (0.5, 0.5)), [record])
+    result = identify([record], DelayProfile(1, 0, (0.5, 0.5)))
     text, again = page_of(result, measured, None, tmp_path)
     assert text == again
     page = Page(text)

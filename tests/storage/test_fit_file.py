@@ -73,7 +73,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_a_fit_is_read_back_to_the_last_bit(case, tmp_path):
     options, n, noise = CASES[case]
-    result = identify(options, [record_of(k) for k in range(n)], record_of(5), *noise)
+    result = identify([record_of(k) for k in range(n)], options, record_of(5), *noise)
     save_fit(result, tmp_path / "fit.json")
     again = load_fit(tmp_path / "fit.json")
     require_same(result, again)
@@ -101,7 +101,7 @@ def stored(fitted, tmp_path):
     file = tmp_path / "data" / "record.csv"
     file.write_text(fitted, encoding="utf-8")
     measured = [read_measurement(file, stop=25.0)]
-    result = identify(DelayProfile(2, 0, (0.7, 0.7)), [measured[0].record])
+    result = identify(measured[0].record, DelayProfile(2, 0, (0.7, 0.7)))
     text = FitResult(result, Records(measured)).file_text(tmp_path)
     (tmp_path / "fit.json").write_text(text, encoding="utf-8")
     return result, tmp_path / "fit.json"

@@ -32,10 +32,10 @@ class Optimum:
     numerator: Array
     denominator: Array
     delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and offset;
-    #: zeros without them.
+    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, zeros without
+    #: it; and those of the powers of time.
     free_responses: Array
-    offsets: Array
+    trends: Array
     squared_error: float
     ending: Ending
     #: Fall of the squared error that Newton's step promises, as a fraction of it.
@@ -202,7 +202,7 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
         denominator=a,
         delay=point.delay.seconds,
         free_responses=projected.free @ over,
-        offsets=projected.offset,
+        trends=projected.trend,
         squared_error=best.squared_error,
         ending=best.ending,
         promise=best.promise,

@@ -1,8 +1,8 @@
 r"""Variable projection: the squared output error over the denominator and the delay alone.
 
-.. math:: y(t_k) = \frac{B}{A} u(t_k - \tau) + \frac{C}{A}\delta(t_k - t_s) + c + r_k
+.. math:: y(t_k) = \frac{B}{A} u(t_k - \tau) + \frac{C}{A}\delta(t_k - t_s) + c + d (t_k - t_0) + r_k
 
-For given poles and delay B, C and c follow by linear least squares. With Phi their columns and P the projection on
+For given poles and delay B, C, c and d follow by linear least squares. With Phi their columns and P the projection on
 them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``; since ``r`` is orthogonal to Phi its gradient is
 exact. Known coefficients of B leave Phi, and their part of the response leaves y. The derivatives of ``B/A u`` at a
 fixed B are the same, so that nothing else changes.
@@ -36,23 +36,19 @@ class Problem(NamedTuple):
     #: Degree of the numerator.
     zeros: int
     free_response: bool
-    offset: bool
+    #: Powers of time that are eliminated for each record.
+    trend: tuple[int, ...]
     #: Period [s] of each record that repeats for ever, else 0.
     periods: tuple[float, ...]
     #: Known coefficients ``b_0 ... b_m`` of the numerator, NaN for those that are free; empty where all are.
     numerator: Array = np.zeros(0)
-    #: Poles at 0 that the model has besides. An offset is then part of a free response.
+    #: Poles at 0 that the model has besides. The lowest powers of time are then part of a free response.
     integrators: int = 0
 
     @property
     def length(self) -> float:
         """Length of the longest record [s]."""
         return float(max(data.t[-1] - data.t[0] for data in self.records))
-
-    @property
-    def constant(self) -> bool:
-        """Whether a constant is eliminated by itself."""
-        return self.offset and not (self.integrators and self.free_response)
 
     def sections(self, speed: Array, damping: Array) -> tuple[Array, Array]:
         """Return the sections with the integrators behind them."""
@@ -113,8 +109,8 @@ def _columns(problem: Problem, columns: Columns, rows: Array, states: Array) -> 
     """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models."""
     *many, records, q, _ = rows.shape
     n, shared = columns.n, problem.zeros + 1
-    proper, own = min(shared, n), n * problem.free_response + columns.offset
-    # The numerator is common to all records; a free response and an offset are zero outside their own.
+    proper, own = min(shared, n), n * problem.free_response + len(columns.trend)
+    # The numerator is common to all records; a free response and a trend are zero outside their own.
     phi = np.zeros((*many, records, q, shared + records * own))
     # The last m + 1 states of the chain span B/A u; of degree n there is u itself besides.
     to_states = np.swapaxes(states, -1, -2)
@@ -125,8 +121,7 @@ def _columns(problem: Problem, columns: Columns, rows: Array, states: Array) -> 
         place, record = shared + k * own, slice(k, k + 1)
         if problem.free_response:
             phi[..., record, :, place : place + n] = rows[..., record, :, columns.free_z] @ to_states
-        if columns.offset:
-            phi[..., record, :, place + own - 1] = rows[..., record, :, -1]
+        phi[..., record, :, place + own - len(columns.trend) : place + own] = rows[..., record, :, columns.powers]
     return phi.reshape(*many, records * q, -1), rows[..., columns.u + 1].reshape(*many, -1)
 
 
@@ -169,14 +164,14 @@ class Projected(NamedTuple):
     #: Weights of the states, and of u itself.
     output: Array
     direct: float
-    #: Weights of the states of the free response, and offset, of each record: shapes (K, n) and (K,).
+    #: Weights of the states of the free response, and of the powers of time, of each record: shapes (K, n) and (K, q).
     free: Array
-    offset: Array
+    trend: Array
     span: "Span"
 
 
 def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slopes_too: bool = False) -> Projected:
-    """Eliminate numerator, free responses and offsets for given sections, fastest first.
+    """Eliminate numerator, free responses and trends for given sections, fastest first.
 
     Where :func:`slopes` will follow, one pass over the records can serve both.
     """
@@ -186,17 +181,16 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
     span = Span(problem, triangles, weights_of(problem, speed, damping))
     shared, own = span.solution()
     n, records = span.n, len(problem.records)
-    output, free, offset = np.zeros(n), np.zeros((records, n)), np.zeros(records)
+    output, free, trend = np.zeros(n), np.zeros((records, n)), np.zeros((records, len(problem.trend)))
     output[n - span.proper :] = shared[: span.proper]
-    if problem.free_response or problem.constant:
+    if problem.free_response or problem.trend:
         own = own.reshape(records, -1)
         if problem.free_response:
             free = own[:, :n]
-        if problem.constant:
-            offset = own[:, -1]
+        trend = own[:, own.shape[1] - len(problem.trend) :]
     direct = float(shared[n]) if shared.size > n else 0.0
     squared_error = float(span.residual @ span.residual)
-    return Projected(squared_error, output, direct, free, offset, span)
+    return Projected(squared_error, output, direct, free, trend, span)
 
 
 def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delay: Delay) -> Array:
@@ -212,7 +206,7 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
     for first in range(0, len(modal), at_once):
         own = modal[first : first + at_once]
         group = [form for k in own if isinstance(form := forms[k], Modal)]
-        columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.constant)
+        columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.trend)
         each = zip(problem.records, problem.periods, strict=True)
         rows = np.stack([triangles_of(group, columns, delay, *record) for record in each], axis=1)
         phi, y = _columns(problem, columns, rows, np.stack([form.states for form in group])[:, None])
@@ -226,7 +220,7 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
 def _triangles(problem: Problem, forms: Sequence[Form], delay: Delay, second: bool) -> Triangles:
     """Return the triangles of all records, each in its form."""
     n = forms[0].states.shape[0]
-    columns = Columns.of(n, second, problem.free_response, problem.constant)
+    columns = Columns.of(n, second, problem.free_response, problem.trend)
     each = zip(forms, problem.records, problem.periods, strict=True)
     rows = np.stack([triangle_of(form, columns, delay, data, period) for form, data, period in each])
     return Triangles(forms[0], columns, delay, rows)

@@ -1,8 +1,8 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps
-of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
-condition; this costs little more, so that one route serves the search and its end.
+With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples, ``Z = Q R``: whatever is asked of
+linear maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would
+square the condition; this costs little more, so that one route serves the search and its end.
 """
 
 from collections.abc import Iterator
@@ -35,16 +35,16 @@ class Columns(NamedTuple):
     """Where the rows of n states have what."""
 
     n: int
-    #: Rows of w and of the free response, and constants, that there are.
+    #: Rows of w and of the free response that there are, and the powers of time beside them.
     second: int
     free: int
-    offset: int
+    trend: tuple[int, ...]
 
     @classmethod
-    def of(cls, n: int, second: bool, free: bool, offset: bool) -> "Columns":
-        """Return the columns of rows with or without w, free response and constant."""
+    def of(cls, n: int, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
+        """Return the columns of rows with or without w and free response, and with powers of time."""
         states = 2 * n if second else n
-        return cls(n, states - n, states if free else 0, int(offset))
+        return cls(n, states - n, states if free else 0, trend)
 
     @property
     def u(self) -> int:
@@ -59,12 +59,17 @@ class Columns(NamedTuple):
     @property
     def free_states(self) -> slice:
         """Z and w of the free response."""
-        return slice(self.u + 2, self.size - self.offset)
+        return slice(self.u + 2, self.u + 2 + self.free)
 
     @property
     def size(self) -> int:
         """Number of columns."""
-        return self.u + 2 + self.free + self.offset
+        return self.u + 2 + self.free + len(self.trend)
+
+    @property
+    def powers(self) -> slice:
+        """Powers of the time since the first instant."""
+        return slice(self.u + 2 + self.free, self.size)
 
 
 def rows_of(
@@ -72,14 +77,14 @@ def rows_of(
 ) -> Iterator[Array]:
     """Yield the rows of the used samples, transposed, piece by piece."""
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
-    elapsed = data.t[data.use] if columns.free else data.t
+    elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
     for forced in form.forced(record, second):
         rows = np.empty((columns.size, len(forced)))
         rows[: columns.u + 2] = forced.T
         if columns.free:
             rows[columns.free_states] = form.free(elapsed[done : done + len(forced)] - elapsed[0], second)
-        if columns.offset:
-            rows[-1] = 1.0
+        for row, power in zip(rows[columns.powers], columns.trend, strict=True):
+            row[:] = (elapsed[done : done + len(forced)] - data.t[0]) ** power if power else 1.0
         done += len(forced)
         yield rows
 
@@ -114,11 +119,11 @@ def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: Filte
     # Of each form the rows among those of all modes.
     each = [np.arange(last[place] - widths[place], last[place]) for place in places]
     z, n = np.concatenate(each).reshape(len(forms), columns.n), int(last[-1])
-    whole = Columns.of(n, second=False, free=columns.free > 0, offset=columns.offset > 0)
-    others = np.array([n, n + 1, whole.size - 1])
-    chosen = [z, np.tile(others[:2], (len(forms), 1))]
+    whole = Columns.of(n, second=False, free=columns.free > 0, trend=columns.trend)
+    others = np.arange(whole.size)
+    chosen = [z, np.tile(others[n : n + 2], (len(forms), 1))]
     chosen += [n + 2 + z] if columns.free else []
-    chosen += [np.tile(others[2:], (len(forms), 1))] if columns.offset else []
+    chosen += [np.tile(others[whole.powers], (len(forms), 1))]
     rows_of_forms = np.hstack(chosen)
     triangles: list[Array | None] = [None] * len(forms)
     for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period):

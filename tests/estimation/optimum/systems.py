@@ -45,7 +45,7 @@ def record_of(model, rng, *, samples=300, noise=0.0, regular=True, hold="zoh", o
 def problem_of(records, zeros, *, free_response=False, offset=False, periods=None, integrators=0):
     """Laid out records, and what is eliminated with them."""
     periods = periods or (0.0,) * len(records)
-    return Problem(tuple(records), zeros, free_response, offset, periods, integrators=integrators)
+    return Problem(tuple(records), zeros, free_response, (0,) * offset, periods, integrators=integrators)
 
 
 def best(records, poles, zeros, *, delays=(0.0, 0.0), starts=(), **options):

@@ -29,7 +29,7 @@ def test_a_system_without_noise_is_found(n, m, delay, regular):
     assert 1 <= found.agree <= found.tried
     np.testing.assert_allclose(found.denominator, model.denominator, rtol=1e-6)
     np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-6)
-    np.testing.assert_allclose([found.delay, found.offsets[0]], [delay, 1.5], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose([found.delay, found.trends[0, 0]], [delay, 1.5], rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -78,7 +78,7 @@ def test_the_model_has_the_squared_error_that_is_said():
         HeldSignal(used[:1], np.ones(1)),
         used,
     )
-    x = simulate(found.model, record.input, record.t)[data.use] + free + found.offsets[0]
+    x = simulate(found.model, record.input, record.t)[data.use] + free + found.trends[0, 0]
     assert float(np.sum((data.y_used - x) ** 2)) == pytest.approx(found.squared_error, rel=1e-9)
 
 

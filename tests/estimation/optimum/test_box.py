@@ -81,7 +81,7 @@ def test_a_delay_at_a_sample_keeps_its_side():
 )
 def test_the_set_depends_on_what_is_known_of_the_state(free_response, period, state):
     data = filter_data(record_of(MODEL, np.random.default_rng(1), samples=50))
-    box = box_of(Problem((data,), 0, bool(free_response), False, (period,)), (0.0, 0.0))
+    box = box_of(Problem((data,), 0, bool(free_response), (), (period,)), (0.0, 0.0))
     limits = {name: getattr(limit, state) for name, limit in LIMITS.items()}
     assert box.slowest == pytest.approx(limits["slowest"] / 24.5)
     assert box.fastest == pytest.approx(limits["fastest"] / 0.5)

@@ -34,7 +34,9 @@ def numerator_of(size, known):
 def test_projection_with_known_numerators_is_that_of_dense_matrices(zeros, known, treatment):
     free_response, offset = treatment
     record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3)
-    problem = Problem((filter_data(record),), zeros, free_response, offset, (0.0,), numerator_of(zeros + 1, known))
+    problem = Problem(
+        (filter_data(record),), zeros, free_response, (0,) * offset, (0.0,), numerator_of(zeros + 1, known)
+    )
     delay = Delay(0.0 if zeros == 3 else 0.37, -1)
     shared, own = columns_of(record, DENOMINATOR, zeros, delay.seconds, free_response, offset)
     given = sum(value * shared[:, k] for k, value in known.items())
@@ -79,7 +81,7 @@ def test_known_coefficients_that_hold_poles_at_a_bound():
     assert found.ending in (Ending.AT_BOUND, Ending.CONVERGED)
     assert found.denominator[1] == 0.05
     trials = [[1.0, 0.05, a2] for a2 in np.geomspace(1e-4, 30.0, 200)]
-    problem = Problem((data,), 0, True, False, (0.0,))
+    problem = Problem((data,), 0, True, (), (0.0,))
     for trial in trials:
         poles = np.roots(trial)
         if np.abs(poles).min() >= found.box.slowest and np.abs(poles).max() <= found.box.fastest:
@@ -115,7 +117,7 @@ def test_the_end_of_a_search_is_stationary_along_the_constraint():
     assert found.ending is Ending.CONVERGED
     assert (found.denominator[2], found.numerator[0]) == (values[1], values[4])
     box = found.box
-    descent = Descent(Problem((data,), 1, False, False, (0.0,)), box, known)
+    descent = Descent(Problem((data,), 1, False, (), (0.0,)), box, known)
     here = descent.local(point_of(found.model.poles, found.delay, box))
     basis = null_space(known.slopes(here.point, 5))
     along = basis.T @ here.gradient

@@ -36,7 +36,7 @@ TREATMENTS = [
 
 def problem_of(record, zeros, free_response=False, offset=False, periodic=False):
     period = float(record.t[-1] - record.t[0] + 0.5) if periodic else 0.0
-    return Problem((filter_data(record),), zeros, free_response, offset, (period,))
+    return Problem((filter_data(record),), zeros, free_response, (0,) * offset, (period,))
 
 
 @pytest.mark.parametrize("treatment", TREATMENTS, ids=str)
@@ -46,7 +46,9 @@ def test_projection_is_that_of_dense_matrices(case, treatment, zeros, delay):
     record = record_of(MODEL, np.random.default_rng(1), noise=0.1, offset=0.3, **case)
     problem = problem_of(record, zeros, **treatment)
     found = project(problem, SPEED, DAMPING, Delay(delay, -1)).squared_error
-    dense = squared_error(record, DENOMINATOR, zeros, delay, problem.free_response, problem.offset, problem.periods[0])
+    dense = squared_error(
+        record, DENOMINATOR, zeros, delay, problem.free_response, bool(problem.trend), problem.periods[0]
+    )
     np.testing.assert_allclose(found, dense, rtol=1e-8)
 
 
@@ -114,7 +116,7 @@ def test_masked_samples_do_not_count():
 def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_response, offset):
     rng = np.random.default_rng(7)
     records = [record_of(MODEL, rng, noise=0.1, offset=k, samples=100 + 40 * k, regular=k != 1) for k in range(3)]
-    problem = Problem(tuple(filter_data(record) for record in records), 2, free_response, offset, (0.0,) * 3)
+    problem = Problem(tuple(filter_data(record) for record in records), 2, free_response, (0,) * offset, (0.0,) * 3)
     delay = Delay(0.37, -1)
     found = project(problem, SPEED, DAMPING, delay)
     parts = [columns_of(record, DENOMINATOR, 2, 0.37, free_response, offset) for record in records]
@@ -178,7 +180,7 @@ def test_poles_of_a_section_meet_and_part():
 def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping):
     data = filter_data(record_of(MODEL, np.random.default_rng(3), samples=400, regular=regular))
     form = form_of(np.array([2.0]), np.array([damping]), 100.0)
-    columns = Columns.of(2, False, True, True)
+    columns = Columns.of(2, False, True, (0,))
     (whole,) = rows_of(form, columns, Delay(0.8, -1), data, 0.0)
     monkeypatch.setattr(chain, "PIECE", 37)
     found = np.hstack(list(rows_of(form, columns, Delay(0.8, -1), data, 0.0)))

@@ -20,7 +20,7 @@ from tests.estimation.optimum.systems import MODEL, random_model, random_poles, 
 
 def descent_of(record, zeros, delays=(0.0, 0.0), *, free_response=False, offset=False):
     data = filter_data(record)
-    problem = Problem((data,), zeros, free_response, offset, (0.0,))
+    problem = Problem((data,), zeros, free_response, (0,) * offset, (0.0,))
     return Descent(problem, box_of(problem, delays))
 
 
@@ -124,7 +124,7 @@ def test_without_a_delay_the_slope_is_that_of_a_later_input():
     rng = np.random.default_rng(5)
     record = record_of(TransferFunction([0.5], [1.0, 0.5], 0.3), rng, samples=60, regular=False)
     data = filter_data(record)
-    problem = Problem((data,), 0, False, False, (0.0,))
+    problem = Problem((data,), 0, False, (), (0.0,))
     box = box_of(problem, (0.0, 5.0))
     descent = Descent(problem, box)
     here, later = (point_of(np.array([-0.4 + 0j]), delay, box) for delay in (0.0, 1e-5))

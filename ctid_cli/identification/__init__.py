@@ -1,0 +1,1 @@
+"""From records to a model: what is not given is chosen by one criterion."""

@@ -1,0 +1,180 @@
+"""Fits of many structures to the same records, each found from the smaller ones that it contains."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import best_of_orders
+from ctid_cli.estimation.optimum.box import box_of
+from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
+from ctid_cli.estimators.delay_profile import DelayProfile, fitted
+from ctid_cli.identification.criterion import Candidate, Ranking, ranked
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
+
+#: Most poles, integrators included.
+MOST_POLES = 12
+#: The grid ends at so many poles more than the best structure has, and not before the second number.
+BEYOND, FEWEST_TRIED = 2, 4
+#: All poles and zeros of the structures that settings of records are compared with.
+SMALL = ((1, 0), (2, 1), (3, 2))
+#: Samples for each parameter of a structure at least.
+SAMPLES_PER_PARAMETER = 3
+
+
+class Setting(NamedTuple):
+    """How records are taken."""
+
+    hold: Hold
+    initial_state: InitialState
+    input_before: InputBefore
+    offset: Offset
+
+    @property
+    def state(self) -> tuple[InitialState, InputBefore]:
+        """The state before the records."""
+        return self.initial_state, self.input_before
+
+
+class Span(NamedTuple):
+    """Least and greatest number of poles (integrators not among them) and of zeros, and the numbers of integrators."""
+
+    poles: tuple[int, int] = (0, MOST_POLES)
+    zeros: tuple[int, int] = (0, MOST_POLES)
+    integrators: tuple[int, ...] = (0, 1)
+
+    @classmethod
+    def only(cls, options: DelayProfile) -> "Span":
+        """Return the span of one structure."""
+        poles, zeros = options.poles, options.zeros
+        return cls((poles, poles), (zeros, zeros), (options.integrators,))
+
+    def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
+        """Yield poles and zeros of all structures with so many poles in all."""
+        poles = order - integrators
+        if max(self.poles[0], int(not integrators)) <= poles <= self.poles[1]:
+            for zeros in range(self.zeros[0], min(self.zeros[1], order - int(delay_free)) + 1):
+                yield poles, zeros
+
+    def small(self, integrators: int, delay_free: bool, most: int) -> list[tuple[int, int]]:
+        """Return the structures that settings of records are compared with: small ones, or else the smallest."""
+        orders = range(1, MOST_POLES + max(self.integrators) + 1)
+        found = [(n, each) for n in orders for each in self.structures(n, integrators, delay_free)]
+        small = [each for n, each in found if (n, each[1]) in SMALL[:most]]
+        return small or [each for _, each in found[:1]]
+
+
+def with_hold(record: Record, hold: Hold) -> Record:
+    """Return a record with another hold of its input."""
+    signal = record.input
+    return record if signal.hold == hold else replace(record, input=HeldSignal(signal.t, signal.values, hold))
+
+
+@dataclass(frozen=True, eq=False)
+class Structures:
+    """Structures with one number of integrators, in one setting of the records."""
+
+    records: Sequence[Record]
+    hold: Hold
+    options: DelayProfile
+    measured: MeasuredRecords
+    search: StructureSearch
+    found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        records: Sequence[Record],
+        setting: Setting,
+        integrators: int,
+        delays: tuple[float, float],
+        near: "Structures | None" = None,
+    ) -> "Structures":
+        """Lay records out; searches start from what another setting near this one has led to, if any."""
+        hold, state, before, offset = setting
+        least = int(not integrators)
+        options = DelayProfile(
+            *(least, 0, delays), initial_state=state, offset=offset, integrators=integrators, input_before=before
+        )
+        held = [with_hold(record, hold) for record in records]
+        measured = options.prepare(held).laid_out
+        # One box for all: a wider one for those at rest would favour them.
+        box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
+        pilot = None if near is None else near.search
+        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK, pilot=pilot))
+
+    def fit(self, poles: int, zeros: int) -> Candidate | None:
+        """Fit a structure; None where there are too few samples."""
+        if (poles, zeros) in self.found:
+            return self.found[poles, zeros]
+        options, measured, free = (
+            replace(self.options, poles=poles, zeros=zeros),
+            self.measured,
+            self.search.box.delay_free,
+        )
+        structure = Structure(options.order, zeros, delay=free)
+        size = structure.size - options.integrators + measured.layout_of(options.order, free).own * len(self.records)
+        if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
+            return None
+        found = fitted(measured.with_structure(structure), best_of_orders(self.search, poles, zeros), None, None)
+        self.found[poles, zeros] = Candidate(options, self.hold, found, size)
+        return self.found[poles, zeros]
+
+
+class SmallModels:
+    """A few structures in several settings of the same records."""
+
+    def __init__(
+        self, records: Sequence[Record], span: Span, delays: tuple[float, float], most: int = len(SMALL)
+    ) -> None:
+        self.records, self.span, self.delays, self.most = records, span, delays, most
+        self._structures: dict[tuple[Setting, int], Structures] = {}
+
+    def compared(self, settings: Sequence[Setting]) -> Ranking:
+        """Rank the structures in some settings, which all use the same samples."""
+        found = [each for setting in settings for each in self._fitted(setting)]
+        if not found:
+            raise DataError(f"{self.records[0].name}: too few usable samples for a model's parameters")
+        return ranked(found)
+
+    def _fitted(self, setting: Setting) -> Iterator[Candidate]:
+        for integrators in self.span.integrators:
+            structures = self._laid_out(setting, integrators)
+            for each in self.span.small(integrators, structures.search.box.delay_free, self.most):
+                candidate = structures.fit(*each)
+                if candidate is not None:
+                    yield candidate
+
+    def _laid_out(self, setting: Setting, integrators: int) -> Structures:
+        """Lay records out; another hold or offset has its minima near those that are known."""
+        key = setting, integrators
+        if key not in self._structures:
+            pairs = ((one, number) for one, number in self._structures if one.state == setting.state)
+            alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, alike)
+        return self._structures[key]
+
+
+def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:
+    """Fit structures of ever more poles, until the best lies inside or there are no more."""
+    families = [Structures.of(records, setting, integrators, delays) for integrators in span.integrators]
+    found: list[Candidate] = []
+    most = span.poles[1] + max(span.integrators)
+    for order in range(1, min(most, MOST_POLES) + 1):
+        tried = [
+            family.fit(*structure)
+            for family in families
+            for structure in span.structures(order, family.options.integrators, family.search.box.delay_free)
+        ]
+        found += [each for each in tried if each is not None]
+        if tried and not any(tried):
+            break
+        if order >= FEWEST_TRIED and found and order - ranked(found).best.options.order >= BEYOND:
+            break
+    if not found:
+        raise DataError(f"{records[0].name}: too few usable samples for a model's parameters; take a longer record")
+    return ranked(found)

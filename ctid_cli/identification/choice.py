@@ -1,0 +1,134 @@
+"""What is chosen of a model and of the treatment of its records where nothing is given, and why."""
+
+from dataclasses import dataclass, field
+
+from ctid_cli.errors import OptionError
+from ctid_cli.estimation.common import Fixed
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification.candidates import MOST_POLES, Span
+from ctid_cli.identification.criterion import Ranking
+from ctid_cli.inference.response_test import AnswerTest
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+
+
+@dataclass(frozen=True)
+class Given:
+    """What of a model and of the treatment of its records is given; what is None is chosen.
+
+    Parameters
+    ----------
+    poles, zeros : int or tuple of int, optional
+        Number, or least and greatest number, of poles (integrators not among them) and zeros.
+    integrators : int, optional
+        Poles at the origin; chosen among 0 and 1, and 0 where a number of poles is given.
+    delay_bounds : tuple of float, optional
+        Least and greatest delay [s]; two equal numbers are a known delay.
+    initial_state : {"rest", "estimate", "periodic"}, optional
+        State before the record.
+    offset : {"none", "remove", "estimate", "drift"}, optional
+        Offset of the output.
+    input_before : float or "first", optional
+        Input before the first sample of a record that begins at rest [input unit].
+    hold : {"auto", "zoh", "foh", "band-limited"}, default "auto"
+        The input between its samples.
+    loss : {"squares", "huber", "tukey"}, default "squares"
+        What output errors count in the fit; the choice is made with their squares.
+    fixed : tuple of Fixed, optional
+        Known parameters of the fit.
+    """
+
+    poles: int | tuple[int, int] | None = None
+    zeros: int | tuple[int, int] | None = None
+    integrators: int | None = None
+    delay_bounds: tuple[float, float] | None = None
+    initial_state: InitialState | None = None
+    offset: Offset | None = None
+    input_before: InputBefore = None
+    hold: AskedHold = "auto"
+    loss: LossKind = "squares"
+    fixed: tuple[Fixed, ...] | None = None
+
+    @property
+    def span(self) -> Span:
+        """Structures that are admitted."""
+        poles, zeros = (
+            (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
+        )
+        none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
+        free = (0,) if none else (0, 1)
+        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
+
+    def check(self) -> None:
+        """Refuse what does not go together, with an OptionError."""
+        delays = self.delay_bounds or (0.0, 1.0)
+        (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
+        integrators = max(self.span.integrators)
+        if isinstance(self.poles, tuple) and fewest_zeros > most + integrators - int(delays[0] < delays[1]):
+            raise OptionError("zeros", f"no structure has at least {fewest_zeros} zeros and at most {most} poles")
+        # A single structure is checked as such.
+        poles, zeros = (self.poles, fewest_zeros) if isinstance(self.poles, int) else (max(least, 1), 0)
+        DelayProfile(
+            *(poles, zeros, delays),
+            initial_state=self.initial_state or "rest",
+            offset=self.offset or "none",
+            loss=self.loss,
+            fixed=self.fixed,
+            integrators=self.integrators or 0,
+            input_before=self.input_before,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A structure and a treatment, and the candidates that they were chosen from.
+
+    Parameters
+    ----------
+    options : DelayProfile
+        What is to be fitted.
+    records : tuple of Record
+        The records with the hold that was chosen.
+    fitted : tuple of Record
+        The same, or parts of long ones, to which the candidates were fitted.
+    ranking : Ranking
+        All structures of the grid, the best first.
+    answer : AnswerTest
+        Whether a response of the outputs to the inputs is seen at all.
+    sentences : tuple of str
+        One for each choice, with its criterion and that of the runner-up.
+    """
+
+    options: DelayProfile
+    records: tuple[Record, ...] = field(repr=False)
+    fitted: tuple[Record, ...] = field(repr=False)
+    ranking: Ranking = field(repr=False)
+    answer: AnswerTest
+    sentences: tuple[str, ...]
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is a model: a response is seen, and the best candidate describes it."""
+        return self.answer.seen
+
+    @property
+    def why_none(self) -> str:
+        """Why there is none."""
+        evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
+        return (
+            "There is no model here: the output is not seen to answer to the input "
+            f"(p = {self.answer.p_value:.2g}).{evidence}"
+        )
+
+    def words(self) -> list[str]:
+        """Return the choice as the options of ``ctid fit``."""
+        options = self.options
+        found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
+        found += ["--integrators", f"{options.integrators}"] if options.integrators else []
+        low, high = options.delay_bounds
+        found += ["--delay", f"{low:g}:{high:g}" if low < high else f"{low:g}"]
+        found += ["--initial-state", options.initial_state, "--offset", options.offset]
+        if options.initial_state == "rest" and options.offset != "remove":
+            before = options.input_before
+            found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
+        return [*found, "--hold", self.records[0].input.hold]

@@ -1,0 +1,212 @@
+"""The choice of delay range, treatment, hold and structure, in this order, by one criterion.
+
+Range, treatment and hold are chosen with a few small structures; then the grid of structures is fitted once. Where an
+estimated state is compared with rest, all candidates are fitted to the samples after the greatest delay, which are all
+that an unknown input before the record leaves to an estimated state.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from ctid_cli.estimation.common import check_greatest_delay
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification import sentences
+from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.choice import Choice, Given
+from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.parts import FEW, MANY, parts_of
+from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
+from ctid_cli.inference.input_response import analyse_response
+from ctid_cli.inference.response_test import response_test
+from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.signals.held import Hold
+from ctid_cli.signals.record import Record
+
+#: Greatest delay that is tried unless the record shows a later response, as shares of the record.
+LATEST, LATER = 0.1, 0.5
+#: The range of the delay reaches so many times beyond that of a small model, and so many samples further: the delay of
+#: a model with too few poles is too long.
+REACH, FURTHER = 1.5, 3
+#: A delay beyond this share of the range is at its end.
+AT_END = 0.9
+#: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
+TIE = 1e-3
+
+
+def choose(records: Record | Sequence[Record], given: Given | None = None) -> Choice:
+    """Choose what is not given of the structure of a model and of the treatment of its records.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        One for each experiment.
+    given : Given, optional
+        What is given; by default nothing.
+
+    Returns
+    -------
+    Choice
+        The options to fit, the candidates, and a sentence for each choice.
+
+    Raises
+    ------
+    DataError
+        If a record cannot be used.
+    OptionError
+        If what is given does not go together.
+    """
+    several = [records] if isinstance(records, Record) else list(records)
+    given = given or Given()
+    given.check()
+    if given.delay_bounds is not None:
+        for record in several:
+            check_greatest_delay(record, given.delay_bounds[1])
+    return _Choosing(several, given).choice()
+
+
+class _Choosing:
+    """The steps of a choice."""
+
+    def __init__(self, records: list[Record], given: Given) -> None:
+        self.records, self.given, self.span = records, given, given.span
+        whole = given.initial_state == "periodic"
+        self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
+        self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
+        self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
+        self.said: list[str] = []
+
+    def choice(self) -> Choice:
+        """Return what is chosen."""
+        delays, latest = self._delays()
+        setting = self._setting(self.span, delays)
+        ranking = self._grid(setting, delays)
+        # Small models may miss so much that a state makes up for it, or that their delay is far too long.
+        span = Span.only(ranking.best.options)
+        again = self._range_of(ranking, delays), self._setting(span, self._range_of(ranking, delays))
+        if again != (delays, setting):
+            delays, setting = again
+            ranking = self._grid(setting, delays)
+        while self.given.delay_bounds is None and _at_end(ranking, delays) and delays[1] < latest:
+            delays = 0.0, _rounded(min(2.0 * delays[1], latest))
+            ranking = self._grid(setting, delays)
+        best = ranking.best
+        options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
+        if not self.all_from_start:
+            options = replace(options, initial_state="estimate", input_before=None)
+        fitted = tuple(with_hold(record, setting.hold) for record in self.many)
+        measured = best.options.prepare(fitted).laid_out
+        answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
+        said = [*self.said, *sentences.of_grid(ranking, delays, self.given)]
+        said += [sentences.of_criterion(ranking)] * bool(said)
+        held = tuple(with_hold(record, setting.hold) for record in self.records)
+        return Choice(options, held, fitted, ranking, answer, tuple(said))
+
+    def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
+        if not self.all_from_start:
+            setting = setting._replace(initial_state="estimate", input_before=None)
+        return grid(self.many, setting, self.span, delays)
+
+    # --- the range of the delay ------------------------------------------------------------------------
+
+    def _delays(self) -> tuple[tuple[float, float], float]:
+        """Return the range of the delay, and how far it may be extended [s]."""
+        given = self.given.delay_bounds
+        if given is not None:
+            return given, given[1]
+        length = min(record.duration for record in self.few)
+        hints = [analyse_response(record).delay for record in self.few]
+        seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
+        latest = min(max(LATEST * length, seen), LATER * length)
+        settings = self._settings(latest)
+        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        return self._range_of(models, (0.0, latest)), latest
+
+    def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
+        """Return the range that the delay of the best model asks for, within another; that one where it is given."""
+        if self.given.delay_bounds is not None:
+            return delays
+        interval = max(float(np.median(np.diff(record.t))) for record in self.few)
+        reach = REACH * ranking.best.fit.model.delay + FURTHER * interval
+        return 0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), delays[1]))
+
+    # --- state, offset and hold ------------------------------------------------------------------------
+
+    def _setting(self, span: Span, delays: tuple[float, float]) -> Setting:
+        """Return state, offset and hold, as structures of a span show them."""
+        self.said = []
+        settings = self._settings(delays[1])
+        rests = [each for each in settings if each.initial_state == "rest"]
+        if len(rests) > 1:
+            # The level before the record is told by all samples, the first ones above all.
+            level = SmallModels(self.few, span, delays).compared(rests).best.options.input_before
+            settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
+        models = SmallModels(self._common(settings, delays[1]), span, delays)
+        if self.given.offset is None:
+            settings += [each._replace(offset="none") for each in settings]
+        best = self._treated(models.compared(settings), delays[1])
+        setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
+        holds = self._holds()
+        if len(holds) > 1:
+            compared = models.compared([setting._replace(hold=hold) for hold in holds])
+            self.said.append(sentences.of_hold(compared))
+            setting = setting._replace(hold=compared.best.hold)
+        return setting
+
+    def _treated(self, models: Ranking, length: float) -> DelayProfile:
+        """Return state and offset: rest, unless the estimated state or the first samples speak against it."""
+        rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
+        chosen = models
+        if rest is not None and estimated is not None:
+            at_rest = rest.best.criterion <= estimated.best.criterion + TIE
+            likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.few, length)
+            chosen = rest if at_rest and likely else estimated
+            self.said.append(sentences.of_state(rest.best, estimated.best, likely))
+        elif self.given.initial_state is None:
+            options = models.best.options
+            self.said.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
+        if self.given.offset is None:
+            self.said.append(sentences.of_offset(chosen))
+        return chosen.best.options
+
+    # --- what there is to compare ----------------------------------------------------------------------
+
+    def _settings(self, latest: float) -> list[Setting]:
+        """Return the states that can be compared, with an offset."""
+        return [
+            Setting(self.first_hold, state, before, self.given.offset or "estimate")
+            for state, before in self._states(latest)
+        ]
+
+    def _states(self, latest: float) -> list[State]:
+        if not self.from_start:
+            return [("estimate", None)]
+        found = states_of(self.few, self.given)
+        determined = excited_after(self.few, latest)
+        return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
+
+    def _holds(self) -> list[Hold]:
+        """Return the holds to compare: an input that jumps between levels shows that it is held."""
+        if self.given.hold != "auto" or {input_moves(record).kind for record in self.records} != {"continuous"}:
+            return [self.first_hold]
+        if not all(np.array_equal(record.input.t, record.t) for record in self.records):
+            return [self.records[0].input.hold]
+        regular = all(record.interval is not None for record in self.few)
+        return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
+
+    def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
+        """Return the records with the samples that all settings can use."""
+        if all(setting.initial_state != "estimate" for setting in settings):
+            return self.few
+        return without_beginning(self.few, latest)
+
+
+def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
+    return ranking.best.fit.model.delay > AT_END * delays[1]
+
+
+def _rounded(delay: float) -> float:
+    """Return a delay with three digits, so that it is the same when it is typed."""
+    return float(f"{delay:.3g}")

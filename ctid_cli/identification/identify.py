@@ -1,0 +1,88 @@
+"""From records to a fitted model, with what is not given chosen."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ctid_cli.errors import DataError
+from ctid_cli.estimators import identification
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.measured_submodels import Options
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.choice import Given
+from ctid_cli.identification.choose import choose
+from ctid_cli.identification.validation import judged_on, laid_out_for
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
+from ctid_cli.signals.record import Record
+
+
+def identify(
+    records: Record | Sequence[Record],
+    options: Options | Given | None = None,
+    validation: Record | None = None,
+    covariance: Covariance = "auto",
+    bootstrap_draws: int = DRAWS,
+    progress: Progress | None = None,
+) -> Identification:
+    """Fit a model to records and judge it; what is not given of its structure and treatment is chosen.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        One for each experiment.
+    options : DelayProfile, MeasuredSubmodels or Given, optional
+        An estimator, of which nothing is chosen, or what is given; by default everything is chosen, the hold of the
+        input too where it is known at the samples of the output.
+    validation : Record, optional
+        Another record of the same system, which never enters the choice. Its state and offset are chosen on it, with
+        the model fixed, unless they are given.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
+        What the noise is taken for: white unless the residuals are not, white, or coloured with standard errors and
+        Student's t, or coloured with the intervals of a bootstrap-t.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
+    progress : callable, optional
+        Told after each of them how many of how many are done.
+
+    Returns
+    -------
+    Identification
+        The model, and everything that tells whether to believe it; ``choices`` has a sentence for each choice.
+
+    Raises
+    ------
+    DataError
+        If a record cannot be used, or no response to its input is seen and no number of poles is given.
+    OptionError
+        If what is given does not go together.
+
+    Notes
+    -----
+    All is chosen by one criterion, BIC of the innovations with a noise model that all candidates share and each
+    parameter counted 1.5 times; see :func:`~ctid_cli.identification.choose.choose`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import HeldSignal, Record, TransferFunction, identify, simulate
+    >>> t = 0.1 * np.arange(400)
+    >>> signal = HeldSignal(t, np.sign(np.sin(0.4 * t**1.5)))
+    >>> noise = 0.05 * np.random.default_rng(0).standard_normal(400)
+    >>> found = identify(Record(t, simulate(TransferFunction([2.0], [1.0, 1.0]), signal, t) + noise, signal))
+    >>> found.options.poles, found.options.initial_state
+    (1, 'rest')
+    """
+    several = [records] if isinstance(records, Record) else list(records)
+    noise = covariance, bootstrap_draws, progress
+    if options is not None and not isinstance(options, Given):
+        return identification.identify(options, several, validation, *noise)
+    given = options or Given()
+    choice = choose(several, given)
+    if given.poles is None and not choice.seen:
+        raise DataError(f"{choice.why_none} Give the number of poles (--poles) to fit a model all the same.")
+    other = None if validation is None else with_hold(validation, choice.records[0].input.hold)
+    if other is not None:
+        # Refused before the fit takes its time.
+        laid_out_for(other, choice.options, given)
+    found = identification.identify(choice.options, choice.records, None, *noise)
+    found = replace(found, choices=choice.sentences)
+    return found if other is None else replace(found, validation=judged_on(other, choice.options, found.fit, given))

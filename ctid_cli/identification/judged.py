@@ -1,0 +1,51 @@
+"""What is reported of each candidate besides its criterion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctid_cli.estimators.identification import tests_of
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.choice import Choice, Given
+from ctid_cli.identification.criterion import Candidate
+from ctid_cli.identification.validation import judged_on
+from ctid_cli.inference import criteria
+from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.signals.record import Record
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedCandidate:
+    """A candidate with what else tells how good it is."""
+
+    candidate: Candidate
+    #: Young's criterion [-].
+    yic: float
+    #: Fit of each tenth of each record with the parameters of all the rest, linearised [%].
+    cross_validated_percent: float
+    tests: tuple[ResidualTests, ...]
+    #: Fit on the validation record [%].
+    validation_percent: float | None
+
+
+def judged_candidates(choice: Choice, given: Given, validation: Record | None) -> list[JudgedCandidate]:
+    """Judge all candidates of a choice, the best first."""
+    other = None if validation is None else with_hold(validation, choice.ranking.best.hold)
+    return [_judged(each, choice, given, other) for each in choice.ranking.candidates]
+
+
+def _judged(candidate: Candidate, choice: Choice, given: Given, other: Record | None) -> JudgedCandidate:
+    fit, options = candidate.fit, candidate.options
+    outputs = [record.y[use] for record, use in zip(choice.fitted, fit.used, strict=True)]
+    total = np.concatenate([y - y.mean() for y in outputs])
+    left = criteria.cross_validated_errors(fit.residuals, [psi @ fit.tangent for psi in fit.sensitivities])
+    free = np.flatnonzero(fit.tangent.any(axis=1))
+    covariance = fit.uncertainty("white").covariance[np.ix_(free, free)]
+    residuals = np.concatenate(fit.residuals)
+    return JudgedCandidate(
+        candidate,
+        criteria.young_information_criterion(residuals, np.concatenate(outputs), fit.theta[free], covariance),
+        criteria.fit_percent(total, total - np.concatenate(left)),
+        tests_of(options, fit, choice.fitted, choice.answer),
+        None if other is None else judged_on(other, options, fit, given).fit_percent,
+    )

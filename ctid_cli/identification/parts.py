@@ -1,0 +1,50 @@
+"""Parts of long records that choices are made on."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.estimation.optimum.best_model import liveliest
+from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record, beginning
+
+#: Samples of all records that settings are compared on, and that the grid of structures is fitted to: what ten seconds
+#: are enough for.
+FEW, MANY = 2000, 5000
+#: The beginning of a record stands for the whole if input and output move so much there, as a share of all.
+LIVELY = 0.5
+
+
+class Parts(NamedTuple):
+    """Parts of records."""
+
+    records: list[Record]
+    #: Whether they begin with the records.
+    from_start: bool
+
+
+def parts_of(records: Sequence[Record], most: int) -> Parts:
+    """Return parts with so many samples in all."""
+    found = [_part(record, most // len(records)) for record in records]
+    return Parts([record for record, _ in found], all(from_start for _, from_start in found))
+
+
+def _part(record: Record, most: int) -> tuple[Record, bool]:
+    signal = record.input
+    thinned = -(-record.n_samples // most)
+    if thinned == 1:
+        return record, True
+    if input_moves(record).kind in ("constant", "steps") or not np.array_equal(signal.t, record.t):
+        # Seldom does anything happen, and all of it must be seen.
+        moves = np.append(True, np.diff(signal.values) != 0) | (signal.hold != "zoh")
+        held = HeldSignal(signal.t[moves], signal.values[moves], signal.hold)
+        return Record(record.t[::thinned], record.y[::thinned], held, name=record.name), True
+    y = record.bridged_y
+    if all(np.std(x[:most]) >= LIVELY * np.std(x) for x in (signal.values, y)):
+        return beginning(record, most), True
+    where = liveliest(signal.values, y, most)
+    t = record.t[where]
+    held = HeldSignal(t, signal.values[where], signal.hold)
+    return Record(t, record.y[where], held, name=record.name), where.start == 0

@@ -1,0 +1,92 @@
+"""What is said of each choice: the criterion against the runner-up."""
+
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification.choice import Given
+from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
+from ctid_cli.text import count
+
+#: What is said where the beginning of a record is not looked at.
+STATE_OF_PART = (
+    "State before the record: estimated (--initial-state estimate); the choice is made on a part of this long record."
+)
+
+
+def spelled(candidate: Candidate) -> str:
+    """Return a structure in words."""
+    options = candidate.options
+    zeros = count(options.zeros, "zero") if options.zeros else "no zero"
+    besides = f" and {count(options.integrators, 'integrator')}" if options.integrators else ""
+    return f"{count(options.poles, 'pole')}, {zeros}{besides}"
+
+
+def rest_assumed(options: DelayProfile) -> str:
+    """Return that no other state could be tried."""
+    level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
+    return (
+        f"State before the record: at rest with the input at {level}, which is assumed: the input does not change "
+        "enough after the longest delay to estimate a state besides (--initial-state, --input-before)."
+    )
+
+
+def of_state(rest: Candidate, estimated: Candidate, likely: bool) -> str:
+    """Return the state, and by how much it is better than the other."""
+    if not likely:
+        return (
+            "State before the record: estimated, as the first samples are not those of a system at rest "
+            "(--initial-state estimate)."
+        )
+    best, other = sorted((rest, estimated), key=lambda each: each.criterion)
+    fall = other.criterion - best.criterion
+    return f"State before the record: {_state(best)}; the criterion is {fall:.3g} below that of {_state(other)}."
+
+
+def _state(candidate: Candidate) -> str:
+    options = candidate.options
+    if options.initial_state != "rest":
+        return "estimated (--initial-state estimate)"
+    before = "at its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
+    return f"at rest, input before it {before} (--initial-state rest, --input-before {_typed(options.input_before)})"
+
+
+def _typed(before: object) -> str:
+    return "first" if before == "first" else f"{before or 0:g}"
+
+
+def of_offset(models: Ranking) -> str:
+    """Return the treatment of the offset."""
+    other = models.runner_up("offset")
+    return (
+        f"Offset: {models.best.options.offset} (--offset); "
+        f"{_below(models, other, '' if other is None else other.options.offset)}."
+    )
+
+
+def of_hold(models: Ranking) -> str:
+    """Return the hold."""
+    other = models.runner_up("hold")
+    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else other.hold)}."
+
+
+def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list[str]:
+    """Return the structure and the range of the delay."""
+    best = ranking.best
+    other = ranking.runner_up("poles", "zeros", "integrators")
+    found = []
+    if other is not None:
+        found.append(f"Structure: {spelled(best)}; {_below(ranking, other, other.name)}.")
+    if given.delay_bounds is None:
+        found.append(f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {best.fit.model.delay:.4g}.")
+    return found
+
+
+def of_criterion(ranking: Ranking) -> str:
+    """Return the criterion."""
+    order = ranking.noise.order
+    noise = f"one autoregressive noise model of order {order}" if order else "white noise"
+    return f"Criterion: BIC of the innovations with {noise} for all, each parameter counted {PENALTY:g} times."
+
+
+def _below(models: Ranking, other: Candidate | None, name: str) -> str:
+    if other is None:
+        return "nothing else could be tried"
+    return f"the criterion is {other.criterion - models.best.criterion:.3g} below that of {name}, the runner-up"

@@ -1,0 +1,79 @@
+"""What is assumed of the state and the offset of records, and which samples that leaves to compare."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.choice import Given
+from ctid_cli.identification.criterion import Candidate
+from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.residual_tests import chi_square_tail
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import InitialState, InputBefore
+
+#: Share of the range of the input that it must still cross after the greatest delay, for an estimated state to leave
+#: the gain determined.
+EXCITED = 0.5
+#: Rest is refused where the first samples are, with it, this unlikely: to estimate a state in vain costs little.
+UNLIKELY = 1e-2
+
+
+#: A state before the records, and the input that goes with it.
+State = tuple[InitialState, InputBefore]
+
+
+def states_of(records: Sequence[Record], given: Given) -> list[State]:
+    """Return the states before the records that are to be compared.
+
+    Rest is equilibrium with a constant input: the first value, or zero.
+    """
+    state, before = given.initial_state, given.input_before
+    if state is not None and state != "rest":
+        return [(state, None)]
+    if given.offset == "remove":
+        both: list[State] = [("rest", None), ("estimate", None)]
+        return both if state is None else both[:1]
+    first = [float(record.input.values[0]) for record in records]
+    varies = all(np.ptp(record.input.values) > 0.0 for record in records)
+    levels: list[InputBefore] = ["first"] if before is None else [before]
+    if before is None and varies and any(first):
+        levels.append(None)
+    found: list[tuple[InitialState, InputBefore]] = [("rest", level) for level in levels]
+    return found + [("estimate", None)] * (state is None and before is None and varies)
+
+
+def excited_after(records: Sequence[Record], delay: float) -> bool:
+    """Whether the inputs still change enough after a delay [s] from the first samples."""
+    for record in records:
+        u = record.input.at(record.t)
+        later = u[record.t >= record.t[0] + delay]
+        if not later.size or np.ptp(later) < EXCITED * np.ptp(u):
+            return False
+    return True
+
+
+def without_beginning(records: Sequence[Record], length: float) -> list[Record]:
+    """Return records whose first samples, up to a length [s], are marked as missing."""
+    return [
+        replace(record, y=np.where(record.t < record.t[0] + length * (1 - 1e-9), np.nan, record.y), noise_free=None)
+        for record in records
+    ]
+
+
+def beginning_is_likely(best: Candidate, noise: NoiseModel, records: Sequence[Record], length: float) -> bool:
+    """Whether a model from rest, fitted to what comes later, explains the first samples of the records too.
+
+    Their squared innovations over the variance, and the first error over that of the noise, are chi-square.
+    """
+    held = [with_hold(record, best.hold) for record in records]
+    errors = best.options.prepare(held).laid_out.errors_of(best.fit.model).residuals
+    later = np.concatenate([noise.innovations(e)[noise.order :] for e in best.fit.residuals])
+    deviation, power = float(later.std()), max(float(noise.first_autocovariances[0]), np.finfo(float).tiny)
+    squared, count = 0.0, 0
+    for record, e in zip(records, errors, strict=True):
+        first = int(np.count_nonzero(record.valid & (record.t < record.t[0] + length * (1 - 1e-9))))
+        new = noise.innovations(e)[max(noise.order, 1) : first] / deviation
+        squared, count = squared + float(new @ new) + float(e[0] ** 2) / power, count + new.size + 1
+    return chi_square_tail(count, squared) > UNLIKELY

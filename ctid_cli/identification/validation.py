@@ -1,0 +1,42 @@
+"""Models on a record that they were not estimated from, with a state and an offset of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
+from ctid_cli.identification.choice import Given
+from ctid_cli.identification.criterion import noise_of, penalised
+from ctid_cli.identification.treatment import states_of
+from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Offset
+
+
+def laid_out_for(record: Record, options: DelayProfile, given: Given) -> list[tuple[DelayProfile, MeasuredRecords]]:
+    """Lay a record out in all treatments of state and offset that it may need; a DataError where it cannot be used."""
+    offsets: list[Offset] = ["estimate", "none"] if given.offset is None else [given.offset]
+    tried = [
+        replace(options, initial_state=state, input_before=before, offset=offset)
+        for state, before in states_of([record], given)
+        for offset in offsets
+    ]
+    pairs = ((each, laid_out_validation(each, record)) for each in tried)
+    return [(each, laid_out) for each, laid_out in pairs if isinstance(laid_out, MeasuredRecords)]
+
+
+def judged_on(record: Record, options: DelayProfile, fit: MeasuredFit, given: Given) -> Validation:
+    """Judge a model in the treatment that the criterion of the choice prefers on a record, the model being fixed."""
+    tried = laid_out_for(record, options, given)
+    applied = [own._applied(fit, laid_out) for own, laid_out in tried]
+    common = np.logical_and.reduce([each.used[0] for each in applied])
+    left = [each.residuals[0][common[each.used[0]]] for each in applied]
+    noise = noise_of([min(left, key=lambda e: float(e @ e))])
+    scores = []
+    for e, (_, laid_out) in zip(left, tried, strict=True):
+        squared = squared_innovations([e], [np.zeros((e.size, 0))], noise)
+        scores.append(penalised(squared, innovations_count([e], noise), laid_out.layout.own))
+    best = int(np.argmin(scores))
+    return replace(validated(applied[best], record), options=tried[best][0])

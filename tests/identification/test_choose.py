@@ -1,0 +1,130 @@
+"""What is chosen where nothing is given, on records whose answer is known."""
+
+import numpy as np
+import pytest
+
+from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
+from ctid_cli.errors import DataError, OptionError
+
+SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
+DRIVE = TransferFunction([1.5], [1.0, 0.5, 0.0], 0.4)
+
+
+def binary(rng, count, width=8):
+    return np.repeat(rng.choice([-1.0, 1.0], count // width + 1), width)[:count]
+
+
+def record_of(model, *, seed=0, u=None, past=0, offset=0.0, colour=0.0, deviation=0.05, count=600, hold="zoh"):
+    """Samples of a model; those before the record leave a state behind."""
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(count + past)
+    u = binary(rng, t.size) if u is None else u
+    e = deviation * rng.standard_normal(t.size)
+    for k in range(1, t.size):
+        e[k] += colour * e[k - 1]
+    y = offset + e + simulate(model, HeldSignal(t, u, hold), t)
+    return Record(t[past:] - t[past], y[past:], HeldSignal(t[past:] - t[past], u[past:]), name="made")
+
+
+def step(lead, count=600):
+    return np.where(np.arange(count) < lead, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("model", "colour", "expected"),
+    [(SECOND, 0.0, (2, 0, 0)), (SECOND, 0.9, (2, 0, 0)), (DRIVE, 0.0, (1, 0, 1))],
+    ids=["white", "coloured", "integrating"],
+)
+def test_the_structure_that_made_a_record_is_found(model, colour, expected):
+    choice = choose(record_of(model, colour=colour, deviation=0.03))
+    options = choice.options
+    assert (options.poles, options.zeros, options.integrators) == expected
+    assert options.delay_bounds[0] <= model.delay <= options.delay_bounds[1] < 6.0
+    assert options.initial_state == "rest"
+    assert choice.ranking.best.options.order + 2 <= max(each.options.order for each in choice.ranking.candidates)
+
+
+@pytest.mark.parametrize(
+    ("made", "state", "offset"),
+    [({"past": 37}, "estimate", "none"), ({"offset": 3.0}, "rest", "estimate"), ({}, "rest", "none")],
+)
+def test_state_and_offset_are_those_that_were_made(made, state, offset):
+    options = choose(record_of(SECOND, **made)).options
+    assert (options.initial_state, options.offset) == (state, offset)
+
+
+@pytest.mark.parametrize("lead", [1, 5, 15])
+def test_an_early_step_is_a_step_from_rest(lead):
+    choice = choose(record_of(SECOND, u=step(lead), offset=1.0))
+    assert choice.options.initial_state == "rest"
+    assert choice.ranking.best.fit.model.numerator[-1] / 4.0 == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_record_that_begins_with_its_step_needs_the_level_before():
+    record = record_of(SECOND, u=np.ones(600))
+    with pytest.raises(DataError, match="input_before"):
+        choose(record)
+    choice = choose(record, Given(input_before=0.0))
+    assert choice.options.poles == 2
+    assert choice.words()[-4:] == ["--input-before", "0", "--hold", "zoh"]
+
+
+def test_the_hold_is_compared_where_the_input_moves_continuously():
+    u = np.sin(np.outer(0.1 * np.arange(600), [0.7, 1.9, 3.1, 5.3, 8.0]) + np.arange(5)).sum(axis=1)
+    made = choose(record_of(SECOND, u=u, hold="foh", deviation=0.003))
+    assert made.records[0].input.hold != "zoh"
+    assert any(sentence.startswith("Hold: ") for sentence in made.sentences)
+
+
+def test_what_is_given_is_kept():
+    given = Given(poles=3, zeros=1, delay_bounds=(0.1, 0.6), initial_state="estimate", offset="drift", hold="foh")
+    choice = choose(record_of(SECOND), given)
+    options = choice.options
+    assert (options.poles, options.zeros, options.integrators, options.delay_bounds) == (3, 1, 0, (0.1, 0.6))
+    assert (options.initial_state, options.offset, choice.records[0].input.hold) == ("estimate", "drift", "foh")
+    with pytest.raises(OptionError, match="zeros"):
+        choose(record_of(SECOND), Given(poles=2, zeros=3))
+
+
+def test_the_choice_typed_out_is_the_same_model():
+    record = record_of(SECOND, offset=2.0)
+    choice = choose(record)
+    found = identify(record)
+    words = dict(zip(choice.words()[::2], choice.words()[1::2], strict=True))
+    low, high = map(float, words["--delay"].split(":"))
+    typed = Given(
+        int(words["--poles"]),
+        int(words["--zeros"]),
+        None,
+        (low, high),
+        words["--initial-state"],
+        words["--offset"],
+        None if words["--input-before"] == "first" else float(words["--input-before"]),
+        words["--hold"],
+    )
+    again = identify(record, typed)
+    np.testing.assert_allclose(again.fit.theta, found.fit.theta, rtol=1e-9)
+    assert found.choices == choice.sentences
+
+
+def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
+    other = record_of(SECOND, seed=1, past=37, offset=-4.0)
+    found = identify([record_of(SECOND), record_of(SECOND, seed=2)], validation=other)
+    assert found.options.initial_state == "rest"
+    assert found.validation.options.initial_state == "estimate"
+    assert found.validation.fit_percent > 85
+
+
+def test_no_response_is_no_model():
+    noise = record_of(SECOND)
+    noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
+    assert not choose(noise).seen
+    with pytest.raises(DataError, match="no model here"):
+        identify(noise)
+
+
+def test_a_part_of_a_long_record_is_looked_at():
+    choice = choose(record_of(SECOND, count=12_000))
+    assert choice.fitted[0].n_samples == 5000
+    assert choice.records[0].n_samples == 12_000
+    assert choice.options.poles == 2
