@@ -1,0 +1,309 @@
+r"""Response of an output to its input without a structure: a Gaussian process beside slow terms and coloured noise.
+
+.. math:: y(t) = \int_0^S g(s)\, (u(t - s) - u_b)\, ds + X(t) \beta + v(t)
+
+The impulse response g is constant over each of some hundred intervals, and a priori a Gaussian process that decays,
+with one of two covariances [1]_, :math:`\theta = e^{-s/T}`, :math:`m = \min(\theta, \theta')`:
+
+- rough ("tuned and correlated"): :math:`\lambda m`;
+- smooth ("stable spline"): :math:`\lambda (3 \theta \theta' m - m^3) / 2`.
+
+X holds what is not the response: a constant, a straight line, free responses that decay; and the integral of u where
+the system integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the system
+integrates have the least BIC; v is autoregressive noise by REML, beside all of these.
+
+References
+----------
+.. [1] G. Pillonetto, F. Dinuzzo, T. Chen, G. De Nicolao and L. Ljung, "Kernel methods in system identification,
+   machine learning and function estimation: A survey", *Automatica* 50 (2014) 657-682.
+   doi:10.1016/j.automatica.2014.01.001
+"""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.noise_model import NoiseModel, fit_residual_noise
+from ctid_cli.signals.held import HeldSignal
+
+#: Intervals of the impulse response while decay and noise are searched, and afterwards; so many sampling intervals long
+#: are the first third of them.
+COARSE, FINE = 60, 120
+#: Decay times that are tried: their number, the first [sampling intervals] and the last [duration of the record].
+DECAYS, FASTEST, SLOWEST = 7, 1.5, 1 / 8
+#: The impulse response ends after this many decay times, where its prior deviation is e^-4 of the first.
+LENGTH = 8.0
+#: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
+SCALES = np.geomspace(1e-3, 1e9, 37)
+#: Poles of the AR(1) noise with which the search begins.
+NOISE_POLES = (0.0, 0.5, 0.8, 0.95)
+#: Times after which a free response has decayed by the factor e [decay times of the impulse response].
+FREE = (0.7, 2.0, 6.0)
+#: The longest of them [duration of the record]: longer ones are not told from a straight line.
+LONGEST_FREE = 1 / 6
+#: Rounding of products and factors, as a share of the diagonal.
+ROUNDING = 1e-11
+
+#: Columns of X.
+CONSTANT, LINE, INTEGRAL, FIRST_FREE = range(4)
+START = tuple(range(FIRST_FREE, FIRST_FREE + len(FREE)))
+#: Slow terms that are compared while the response is chosen.
+SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE))
+
+
+class Prior(NamedTuple):
+    """What is assumed of the impulse response."""
+
+    #: Time after which its variance has decayed by the factor e [s].
+    decay: float
+    smooth: bool
+    #: Its first variance over that of the innovations.
+    scale: float
+
+
+class Pulse(NamedTuple):
+    """Integral of an input about its value before the record."""
+
+    t: Array
+    values: Array
+    slopes: Array
+    sums: Array
+
+    @classmethod
+    def of(cls, signal: HeldSignal, before: float) -> "Pulse":
+        """Integrate exactly a signal that is held or joined by straight lines."""
+        w, steps, slopes = signal.values - before, np.diff(signal.t), np.zeros(signal.t.size)
+        if signal.hold != "zoh":
+            slopes[:-1] = np.diff(w) / steps
+        areas = steps * (w[:-1] + 0.5 * slopes[:-1] * steps)
+        return cls(signal.t, w, slopes, np.append(0.0, np.cumsum(areas)))
+
+    def at(self, times: Array) -> Array:
+        """Return the integral until given instants; zero before the record."""
+        k = np.maximum(np.searchsorted(self.t, times, side="right") - 1, 0)
+        since = np.maximum(times - self.t[k], 0.0)
+        return np.asarray(self.sums[k] + since * (self.values[k] + 0.5 * self.slopes[k] * since))
+
+
+class Layout(NamedTuple):
+    """Columns for one decay time and one input before the record."""
+
+    before: float
+    decay: float
+    #: Ends of the intervals of the impulse response [s], shape (K + 1,).
+    edges: Array
+    #: Responses to the input over each interval, X and the output, shape (N, K + q + 1).
+    columns: Array
+
+    @classmethod
+    def of(cls, t: Array, y: Array, signal: HeldSignal, before: float, decay: float, taps: int) -> "Layout":
+        """Lay a record out; ``taps`` is the greatest number of intervals."""
+        interval, duration = float(np.median(np.diff(t))), float(t[-1] - t[0])
+        since, pulse = t - t[0], Pulse.of(signal, before)
+        edges = _edges(min(LENGTH * decay, duration), interval, taps)
+        responses = -np.diff(pulse.at(t[:, None] - edges), axis=1)
+        free = [np.exp(-since / min(factor * decay, LONGEST_FREE * duration)) for factor in FREE]
+        columns = np.column_stack([responses, np.ones(t.size), since / duration, pulse.at(t), *free, y])
+        return cls(before, decay, edges, columns)
+
+    @property
+    def taps(self) -> int:
+        """Number of intervals."""
+        return int(self.edges.size - 1)
+
+
+class Weighted(NamedTuple):
+    """Products of the columns of X and of the output, which come last, weighted by the inverse of their covariance."""
+
+    #: At each scale of the prior, shape (scales, q + 1, q + 1).
+    products: Array
+    #: Logarithm of the determinant of that covariance over that of the noise, shape (scales,).
+    log_determinants: Array
+
+    def fit(self, columns: Sequence[int]) -> tuple[Array, Array, float]:
+        """Return coefficients of columns of X, their covariance over the variance, and the weighted square of the rest."""
+        k, products = list(columns), self.products[0]
+        inverse = np.linalg.pinv(products[np.ix_(k, k)], rcond=ROUNDING, hermitian=True)
+        coefficients = inverse @ products[k, -1]
+        return coefficients, inverse, float(products[-1, -1] - products[k, -1] @ coefficients)
+
+    def criteria(self, columns: Sequence[int], count: int) -> Array:
+        """Return BIC with some columns of X at each scale, but for a constant and the noise."""
+        k = list(columns)
+        right, left = self.products[:, k, -1], self.products[:, -1, -1]
+        if k:
+            normal = self.products[:, k][:, :, k]
+            normal = normal + ROUNDING * np.eye(len(k)) * np.einsum("lii->li", normal)[:, None]
+            left = left - np.einsum("li,li->l", right, np.linalg.solve(normal, right[..., None])[..., 0])
+        left = np.maximum(left, np.finfo(float).tiny)
+        return np.asarray(count * np.log(left / count) + self.log_determinants + len(k) * np.log(count))
+
+
+class Directions(NamedTuple):
+    r"""Directions of the response, :math:`\Phi L = U S V'`, by whitened columns and a factor L of the prior covariance."""
+
+    #: S^2, rising, and V, shapes (K,) and (K, K).
+    squares: Array
+    right: Array
+    #: Products of the columns with S U, and with one another, shapes (K, q + 1) and (q + 1, q + 1).
+    along: Array
+    products: Array
+
+    @classmethod
+    def of(cls, gram: Array, factor: Array) -> "Directions":
+        """Find the directions from the products of all columns."""
+        taps = len(factor)
+        squares, right = np.linalg.eigh(factor.T @ gram[:taps, :taps] @ factor)
+        along = right.T @ (factor.T @ gram[:taps, taps:])
+        return cls(np.maximum(squares, 0.0), right, along, gram[taps:, taps:])
+
+    def weighted(self, scales: Array) -> Weighted:
+        r"""Weight the products at each scale :math:`\lambda`: direction i loses the share l s^2 / (1 + l s^2) of its own."""
+        lost = scales[:, None] / (1 + scales[:, None] * self.squares)
+        taken = np.einsum("lk,ki,kj->lij", lost, self.along, self.along, optimize=True)
+        return Weighted(self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseModel:
+    """An impulse response with its uncertainty, what is beside it, and the noise."""
+
+    layout: Layout
+    prior: Prior
+    noise: NoiseModel
+    integrates: bool
+
+    @property
+    def own(self) -> tuple[int, ...]:
+        """Columns of X that belong to the response."""
+        return (INTEGRAL,) if self.integrates else ()
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products of the whitened columns."""
+        white = whitened(self.layout.columns, self.noise)
+        return np.asarray(white.T @ white)
+
+    @cached_property
+    def factor(self) -> Array:
+        """Factor of the prior covariance of the taps over the variance of the innovations."""
+        return np.asarray(np.sqrt(self.prior.scale) * prior_factor(self.layout, self.prior.smooth))
+
+    @cached_property
+    def directions(self) -> Directions:
+        """Directions of the response."""
+        return Directions.of(self.gram, self.factor)
+
+    @cached_property
+    def weighted(self) -> Weighted:
+        """Weighted products of X and the output."""
+        return self.directions.weighted(np.ones(1))
+
+    def taps(self, columns: Sequence[int]) -> tuple[Array, Array]:
+        """Return the impulse response beside columns of X, and its covariance over the variance of the innovations."""
+        found, k = self.directions, list(columns)
+        beta, uncertain, _ = self.weighted.fit(k)
+        gain = self.factor @ found.right / (1 + found.squares)
+        moved = gain @ found.along[:, k]
+        mean = gain @ found.along[:, -1] - moved @ beta
+        return mean, gain @ (self.factor @ found.right).T + moved @ uncertain @ moved.T
+
+    def parts(self, columns: Sequence[int]) -> tuple[Array, Array]:
+        """Return the response to the input, and the residuals beside it and columns of X."""
+        taps, all_columns, beta = self.layout.taps, self.layout.columns, self.weighted.fit(columns)[0]
+        response = all_columns[:, :taps] @ self.taps(columns)[0]
+        slow = {column: all_columns[:, taps + column] * value for column, value in zip(columns, beta, strict=True)}
+        rest = all_columns[:, -1] - response - sum(slow.values())
+        return response + slow.get(INTEGRAL, 0.0), rest
+
+
+def _edges(length: float, interval: float, taps: int) -> Array:
+    """Ends of the intervals of an impulse response: as short as the clock's at first, then even."""
+    if length <= taps * interval:
+        return np.asarray(interval * np.arange(max(round(length / interval), 4) + 1.0))
+    first = interval * np.arange(taps // 3 + 1.0)
+    return np.append(first, np.linspace(first[-1], length, taps - taps // 3 + 1)[1:])
+
+
+def prior_factor(layout: Layout, smooth: bool) -> Array:
+    """Cholesky's factor of the prior covariance of an impulse response, of scale 1."""
+    theta = np.exp(-0.5 * (layout.edges[1:] + layout.edges[:-1]) / layout.decay)
+    least = np.minimum(theta[:, None], theta)
+    covariance = 0.5 * (3 * np.outer(theta, theta) * least - least**3) if smooth else least
+    covariance[np.diag_indices_from(covariance)] *= 1 + 10 * ROUNDING
+    return np.linalg.cholesky(covariance)
+
+
+def ar1(pole: float) -> NoiseModel:
+    """AR(1) noise of innovation variance 1."""
+    return NoiseModel(np.array([1.0, -pole]), np.array([1.0, pole]) / (1 - pole**2), 1.0)
+
+
+def first_factor(noise: NoiseModel) -> Array:
+    """Cholesky's factor of the covariance of the first r samples of a noise over the variance of its innovations."""
+    lags = np.abs(np.subtract.outer(np.arange(noise.order), np.arange(noise.order)))
+    return np.linalg.cholesky(noise.first_autocovariances[lags] / noise.innovation_variance)
+
+
+def whitened(columns: Array, noise: NoiseModel) -> Array:
+    """Columns whose noise would be white with the variance of the innovations, the first rows included."""
+    white, r = columns.copy(), noise.order
+    for k in range(1, r + 1):
+        white[r:] += noise.coefficients[k] * columns[r - k : len(columns) - k]
+    if r:
+        white[:r] = np.linalg.solve(first_factor(noise), columns[:r])
+    return white
+
+
+def fit_response(t: Array, y: Array, signal: HeldSignal) -> ResponseModel:
+    """Fit the response of an output to an input that varies."""
+    interval, duration = float(np.median(np.diff(t))), float(t[-1] - t[0])
+    longest = max(SLOWEST * duration, 2 * FASTEST * interval)
+    decays = np.geomspace(FASTEST * interval, longest, DECAYS)
+    befores = sorted({0.0, float(signal.values[0])})
+    coarse = (Layout.of(t, y, signal, *pair, COARSE) for pair in itertools.product(befores, decays))
+    model = _likeliest(coarse, [ar1(pole) for pole in NOISE_POLES], (False, True))
+    before, ratio = model.layout.before, np.sqrt(decays[1] / decays[0])
+    near = [float(np.clip(model.prior.decay * factor, decays[0], longest)) for factor in (1 / ratio, 1, ratio)]
+    fine = [Layout.of(t, y, signal, before, decay, FINE) for decay in near]
+    for _ in range(2):
+        model = _likeliest(fine, [noise_beside(model)], (model.integrates,))
+    return ResponseModel(model.layout, model.prior, noise_beside(model), model.integrates)
+
+
+def _likeliest(
+    layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrating: Sequence[bool]
+) -> ResponseModel:
+    """Return the model of the least BIC, whatever slow terms are beside the response."""
+    least, best = np.inf, None
+    for layout, noise in itertools.product(layouts, noises):
+        white = whitened(layout.columns, noise)
+        gram, count = white.T @ white, len(white)
+        determinant = 2 * float(np.log(first_factor(noise).diagonal()).sum())
+        for smooth in (False, True):
+            directions = Directions.of(gram, prior_factor(layout, smooth))
+            scales = SCALES / max(float(directions.squares[-1]), np.finfo(float).tiny)
+            weighted = directions.weighted(scales)
+            for slow, integrates in itertools.product(SLOW, integrating):
+                values = determinant + weighted.criteria((*slow, INTEGRAL) if integrates else slow, count)
+                k = int(np.argmin(values))
+                if values[k] < least:
+                    least, prior = float(values[k]), Prior(layout.decay, smooth, float(scales[k]))
+                    best = ResponseModel(layout, prior, noise, integrates)
+    assert best is not None
+    return best
+
+
+def noise_beside(model: ResponseModel) -> NoiseModel:
+    """Noise by REML, beside X and the directions of the response that the data determine to more than one half."""
+    fixed = (CONSTANT, LINE, *START, *model.own)
+    taps, columns, found = model.layout.taps, model.layout.columns, model.directions
+    determined = columns[:, :taps] @ (model.factor @ found.right[:, found.squares > 1.0])
+    psi = np.column_stack([determined, columns[:, [taps + k for k in fixed]]])
+    basis, singular, _ = np.linalg.svd(psi / np.linalg.norm(psi, axis=0), full_matrices=False)
+    return fit_residual_noise([basis[:, singular > 1e-9 * singular[0]]], [model.parts(fixed)[1]])
