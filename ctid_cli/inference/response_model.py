@@ -210,16 +210,21 @@ class ResponseModel:
         beta, uncertain, _ = self.weighted.fit(k)
         gain = self.factor @ found.right / (1 + found.squares)
         moved = gain @ found.along[:, k]
+        # An integrating system responds with a constant beside what decays.
+        moved -= np.array(k) == INTEGRAL
         mean = gain @ found.along[:, -1] - moved @ beta
         return mean, gain @ (self.factor @ found.right).T + moved @ uncertain @ moved.T
 
     def parts(self, columns: Sequence[int]) -> tuple[Array, Array]:
         """Return the response to the input, and the residuals beside it and columns of X."""
-        taps, all_columns, beta = self.layout.taps, self.layout.columns, self.weighted.fit(columns)[0]
-        response = all_columns[:, :taps] @ self.taps(columns)[0]
-        slow = {column: all_columns[:, taps + column] * value for column, value in zip(columns, beta, strict=True)}
-        rest = all_columns[:, -1] - response - sum(slow.values())
-        return response + slow.get(INTEGRAL, 0.0), rest
+        taps, signals = self.layout.taps, self.layout.columns
+        values = dict(zip(columns, self.weighted.fit(columns)[0], strict=True))
+        response = signals[:, :taps] @ self.taps(columns)[0]
+        if INTEGRAL in values:
+            beyond = signals[:, taps + INTEGRAL] - signals[:, :taps].sum(axis=1)
+            response += values.pop(INTEGRAL) * beyond
+        slow = signals[:, [taps + column for column in values]] @ np.array(list(values.values()))
+        return response, signals[:, -1] - response - slow
 
 
 def _edges(length: float, interval: float, taps: int) -> Array:

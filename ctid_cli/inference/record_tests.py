@@ -1,0 +1,130 @@
+"""Tests of a record beside the response to its input: offset, drift, start, outliers and feedback."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctid_cli.arrays import Array, IntArray
+from ctid_cli.inference.intervals import normal_quantile, robust_deviation, student_quantile
+from ctid_cli.inference.residual_tests import normal_tail
+from ctid_cli.inference.response_model import CONSTANT, LINE, START, ResponseModel, whitened
+
+#: Probability of each false alarm. There are five tests of random errors, and all alarms together are to be rare.
+LEVEL = 0.001
+#: Earlier inputs and responses from which the next input is told, and the delays of the answer of a controller.
+ORDER, ANSWERS = 6, 3
+#: Steps of the robust regression, and the residual in robust standard deviations from which on it counts no more.
+REWEIGHTED, CLIPPED = 8, 1.5
+
+#: Outliers are looked for until so large a share of the samples are.
+MOST_OUTLIERS = 0.05
+
+SLOW_TERMS: Mapping[str, tuple[int, ...]] = {"offset": (CONSTANT,), "drift": (LINE,), "start": START}
+
+
+@dataclass(frozen=True)
+class SlowTerm:
+    """A part of the output that does not follow the input."""
+
+    detected: bool
+    #: Probability of one as large without any [-].
+    p_value: float
+    #: The constant, the change along the line over the record, or the free response at its beginning [output unit].
+    value: float
+    #: 95 % interval [output unit].
+    low: float
+    high: float
+
+
+def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
+    """Test offset, drift of the output, and free response of a record.
+
+    F tests by generalised least squares, the greatest first and the others beside it, as long as one is significant.
+    The noise has as many degrees of freedom as the record is worth independent samples.
+    """
+    weighted, count = model.weighted, len(model.layout.columns)
+    everything = (CONSTANT, LINE, *START, *model.own)
+    freedom = max(2.0, model.noise.effective_count(count) - len(everything))
+    variance = weighted.fit(everything)[2] / (count - len(everything))
+
+    def p_value(name: str, beside: list[str]) -> float:
+        from scipy.special import fdtrc
+
+        others = _columns(model, [other for other in beside if other != name])
+        own = SLOW_TERMS[name]
+        gain = weighted.fit(others)[2] - weighted.fit((*others, *own))[2]
+        return float(fdtrc(len(own), freedom, max(gain, 0.0) / (len(own) * variance)))
+
+    found: list[str] = []
+    while len(found) < len(SLOW_TERMS):
+        likely = {name: p_value(name, found) for name in SLOW_TERMS if name not in found}
+        name = min(likely, key=lambda key: likely[key])
+        if likely[name] > LEVEL:
+            break
+        found.append(name)
+    found = [name for name in found if p_value(name, found) <= LEVEL]
+    quantile = student_quantile(freedom)
+    terms = {}
+    for name in SLOW_TERMS:
+        columns = _columns(model, {*found, name})
+        values, covariance, _ = weighted.fit(columns)
+        places = [columns.index(column) for column in SLOW_TERMS[name]]
+        value = float(values[places].sum())
+        reach = quantile * float(np.sqrt(variance * covariance[np.ix_(places, places)].sum()))
+        terms[name] = SlowTerm(name in found, p_value(name, found), value, value - reach, value + reach)
+    return terms
+
+
+def _columns(model: ResponseModel, names) -> tuple[int, ...]:
+    """Columns of X that belong to slow terms and to the response."""
+    return (*model.own, *(column for name in SLOW_TERMS if name in names for column in SLOW_TERMS[name]))
+
+
+def outlying(model: ResponseModel, rest: Array) -> IntArray:
+    """Samples that lie farther from what the others tell than chance explains, in noise of any colour.
+
+    The likelihood ratio of one sample with an error of its own, over a robust deviation (Chang, Tiao and Chen,
+    Technometrics 30 (1988) 193-204).
+    """
+    c, r = model.noise.coefficients, model.noise.order
+    limit, rest, found = normal_quantile(1 - LEVEL / rest.size), rest.copy(), []
+    energy = np.cumsum(c**2)[np.minimum(np.arange(rest.size)[::-1], r)]
+    # An error shows in its neighbours too, so that the greatest is taken away before the next is looked for.
+    for _ in range(int(MOST_OUTLIERS * rest.size)):
+        ahead = np.append(whitened(rest[:, None], model.noise)[:, 0], np.zeros(r))
+        errors = sum(c[k] * ahead[k : k + rest.size] for k in range(r + 1)) / energy
+        score = errors * np.sqrt(energy)
+        k = int(np.argmax(np.abs(score)))
+        if not abs(score[k]) > limit * robust_deviation(score):
+            break
+        found.append(k)
+        rest[k] -= errors[k]
+    return np.unique(np.array(found, dtype=np.int64))
+
+
+def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> tuple[float, int]:
+    """Return the probability of an input that goes with the noise so much by chance, and after how many samples.
+
+    What the input and the response were does not tell all moves: those of a reference that is held are rare and large,
+    and would drown the answer to the noise. So they are clipped. Innovations of the noise are independent of any
+    function of an input that does not depend on the output.
+    """
+    windows = np.lib.stride_tricks.sliding_window_view
+    before = np.column_stack([windows(u, ORDER + 1)[:, :-1], windows(response, ORDER + 1), np.ones(u.size - ORDER)])
+    scale = np.abs(before).max(axis=0)
+    before, now = before[:, scale > 0] / scale[scale > 0], u[ORDER:]
+    weight, moves = np.ones(now.size), now
+    for _ in range(REWEIGHTED):
+        root = np.sqrt(weight)
+        moves = now - before @ np.linalg.lstsq(before * root[:, None], now * root, rcond=1e-10)[0]
+        spread = robust_deviation(moves)
+        if not spread > 1e-9 * float(np.ptp(now)):
+            return 1.0, 0
+        weight = 1.0 / np.maximum(np.abs(moves) / spread, 1.0)
+    moves = np.clip(moves / spread, -CLIPPED, CLIPPED)
+    white = whitened(rest[:, None], model.noise)[:, 0]
+    products = [moves * white[ORDER - k : white.size - k] for k in range(ANSWERS)]
+    scores = [abs(float(each.sum())) / float(np.sqrt(each @ each)) for each in products]
+    k = int(np.argmax(scores))
+    return min(1.0, 2 * ANSWERS * normal_tail(scores[k])), k
