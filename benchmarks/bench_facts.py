@@ -4,7 +4,7 @@ Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED]``. Clean records begi
 each is then given one fault at a time, in white noise and in AR(1) noise of .9.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 

@@ -1,7 +1,8 @@
 """``ctid check``."""
 
+import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,6 +10,9 @@ from ctid_cli.cli._common import emit, guarded
 from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.errors import MismatchError
 from ctid_cli.signals.treatment import AskedHold
+
+if TYPE_CHECKING:
+    from ctid_cli.signals.measurement import Measurement
 
 
 @guarded
@@ -19,27 +23,35 @@ def check(
     hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
 ) -> None:
-    """Check a measured record, and propose a model to begin with.
+    """State facts on a measured record, and the command that identifies a model of it.
 
-    Sampling, gaps, excitation, offsets, trends, bandwidth against the sampling frequency, and a hint of the delay: what
-    is wrong with these data, the worst first; then a structure to begin with, by a short search of at most four poles.
-    Columns are found by their usual names (t, u, y) unless named.
+    Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
+    rest and feedback, tested beside the response to the input in noise of any colour. Columns are found by their usual
+    names (t, u, y) unless named.
     """
-    from ctid_cli.reporting.order_proposal import proposed_by_check
-    from ctid_cli.reporting.record_findings import check_record_quality
+    from ctid_cli.inference.record_facts import record_facts
     from ctid_cli.reporting.record_result import RecordCheckResult
 
-    measured, why = columns.read(file, "zoh" if hold == "auto" else hold), ""
-    units = measured.time_unit or "s", measured.input_unit or "", measured.output_unit or ""
-    report = check_record_quality(measured.record, *units)
-    if hold == "auto" and report.worst != "problem":
-        from ctid_cli.reporting.hold_choice import hold_for_check
-
-        chosen, reason = hold_for_check(measured.record, report)
-        if chosen != "zoh":
-            measured, why = columns.read(file, chosen), f"{reason} "
-    proposal = proposed_by_check(measured.record, report)
-    proposal = proposal and proposal._replace(sentence=why + proposal.sentence)
-    emit(RecordCheckResult(measured, report, proposal), form.form)
-    if strict and report.worst == "problem":
+    measured = columns.read(file, "zoh" if hold == "auto" else hold)
+    facts = record_facts(measured.record)
+    result = RecordCheckResult(measured, facts, None)
+    if result.worst != "problem":
+        result = RecordCheckResult(measured, facts, proposed_command(measured, hold))
+    emit(result, form.form)
+    if strict and result.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")
+
+
+def proposed_command(measured: "Measurement", hold: AskedHold) -> str:
+    """Return the fit of a record, with the columns and the part that were asked for."""
+    from ctid_cli.signals.table import ROLES, USUAL_NAMES, split_header
+
+    words = ["ctid", "fit", measured.record.name]
+    for role in ROLES:
+        name = split_header(getattr(measured, role))[0]
+        if name.lower() not in USUAL_NAMES[role][:2] and Path(measured.record.name).suffix.lower() != ".mat":
+            words += [f"--{role}", name]
+    words += [] if hold == "auto" else ["--hold", hold]
+    for option, value in (("--from", measured.start), ("--to", measured.stop)):
+        words += [] if value is None else [option, f"{value:.12g}"]
+    return shlex.join(words)

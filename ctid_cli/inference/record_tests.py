@@ -1,6 +1,6 @@
 """Tests of a record beside the response to its input: offset, drift, start, outliers and feedback."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,22 +48,22 @@ def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
     freedom = max(2.0, model.noise.effective_count(count) - len(everything))
     variance = weighted.fit(everything)[2] / (count - len(everything))
 
-    def p_value(name: str, beside: list[str]) -> float:
+    def p_value(name: str, beside: Iterable[str]) -> float:
         from scipy.special import fdtrc
 
-        others = _columns(model, [other for other in beside if other != name])
+        others = _columns(model, set(beside) - {name})
         own = SLOW_TERMS[name]
         gain = weighted.fit(others)[2] - weighted.fit((*others, *own))[2]
         return float(fdtrc(len(own), freedom, max(gain, 0.0) / (len(own) * variance)))
 
-    found: list[str] = []
+    found: tuple[str, ...] = ()
     while len(found) < len(SLOW_TERMS):
         likely = {name: p_value(name, found) for name in SLOW_TERMS if name not in found}
         name = min(likely, key=lambda key: likely[key])
         if likely[name] > LEVEL:
             break
-        found.append(name)
-    found = [name for name in found if p_value(name, found) <= LEVEL]
+        found = (*found, name)
+    found = tuple(name for name in found if p_value(name, found) <= LEVEL)
     quantile = student_quantile(freedom)
     terms = {}
     for name in SLOW_TERMS:
@@ -76,8 +76,12 @@ def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
     return terms
 
 
-def _columns(model: ResponseModel, names) -> tuple[int, ...]:
-    """Columns of X that belong to slow terms and to the response."""
+def slow_columns(model: ResponseModel, terms: Mapping[str, SlowTerm]) -> tuple[int, ...]:
+    """Columns of X that belong to the response, and to slow terms that are detected."""
+    return _columns(model, {name for name, term in terms.items() if term.detected})
+
+
+def _columns(model: ResponseModel, names: Collection[str]) -> tuple[int, ...]:
     return (*model.own, *(column for name in SLOW_TERMS if name in names for column in SLOW_TERMS[name]))
 
 
@@ -88,7 +92,7 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
     Technometrics 30 (1988) 193-204).
     """
     c, r = model.noise.coefficients, model.noise.order
-    limit, rest, found = normal_quantile(1 - LEVEL / rest.size), rest.copy(), []
+    limit, rest, found = normal_quantile(1 - LEVEL / rest.size), rest.copy(), list[int]()
     energy = np.cumsum(c**2)[np.minimum(np.arange(rest.size)[::-1], r)]
     # An error shows in its neighbours too, so that the greatest is taken away before the next is looked for.
     for _ in range(int(MOST_OUTLIERS * rest.size)):
@@ -103,8 +107,8 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
     return np.unique(np.array(found, dtype=np.int64))
 
 
-def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> tuple[float, int]:
-    """Return the probability of an input that goes with the noise so much by chance, and after how many samples.
+def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> float:
+    """Return the probability that an input which does not depend on the output goes so much with its noise.
 
     What the input and the response were does not tell all moves: those of a reference that is held are rare and large,
     and would drown the answer to the noise. So they are clipped. Innovations of the noise are independent of any
@@ -120,11 +124,10 @@ def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> tu
         moves = now - before @ np.linalg.lstsq(before * root[:, None], now * root, rcond=1e-10)[0]
         spread = robust_deviation(moves)
         if not spread > 1e-9 * float(np.ptp(now)):
-            return 1.0, 0
+            return 1.0
         weight = 1.0 / np.maximum(np.abs(moves) / spread, 1.0)
     moves = np.clip(moves / spread, -CLIPPED, CLIPPED)
     white = whitened(rest[:, None], model.noise)[:, 0]
     products = [moves * white[ORDER - k : white.size - k] for k in range(ANSWERS)]
     scores = [abs(float(each.sum())) / float(np.sqrt(each @ each)) for each in products]
-    k = int(np.argmax(scores))
-    return min(1.0, 2 * ANSWERS * normal_tail(scores[k])), k
+    return min(1.0, 2 * ANSWERS * normal_tail(max(scores)))

@@ -9,8 +9,8 @@ with one of two covariances [1]_, :math:`\theta = e^{-s/T}`, :math:`m = \min(\th
 - smooth ("stable spline"): :math:`\lambda (3 \theta \theta' m - m^3) / 2`.
 
 X holds what is not the response: a constant, a straight line, free responses that decay; and the integral of u where
-the system integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the system
-integrates have the least BIC; v is autoregressive noise by REML, beside all of these.
+the system integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the
+system integrates have the least BIC; v is autoregressive noise by REML, beside all of these.
 
 References
 ----------
@@ -126,7 +126,7 @@ class Weighted(NamedTuple):
     log_determinants: Array
 
     def fit(self, columns: Sequence[int]) -> tuple[Array, Array, float]:
-        """Return coefficients of columns of X, their covariance over the variance, and the weighted square of the rest."""
+        """Return coefficients of columns of X, their covariance over the variance, and the square of the rest."""
         k, products = list(columns), self.products[0]
         inverse = np.linalg.pinv(products[np.ix_(k, k)], rcond=ROUNDING, hermitian=True)
         coefficients = inverse @ products[k, -1]
@@ -145,7 +145,7 @@ class Weighted(NamedTuple):
 
 
 class Directions(NamedTuple):
-    r"""Directions of the response, :math:`\Phi L = U S V'`, by whitened columns and a factor L of the prior covariance."""
+    r"""Directions :math:`\Phi L = U S V'` of the response, from whitened columns and a factor L of the prior."""
 
     #: S^2, rising, and V, shapes (K,) and (K, K).
     squares: Array
@@ -163,7 +163,7 @@ class Directions(NamedTuple):
         return cls(np.maximum(squares, 0.0), right, along, gram[taps:, taps:])
 
     def weighted(self, scales: Array) -> Weighted:
-        r"""Weight the products at each scale :math:`\lambda`: direction i loses the share l s^2 / (1 + l s^2) of its own."""
+        """Weight the products at each scale l: each direction loses the share l s^2 / (1 + l s^2) of its own."""
         lost = scales[:, None] / (1 + scales[:, None] * self.squares)
         taken = np.einsum("lk,ki,kj->lij", lost, self.along, self.along, optimize=True)
         return Weighted(self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
@@ -252,7 +252,7 @@ def ar1(pole: float) -> NoiseModel:
 def first_factor(noise: NoiseModel) -> Array:
     """Cholesky's factor of the covariance of the first r samples of a noise over the variance of its innovations."""
     lags = np.abs(np.subtract.outer(np.arange(noise.order), np.arange(noise.order)))
-    return np.linalg.cholesky(noise.first_autocovariances[lags] / noise.innovation_variance)
+    return np.asarray(np.linalg.cholesky(noise.first_autocovariances[lags] / noise.innovation_variance))
 
 
 def whitened(columns: Array, noise: NoiseModel) -> Array:
@@ -281,9 +281,7 @@ def fit_response(t: Array, y: Array, signal: HeldSignal) -> ResponseModel:
     return ResponseModel(model.layout, model.prior, noise_beside(model), model.integrates)
 
 
-def _likeliest(
-    layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrating: Sequence[bool]
-) -> ResponseModel:
+def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrating: Sequence[bool]) -> ResponseModel:
     """Return the model of the least BIC, whatever slow terms are beside the response."""
     least, best = np.inf, None
     for layout, noise in itertools.product(layouts, noises):

@@ -8,10 +8,9 @@ import numpy as np
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.best_model import liveliest
 from ctid_cli.estimators.order_search import recommend_order
-from ctid_cli.inference.record_check import RecordReport
+from ctid_cli.inference.record_check import RecordReport, examine
 from ctid_cli.inference.response_test import AnswerTest
 from ctid_cli.reporting.order_result import spelled
-from ctid_cli.reporting.record_findings import check_record_quality
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, Offset
@@ -35,7 +34,7 @@ class Proposal(NamedTuple):
 
 def proposed_delay(records: Sequence[Record], unit: str) -> tuple[tuple[float, float], str]:
     """The range in which the first record shows the beginning of its answer, and a sentence about it."""
-    suggested = check_record_quality(records[0]).suggested_delay
+    suggested = examine(records[0]).report.suggested_delay
     if suggested is None:
         return (0.0, 0.0), "No beginning of the answer is seen: the delay is taken as 0 (--delay)."
     low, high = suggested

@@ -1,0 +1,224 @@
+"""Facts on a record before any model of it: clock, input, output, and what stands beside the response to the input."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.input_response import InputResponse, analyse_response, regular_grid
+from ctid_cli.inference.record_tests import SlowTerm, feedback, outlying, slow_columns, slow_terms
+from ctid_cli.inference.response_estimates import (
+    UNKNOWN,
+    Estimate,
+    delay,
+    response_time,
+    signal_to_noise,
+    step_responses,
+)
+from ctid_cli.inference.response_model import fit_response
+from ctid_cli.inference.response_test import response_test
+from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+#: An interval longer than this many median intervals is a gap.
+LONG_INTERVAL = 3.0
+#: Persistence of excitation is counted up to this order.
+HIGHEST_ORDER = 50
+#: Of longer records every n-th sample is compared with the response to the whole input.
+MOST_SAMPLES = 5000
+#: Fewer samples than this show no response beside noise.
+FEWEST_SAMPLES = 50
+#: Rounds in which outliers are left out and looked for again.
+ROUNDS = 3
+#: Delays up to this fraction of the record are tried where it is asked whether the output responds at all.
+LONGEST_DELAY = 0.1
+#: An output moves no more than rounding where its deviation is below this fraction of its mean.
+CONSTANT = 1e-9
+
+
+@dataclass(frozen=True)
+class Gap:
+    """An interval without samples."""
+
+    #: Last instant before it [s].
+    start: float
+    #: Time to the next sample [s].
+    length: float
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a response without a structure shows, and what stands beside it; nan or None where nothing is shown."""
+
+    #: Variance of the response over that of the noise [dB], with a 95 % interval as all estimates.
+    signal_to_noise: Estimate = UNKNOWN
+    #: Time after a step of the input until 63 % of the final response [s], the delay included.
+    response_time: Estimate = UNKNOWN
+    #: Time until the output begins to respond [s].
+    delay: Estimate = UNKNOWN
+    #: Value of the input at rest, from which the offset counts [input unit].
+    input_at_rest: float = math.nan
+    offset: SlowTerm | None = None
+    drift: SlowTerm | None = None
+    start: SlowTerm | None = None
+    #: Instants of outliers [s].
+    outliers: tuple[float, ...] = ()
+    #: Probability that an input which does not depend on the output goes with the noise so much [-].
+    feedback_p_value: float = math.nan
+
+
+@dataclass(frozen=True)
+class RecordFacts:
+    """Facts on one record; nan stands for what the record does not show."""
+
+    name: str
+    n_samples: int
+    n_masked: int
+    #: First instant, and time to the last one [s].
+    start: float
+    duration: float
+    #: Median, shortest and longest sampling interval, and the standard deviation of all but the gaps [s].
+    interval: float
+    interval_min: float
+    interval_max: float
+    interval_deviation: float
+    regular: bool
+    gaps: tuple[Gap, ...]
+    #: Half the sampling frequency at the median interval [rad/s].
+    nyquist: float
+    input_kind: str
+    #: Mean, standard deviation, least and greatest value of the input during the record [input unit].
+    input_mean: float
+    input_deviation: float
+    input_low: float
+    input_high: float
+    #: Values that the input returns to [input unit]; empty where there are many.
+    input_levels: tuple[float, ...]
+    input_changes: int
+    #: Shortest time between two changes [s].
+    shortest_hold: float
+    #: Time after which the input repeats itself [s].
+    input_period: float
+    #: Order of persistent excitation, counted up to 50 [-].
+    excitation_order: int
+    #: Frequencies between which 95 % of the power of the input lies [rad/s].
+    input_band: tuple[float, float]
+    #: Mean, standard deviation, least and greatest value of the output [output unit].
+    output_mean: float
+    output_deviation: float
+    output_low: float
+    output_high: float
+    #: Step in which the output was recorded [output unit]; nan where it is too fine to matter.
+    output_quantum: float
+    #: Fraction of the output samples that sit exactly at its least or greatest value in runs [-]; 0 for none.
+    saturated: float
+    #: Frequency below which 95 % of the response to the input lies [rad/s].
+    output_bandwidth: float
+    #: Probability that noise of the output's colour follows the input as much as the output does [-].
+    answer_p_value: float = math.nan
+    beside: Beside = field(default_factory=Beside)
+
+
+def record_facts(record: Record) -> RecordFacts:
+    """Return the facts on a record.
+
+    The response to the input is a Gaussian process beside autoregressive noise (`response_model`), so that what stands
+    beside it is tested in noise of any colour, and no structure is taken for granted.
+    """
+    moves = input_moves(record)
+    answer = analyse_response(record, moves)
+    t, present = record.t, record.y[record.valid]
+    steps = np.diff(t) if t.size > 1 else np.array([math.nan])
+    interval = float(np.median(steps))
+    long = np.flatnonzero(steps > LONG_INTERVAL * interval)
+    moving = moves.kind != "constant" and float(present.std()) > CONSTANT * abs(float(present.mean()))
+    told = moving and present.size >= FEWEST_SAMPLES
+    return RecordFacts(
+        name=record.name,
+        n_samples=record.n_samples,
+        n_masked=int(np.count_nonzero(~record.valid)),
+        start=float(t[0]),
+        duration=record.duration,
+        interval=interval,
+        interval_min=float(steps.min()),
+        interval_max=float(steps.max()),
+        interval_deviation=float(steps[steps <= LONG_INTERVAL * interval].std()) if t.size > 1 else math.nan,
+        regular=record.interval is not None,
+        gaps=tuple(Gap(float(t[k]), float(steps[k])) for k in long),
+        nyquist=math.pi / interval,
+        input_kind=moves.kind,
+        input_levels=moves.levels,
+        input_changes=int(moves.changes.size),
+        shortest_hold=moves.shortest_hold,
+        input_period=answer.period,
+        excitation_order=excitation_order(record, moves, answer),
+        input_band=answer.input_band,
+        output_quantum=quantum(present),
+        saturated=saturated(present),
+        output_bandwidth=answer.bandwidth,
+        answer_p_value=_response_p_value(record) if moving else math.nan,
+        beside=_beside(record) if told else Beside(),
+        **_range("input", record.input.at(t)),
+        **_range("output", present),
+    )
+
+
+def _range(signal: str, x: Array) -> dict[str, Any]:
+    """Fields on the values of a signal."""
+    values = {"mean": x.mean(), "deviation": x.std(), "low": x.min(), "high": x.max()}
+    return {f"{signal}_{name}": float(value) for name, value in values.items()}
+
+
+def _response_p_value(record: Record) -> float:
+    """Probability that the output follows the input by chance, with the system in equilibrium at first."""
+    signal = record.input
+    moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
+    test = response_test([replace(record, input=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
+    return test.p_value
+
+
+def _beside(record: Record) -> Beside:
+    """Fit the response, leave out what lies far off, and test what stands beside the rest."""
+    every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
+    places = np.flatnonzero(record.valid)
+    wild = places[outliers(record.y[places])]
+    used = np.setdiff1d(places[::every], wild)
+    for _ in range(ROUNDS):
+        model = fit_response(record.t[used], record.y[used], record.input)
+        terms = slow_terms(model)
+        slow = slow_columns(model, terms)
+        response, rest = model.parts(slow)
+        far = used[outlying(model, rest)]
+        if not far.size:
+            break
+        wild, used = np.union1d(wild, far), np.setdiff1d(used, far)
+    steps = step_responses(model, slow)
+    return Beside(
+        signal_to_noise(model, slow),
+        response_time(model, steps),
+        delay(model, slow, steps),
+        model.layout.before,
+        **terms,
+        outliers=tuple(record.t[wild].tolist()),
+        feedback_p_value=feedback(record.input.at(record.t[used]), response, rest, model),
+    )
+
+
+def excitation_order(record: Record, moves: InputMoves, answer: InputResponse) -> int:
+    """Rank of the autocovariance of the input, at most 50; directions 40 dB below the strongest do not count."""
+    grid = regular_grid(record)
+    u = record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
+    highest = answer.input_band[1]
+    if moves.kind == "continuous" and highest > 0:
+        # Of a slow input, neighbouring samples are all alike: look at it as fast as it moves.
+        u = u[:: max(1, int(math.pi / (1.5 * highest * grid.interval)))]
+    order = min(HIGHEST_ORDER, u.size // 3)
+    if order < 1 or moves.kind == "constant":
+        return 0
+    past = np.lib.stride_tricks.sliding_window_view(u, order)[:: max(1, u.size // 20_000)]
+    past = past - past.mean(axis=0)
+    strength = np.linalg.eigvalsh(past.T @ past)
+    return int(np.count_nonzero(strength > 1e-4 * strength[-1]))
