@@ -17,7 +17,7 @@ from ctid_cli.inference.response_estimates import (
     signal_to_noise,
     step_responses,
 )
-from ctid_cli.inference.response_model import fit_response
+from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.held import HeldSignal
@@ -183,18 +183,18 @@ def _response_p_value(record: Record) -> float:
 def _beside(record: Record) -> Beside:
     """Fit the response, leave out what lies far off, and test what stands beside the rest."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
-    places = np.flatnonzero(record.valid)
-    wild = places[outliers(record.y[places])]
-    used = np.setdiff1d(places[::every], wild)
+    interval, places = float(np.median(np.diff(record.t))), np.flatnonzero(record.valid)
+    wild, far = places[outliers(record.y[places])], np.zeros(0, dtype=np.int64)
     for _ in range(ROUNDS):
-        model = fit_response(record.t[used], record.y[used], record.input)
+        wild = np.union1d(wild, far)
+        used = np.setdiff1d(places[::every], wild)
+        model = fit_response(Signals(record.t[used], record.y[used], record.input, interval))
         terms = slow_terms(model)
         slow = slow_columns(model, terms)
         response, rest = model.parts(slow)
         far = used[outlying(model, rest)]
         if not far.size:
             break
-        wild, used = np.union1d(wild, far), np.setdiff1d(used, far)
     steps = step_responses(model, slow)
     return Beside(
         signal_to_noise(model, slow),
@@ -202,7 +202,7 @@ def _beside(record: Record) -> Beside:
         delay(model, slow, steps),
         model.layout.before,
         **terms,
-        outliers=tuple(record.t[wild].tolist()),
+        outliers=tuple(record.t[np.union1d(wild, far)].tolist()),
         feedback_p_value=feedback(record.input.at(record.t[used]), response, rest, model),
     )
 

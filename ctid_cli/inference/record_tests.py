@@ -19,6 +19,8 @@ REWEIGHTED, CLIPPED = 8, 1.5
 
 #: Outliers are looked for until so large a share of the samples are.
 MOST_OUTLIERS = 0.05
+#: Neighbours on each side that show how large errors are about a sample.
+ABOUT = 20
 
 SLOW_TERMS: Mapping[str, tuple[int, ...]] = {"offset": (CONSTANT,), "drift": (LINE,), "start": START}
 
@@ -98,13 +100,19 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
     for _ in range(int(MOST_OUTLIERS * rest.size)):
         ahead = np.append(whitened(rest[:, None], model.noise)[:, 0], np.zeros(r))
         errors = sum(c[k] * ahead[k : k + rest.size] for k in range(r + 1)) / energy
-        score = errors * np.sqrt(energy)
-        k = int(np.argmax(np.abs(score)))
-        if not abs(score[k]) > limit * robust_deviation(score):
+        score = np.abs(errors) * np.sqrt(energy)
+        k = int(np.argmax(score))
+        about = score[max(k - ABOUT, 0) : k + ABOUT + 1]
+        if not score[k] > limit * max(_deviation(score), _deviation(about)):
             break
         found.append(k)
         rest[k] -= errors[k]
     return np.unique(np.array(found, dtype=np.int64))
+
+
+def _deviation(sizes: Array) -> float:
+    """Standard deviation from the median size, or from that which one in twenty exceeds, where tails are heavier."""
+    return max(robust_deviation(sizes), float(np.quantile(sizes, 0.95)) / normal_quantile(0.95))
 
 
 def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> float:

@@ -20,6 +20,7 @@ References
 """
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,8 +35,9 @@ from ctid_cli.signals.held import HeldSignal
 #: Intervals of the impulse response while decay and noise are searched, and afterwards; so many sampling intervals long
 #: are the first third of them.
 COARSE, FINE = 60, 120
-#: Decay times that are tried: their number, the first [sampling intervals] and the last [duration of the record].
-DECAYS, FASTEST, SLOWEST = 7, 1.5, 1 / 8
+#: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
+#: of neighbours.
+FASTEST, SLOWEST, RATIO = 1.5, 1 / 8, 2.2
 #: The impulse response ends after this many decay times, where its prior deviation is e^-4 of the first.
 LENGTH = 8.0
 #: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
@@ -90,6 +92,15 @@ class Pulse(NamedTuple):
         return np.asarray(self.sums[k] + since * (self.values[k] + 0.5 * self.slopes[k] * since))
 
 
+class Signals(NamedTuple):
+    """Samples of an output, which need not be all of them, the input, and the sampling interval."""
+
+    t: Array
+    y: Array
+    input: HeldSignal
+    interval: float
+
+
 class Layout(NamedTuple):
     """Columns for one decay time and one input before the record."""
 
@@ -101,9 +112,10 @@ class Layout(NamedTuple):
     columns: Array
 
     @classmethod
-    def of(cls, t: Array, y: Array, signal: HeldSignal, before: float, decay: float, taps: int) -> "Layout":
-        """Lay a record out; ``taps`` is the greatest number of intervals."""
-        interval, duration = float(np.median(np.diff(t))), float(t[-1] - t[0])
+    def of(cls, signals: Signals, before: float, decay: float, taps: int) -> "Layout":
+        """Lay signals out; ``taps`` is the greatest number of intervals."""
+        t, y, signal, interval = signals
+        duration = float(t[-1] - t[0])
         since, pulse = t - t[0], Pulse.of(signal, before)
         edges = _edges(min(LENGTH * decay, duration), interval, taps)
         responses = -np.diff(pulse.at(t[:, None] - edges), axis=1)
@@ -128,7 +140,9 @@ class Weighted(NamedTuple):
     def fit(self, columns: Sequence[int]) -> tuple[Array, Array, float]:
         """Return coefficients of columns of X, their covariance over the variance, and the square of the rest."""
         k, products = list(columns), self.products[0]
-        inverse = np.linalg.pinv(products[np.ix_(k, k)], rcond=ROUNDING, hermitian=True)
+        sizes = np.sqrt(np.maximum(products.diagonal()[k], np.finfo(float).tiny))
+        scaled = products[np.ix_(k, k)] / np.outer(sizes, sizes)
+        inverse = np.linalg.pinv(scaled, rcond=ROUNDING, hermitian=True) / np.outer(sizes, sizes)
         coefficients = inverse @ products[k, -1]
         return coefficients, inverse, float(products[-1, -1] - products[k, -1] @ coefficients)
 
@@ -265,17 +279,16 @@ def whitened(columns: Array, noise: NoiseModel) -> Array:
     return white
 
 
-def fit_response(t: Array, y: Array, signal: HeldSignal) -> ResponseModel:
+def fit_response(signals: Signals) -> ResponseModel:
     """Fit the response of an output to an input that varies."""
-    interval, duration = float(np.median(np.diff(t))), float(t[-1] - t[0])
-    longest = max(SLOWEST * duration, 2 * FASTEST * interval)
-    decays = np.geomspace(FASTEST * interval, longest, DECAYS)
-    befores = sorted({0.0, float(signal.values[0])})
-    coarse = (Layout.of(t, y, signal, *pair, COARSE) for pair in itertools.product(befores, decays))
+    shortest = FASTEST * signals.interval
+    longest = max(SLOWEST * float(np.ptp(signals.t)), 2 * shortest)
+    decays = np.geomspace(shortest, longest, math.ceil(math.log(longest / shortest, RATIO)) + 1)
+    befores = sorted({0.0, float(signals.input.values[0])})
+    coarse = (Layout.of(signals, *pair, COARSE) for pair in itertools.product(befores, decays))
     model = _likeliest(coarse, [ar1(pole) for pole in NOISE_POLES], (False, True))
-    before, ratio = model.layout.before, np.sqrt(decays[1] / decays[0])
-    near = [float(np.clip(model.prior.decay * factor, decays[0], longest)) for factor in (1 / ratio, 1, ratio)]
-    fine = [Layout.of(t, y, signal, before, decay, FINE) for decay in near]
+    near = np.clip(model.prior.decay * RATIO ** np.array([-0.5, 0.0, 0.5]), shortest, longest)
+    fine = [Layout.of(signals, model.layout.before, float(decay), FINE) for decay in near]
     for _ in range(2):
         model = _likeliest(fine, [noise_beside(model)], (model.integrates,))
     return ResponseModel(model.layout, model.prior, noise_beside(model), model.integrates)
