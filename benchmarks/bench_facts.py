@@ -4,11 +4,21 @@ Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED]``. Clean records begi
 each is then given one fault at a time, in white noise and in AR(1) noise of .9.
 """
 
-from dataclasses import dataclass
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import _timing  # noqa: F401  (one thread for linear algebra)
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.inference.record_facts import beside_response, record_facts
+from ctid_cli.inference.record_tests import LEVEL
+from ctid_cli.inference.signal_features import saturated
+from ctid_cli.signals.held import regular_interval
 
 INPUTS = ("prbs", "step", "multisine")
 
@@ -25,7 +35,6 @@ class Case:
     system: TransferFunction
     integrators: int
     snr_db: float
-    rng: np.random.Generator
 
 
 def draw_case(rng, n=None, snr_db=None):
@@ -42,7 +51,7 @@ def draw_case(rng, n=None, snr_db=None):
     scale = 1 / x.std()
     system = TransferFunction(np.asarray(system.numerator) * scale, system.denominator, delay=system.delay)
     snr = float(rng.uniform(10, 30)) if snr_db is None else snr_db
-    return Case(t, u, x * scale, hold, kind, system, integrators, snr, rng)
+    return Case(t, u, x * scale, hold, kind, system, integrators, snr)
 
 
 def draw_system(rng, order, integrators, slowest):
@@ -82,18 +91,121 @@ def draw_input(rng, kind, t, slowest):
 
 
 def draw_noise(rng, n, pole):
-    e = rng.standard_normal(n + 500)
-    v = np.empty(n + 500)
-    state = 0.0
-    for k, value in enumerate(e):
-        state = pole * state + np.sqrt(1 - pole**2) * value
-        v[k] = state
-    return v[500:]
+    """AR(1) noise of deviation 1, after its transient."""
+    e = np.sqrt(1 - pole**2) * rng.standard_normal(n + 500)
+    return lfilter([1.0], [1.0, -pole], e)[500:]
+
+
+def in_loop(case, noise):
+    """Close a loop u = r - K y with loop gain .5 about a system on a regular clock; None where there is no gain."""
+    if case.integrators or regular_interval(case.t) is None:
+        return None
+    gain = 0.5 / abs(case.system.numerator[-1] / case.system.denominator[-1])
+    once = (np.arange(case.t.size) == 0).astype(float)
+    sampled = simulate(case.system, HeldSignal(case.t, once), case.t)
+    u, y = case.u.copy(), np.zeros(case.t.size)
+    for k in range(u.size):
+        y[k] = u[:k] @ sampled[k:0:-1] + noise[k]
+        u[k] -= gain * y[k]
+    return Record.from_arrays(case.t, u, y)
+
+
+def faulty(case, noise, rng):
+    """The record of a case with each fault."""
+    n, deviation = case.t.size, noise_deviation(case)
+    clean = record_of(case, noise)
+    where = rng.choice(np.arange(5, n - 5), 5, replace=False)
+    errors = np.zeros(n)
+    errors[where] = 6 * deviation * rng.choice([-1, 1], 5)
+    limited = np.minimum(clean.y, np.quantile(clean.y, 0.98))
+    return {
+        "drift": with_output(clean, clean.y + np.linspace(0, 1, n)),
+        "offset": with_output(clean, clean.y + 0.5),
+        "saturation": with_output(clean, limited),
+        "outliers": with_output(clean, clean.y + errors),
+        "feedback": in_loop(case, noise),
+    }
+
+
+def record_of(case, noise):
+    return Record.from_arrays(case.t, case.u, case.x + noise, case.hold)
+
+
+def with_output(record, y):
+    return replace(record, y=y)
 
 
 def noise_deviation(case):
+    """Deviation of the noise; that of the response is 1."""
     return 10 ** (-case.snr_db / 20)
 
 
-def record_of(case, noise, u=None, x=None):
-    return Record.from_arrays(case.t, case.u if u is None else u, (case.x if x is None else x) + noise, case.hold)
+def alarms(record, beside):
+    """Names of the faults that are stated."""
+    terms = {name for name in ("offset", "drift", "start") if getattr(beside, name).detected}
+    others = {
+        "outliers": bool(beside.outliers),
+        "feedback": beside.feedback_p_value <= LEVEL,
+        "saturation": saturated(record.y) > 0,
+    }
+    return terms | {name for name, found in others.items() if found}
+
+
+def true_response_time(case):
+    """Time until 63 % of the final value of the step response."""
+    t = np.linspace(0, 5 * case.t[-1], 400_001)
+    x = simulate(case.system, HeldSignal([0.0], [1.0]), t)
+    return float(t[np.argmax(x / x[-1] >= 1 - np.exp(-1))])
+
+
+def held(estimate, truth):
+    """Whether an interval holds a value; None where no interval is given."""
+    return None if np.isnan(estimate.value) else bool(estimate.low - 1e-9 <= truth <= estimate.high + 1e-9)
+
+
+def main(records, seed):
+    rng = np.random.default_rng(seed)
+    false, found, covered = Counter(), Counter(), {"signal to noise": [], "response time": [], "delay": []}
+    tried, seconds = Counter(), 0.0
+    for number in range(records):
+        case = draw_case(rng)
+        pole = 0.0 if rng.random() < 0.5 else rng.uniform(0.5, 0.95)
+        record = record_of(case, noise_deviation(case) * draw_noise(rng, case.t.size, pole))
+        begin = time.process_time()
+        beside = beside_response(record)
+        seconds += time.process_time() - begin
+        stated = alarms(record, beside)
+        false.update(stated | ({"any"} if stated else set()))
+        covered["signal to noise"].append(held(beside.signal_to_noise, case.snr_db))
+        covered["delay"].append(held(beside.delay, case.system.delay))
+        if not case.integrators:
+            covered["response time"].append(held(beside.response_time, true_response_time(case)))
+        if number % 4:
+            continue
+        for name, of in (("white", 0.0), ("AR(1) .9", 0.9)):
+            noise = noise_deviation(case) * draw_noise(rng, case.t.size, of)
+            for fault, spoilt in faulty(case, noise, rng).items():
+                if spoilt is not None:
+                    stated = alarms(spoilt, beside_response(spoilt))
+                    tried[fault, name] += 1
+                    found[fault, name] += fault in stated
+                    found[fault, name, "others"] += bool(stated - {fault})
+    print(f"{records} clean records, false alarms [%]:")
+    print({name: round(100 * value / records, 1) for name, value in sorted(false.items())})
+    print("faults, found [%], with another fact that is false [%], records:")
+    for key, value in tried.items():
+        print(*key, round(100 * found[key] / value, 1), round(100 * found[(*key, "others")] / value, 1), value)
+    print("95 % intervals that hold the truth [%], where given [%]:")
+    for name, holds in covered.items():
+        given = [each for each in holds if each is not None]
+        print(name, round(100 * np.mean(given), 1), round(100 * len(given) / len(holds), 1))
+    print(f"{seconds / records:.2f} CPU s a record")
+    case = draw_case(rng, n=5000, snr_db=20)
+    record = record_of(case, noise_deviation(case) * draw_noise(rng, case.t.size, 0.9))
+    begin = time.process_time()
+    record_facts(record)
+    print(f"{time.process_time() - begin:.2f} CPU s for all facts on 5,000 samples")
+
+
+if __name__ == "__main__":
+    main(*(int(value) for value in (*sys.argv[1:], "400", "2026")[:2]))

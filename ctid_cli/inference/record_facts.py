@@ -160,7 +160,7 @@ def record_facts(record: Record) -> RecordFacts:
         saturated=saturated(present),
         output_bandwidth=answer.bandwidth,
         answer_p_value=_response_p_value(record) if moving else math.nan,
-        beside=_beside(record) if told else Beside(),
+        beside=beside_response(record) if told else Beside(),
         **_range("input", record.input.at(t)),
         **_range("output", present),
     )
@@ -180,8 +180,8 @@ def _response_p_value(record: Record) -> float:
     return test.p_value
 
 
-def _beside(record: Record) -> Beside:
-    """Fit the response, leave out what lies far off, and test what stands beside the rest."""
+def beside_response(record: Record) -> Beside:
+    """Fit the response of a record whose input varies, leave out what lies far off, and test what stands beside the rest."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
     interval, places = float(np.median(np.diff(record.t))), np.flatnonzero(record.valid)
     wild, far = places[outliers(record.y[places])], np.zeros(0, dtype=np.int64)

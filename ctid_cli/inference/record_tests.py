@@ -19,8 +19,9 @@ REWEIGHTED, CLIPPED = 8, 1.5
 
 #: Outliers are looked for until so large a share of the samples are.
 MOST_OUTLIERS = 0.05
-#: Neighbours on each side that show how large errors are about a sample.
-ABOUT = 20
+#: Neighbours on each side that show how large errors are about a sample, and the share of theirs that counts: the
+#: deviation of so few is uncertain.
+ABOUT, LOUDER = 30, 0.7
 
 SLOW_TERMS: Mapping[str, tuple[int, ...]] = {"offset": (CONSTANT,), "drift": (LINE,), "start": START}
 
@@ -103,7 +104,7 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
         score = np.abs(errors) * np.sqrt(energy)
         k = int(np.argmax(score))
         about = score[max(k - ABOUT, 0) : k + ABOUT + 1]
-        if not score[k] > limit * max(_deviation(score), _deviation(about)):
+        if not score[k] > limit * max(_deviation(score), LOUDER * robust_deviation(about)):
             break
         found.append(k)
         rest[k] -= errors[k]

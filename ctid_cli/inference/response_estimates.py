@@ -28,6 +28,9 @@ STARTS, DELAYS = (0, 1, 2, 3), 12
 #: Weight of the likelihood of a delay. None of these beginnings is the true one: of 97 simulated records of one to four
 #: poles, intervals with weight 1 held the delay in 91 %, with 1/2 in 97 %.
 WEIGHT = 0.5
+#: Share of the independent samples of the noise that count: its model is chosen from the same record. With all of them
+#: intervals held the ratio in 91 % of 400 simulated records.
+SPARE = 0.75
 #: Frequencies at which the spectrum of a noise is summed.
 FREQUENCIES = 1 << 14
 
@@ -58,7 +61,7 @@ def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
     # The variance of coloured noise is as uncertain as that of fewer white samples.
     fitted = float(np.sum(model.directions.squares > 1))
     worth = max(2.0, len(columns) / squared_correlations(model.noise) - fitted)
-    worth = 2 / (2 / worth + error**2)
+    worth = SPARE * 2 / (2 / worth + error**2)
     ratio = power / float(model.noise.first_autocovariances[0])
     low, high = (ratio * chdtri(worth, tail) / worth for tail in reversed(TAILS))
     return Estimate(*(10 * math.log10(each) for each in (ratio, low, high)))

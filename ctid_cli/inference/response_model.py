@@ -37,7 +37,7 @@ from ctid_cli.signals.held import HeldSignal
 COARSE, FINE = 60, 120
 #: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
 #: of neighbours.
-FASTEST, SLOWEST, RATIO = 1.5, 1 / 8, 2.2
+FASTEST, SLOWEST, RATIO = 1.5, 1 / 4, 2.2
 #: The impulse response ends after this many decay times, where its prior deviation is e^-4 of the first.
 LENGTH = 8.0
 #: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
@@ -55,7 +55,7 @@ ROUNDING = 1e-11
 CONSTANT, LINE, INTEGRAL, FIRST_FREE = range(4)
 START = tuple(range(FIRST_FREE, FIRST_FREE + len(FREE)))
 #: Slow terms that are compared while the response is chosen.
-SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE))
+SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE), (CONSTANT, *START), (CONSTANT, LINE, *START))
 
 
 class Prior(NamedTuple):
@@ -306,6 +306,9 @@ def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrat
             scales = SCALES / max(float(directions.squares[-1]), np.finfo(float).tiny)
             weighted = directions.weighted(scales)
             for slow, integrates in itertools.product(SLOW, integrating):
+                if integrates and LINE in slow:
+                    # A slow response to an input that is not zero on average may look like both of them.
+                    continue
                 values = determinant + weighted.criteria((*slow, INTEGRAL) if integrates else slow, count)
                 k = int(np.argmin(values))
                 if values[k] < least:
