@@ -17,7 +17,9 @@ from ctid_cli.inference.response_estimates import (
     signal_to_noise,
     step_responses,
 )
-from ctid_cli.inference.response_model import Signals, fit_response
+from ctid_cli.inference.response_layout import Signals
+from ctid_cli.inference.response_model import fit_response
+from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.held import HeldSignal
@@ -31,10 +33,12 @@ HIGHEST_ORDER = 50
 MOST_SAMPLES = 5000
 #: Fewer samples than this show no response beside noise.
 FEWEST_SAMPLES = 50
+#: An offset of so many deviations of the output needs no test.
+FAR = 1000.0
 #: Rounds in which outliers are left out and looked for again.
 ROUNDS = 3
 #: Delays up to this fraction of the record are tried where it is asked whether the output responds at all.
-LONGEST_DELAY = 0.1
+LONGEST_DELAY = 0.3
 #: An output moves no more than rounding where its deviation is below this fraction of its mean.
 CONSTANT = 1e-9
 
@@ -135,7 +139,10 @@ def record_facts(record: Record) -> RecordFacts:
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
     moving = moves.kind != "constant" and float(present.std()) > CONSTANT * abs(float(present.mean()))
-    told = moving and present.size >= FEWEST_SAMPLES
+    beside = beside_response(record) if moving and present.size >= FEWEST_SAMPLES else Beside()
+    p_value = _response_p_value(record) if moving else math.nan
+    if p_value > NO_RESPONSE:
+        beside = replace(beside, signal_to_noise=UNKNOWN, response_time=UNKNOWN, delay=UNKNOWN)
     return RecordFacts(
         name=record.name,
         n_samples=record.n_samples,
@@ -159,8 +166,8 @@ def record_facts(record: Record) -> RecordFacts:
         output_quantum=quantum(present),
         saturated=saturated(present),
         output_bandwidth=answer.bandwidth,
-        answer_p_value=_response_p_value(record) if moving else math.nan,
-        beside=beside_response(record) if told else Beside(),
+        answer_p_value=p_value,
+        beside=beside,
         **_range("input", record.input.at(t)),
         **_range("output", present),
     )
@@ -181,20 +188,25 @@ def _response_p_value(record: Record) -> float:
 
 
 def beside_response(record: Record) -> Beside:
-    """Fit the response of a record whose input varies, leave out what lies far off, and test what stands beside the rest."""
+    """Fit the response of a record whose input varies, without outliers, and test what stands beside it."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
     interval, places = float(np.median(np.diff(record.t))), np.flatnonzero(record.valid)
+    middle = float(np.median(record.y[places]))
+    # Products of so large an offset would round the rest away.
+    shift = middle if abs(middle) > FAR * float(np.std(record.y[places])) else 0.0
     wild, far = places[outliers(record.y[places])], np.zeros(0, dtype=np.int64)
     for _ in range(ROUNDS):
         wild = np.union1d(wild, far)
         used = np.setdiff1d(places[::every], wild)
-        model = fit_response(Signals(record.t[used], record.y[used], record.input, interval))
-        terms = slow_terms(model)
+        model = fit_response(Signals(record.t[used], record.y[used] - shift, record.input, interval))
+        terms = slow_terms(model, ("offset",) if shift else ())
         slow = slow_columns(model, terms)
         response, rest = model.parts(slow)
         far = used[outlying(model, rest)]
         if not far.size:
             break
+    offset = terms["offset"]
+    terms["offset"] = replace(offset, value=offset.value + shift, low=offset.low + shift, high=offset.high + shift)
     steps = step_responses(model, slow)
     return Beside(
         signal_to_noise(model, slow),

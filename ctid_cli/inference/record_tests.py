@@ -8,7 +8,8 @@ import numpy as np
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.inference.intervals import normal_quantile, robust_deviation, student_quantile
 from ctid_cli.inference.residual_tests import normal_tail
-from ctid_cli.inference.response_model import CONSTANT, LINE, START, ResponseModel, whitened
+from ctid_cli.inference.response_layout import CONSTANT, LINE, START
+from ctid_cli.inference.response_model import ResponseModel, whitened
 
 #: Probability of each false alarm. There are five tests of random errors, and all alarms together are to be rare.
 LEVEL = 0.001
@@ -18,10 +19,15 @@ ORDER, ANSWERS = 6, 3
 REWEIGHTED, CLIPPED = 8, 1.5
 
 #: Outliers are looked for until so large a share of the samples are.
-MOST_OUTLIERS = 0.05
+MOST_OUTLIERS = 0.02
+#: Smaller errors, as a share of the deviation of the output, are those of an impulse response in intervals.
+SMALL = 0.002
 #: Neighbours on each side that show how large errors are about a sample, and the share of theirs that counts: the
 #: deviation of so few is uncertain.
 ABOUT, LOUDER = 30, 0.7
+
+#: Noise of less power than this, as a share of the output's, is rounding.
+NO_NOISE = 1e-20
 
 SLOW_TERMS: Mapping[str, tuple[int, ...]] = {"offset": (CONSTANT,), "drift": (LINE,), "start": START}
 
@@ -40,8 +46,8 @@ class SlowTerm:
     high: float
 
 
-def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
-    """Test offset, drift of the output, and free response of a record.
+def slow_terms(model: ResponseModel, known: tuple[str, ...] = ()) -> dict[str, SlowTerm]:
+    """Test offset, drift of the output, and free response of a record beside those that are known to be there.
 
     F tests by generalised least squares, the greatest first and the others beside it, as long as one is significant.
     The noise has as many degrees of freedom as the record is worth independent samples.
@@ -49,7 +55,8 @@ def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
     weighted, count = model.weighted, len(model.layout.columns)
     everything = (CONSTANT, LINE, *START, *model.own)
     freedom = max(2.0, model.noise.effective_count(count) - len(everything))
-    variance = weighted.fit(everything)[2] / (count - len(everything))
+    least = NO_NOISE * float(weighted.products[0, -1, -1])
+    variance = max(weighted.fit(everything)[2], least) / (count - len(everything))
 
     def p_value(name: str, beside: Iterable[str]) -> float:
         from scipy.special import fdtrc
@@ -59,14 +66,14 @@ def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
         gain = weighted.fit(others)[2] - weighted.fit((*others, *own))[2]
         return float(fdtrc(len(own), freedom, max(gain, 0.0) / (len(own) * variance)))
 
-    found: tuple[str, ...] = ()
+    found = known
     while len(found) < len(SLOW_TERMS):
         likely = {name: p_value(name, found) for name in SLOW_TERMS if name not in found}
         name = min(likely, key=lambda key: likely[key])
         if likely[name] > LEVEL:
             break
         found = (*found, name)
-    found = tuple(name for name in found if p_value(name, found) <= LEVEL)
+    found = tuple(name for name in found if name in known or p_value(name, found) <= LEVEL)
     quantile = student_quantile(freedom)
     terms = {}
     for name in SLOW_TERMS:
@@ -75,7 +82,8 @@ def slow_terms(model: ResponseModel) -> dict[str, SlowTerm]:
         places = [columns.index(column) for column in SLOW_TERMS[name]]
         value = float(values[places].sum())
         reach = quantile * float(np.sqrt(variance * covariance[np.ix_(places, places)].sum()))
-        terms[name] = SlowTerm(name in found, p_value(name, found), value, value - reach, value + reach)
+        p = 0.0 if name in known else p_value(name, found)
+        terms[name] = SlowTerm(name in found, p, value, value - reach, value + reach)
     return terms
 
 
@@ -96,6 +104,7 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
     """
     c, r = model.noise.coefficients, model.noise.order
     limit, rest, found = normal_quantile(1 - LEVEL / rest.size), rest.copy(), list[int]()
+    least = SMALL * float(model.layout.columns[:, -1].std())
     energy = np.cumsum(c**2)[np.minimum(np.arange(rest.size)[::-1], r)]
     # An error shows in its neighbours too, so that the greatest is taken away before the next is looked for.
     for _ in range(int(MOST_OUTLIERS * rest.size)):
@@ -104,7 +113,8 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
         score = np.abs(errors) * np.sqrt(energy)
         k = int(np.argmax(score))
         about = score[max(k - ABOUT, 0) : k + ABOUT + 1]
-        if not score[k] > limit * max(_deviation(score), LOUDER * robust_deviation(about)):
+        sure = score[k] > limit * max(_deviation(score), LOUDER * robust_deviation(about))
+        if not sure or abs(errors[k]) < least:
             break
         found.append(k)
         rest[k] -= errors[k]
@@ -112,8 +122,8 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
 
 
 def _deviation(sizes: Array) -> float:
-    """Standard deviation from the median size, or from that which one in twenty exceeds, where tails are heavier."""
-    return max(robust_deviation(sizes), float(np.quantile(sizes, 0.95)) / normal_quantile(0.95))
+    """Standard deviation from sizes, of which a few may be far too large."""
+    return float(np.sqrt(np.mean(np.minimum(sizes, 3.0 * robust_deviation(sizes)) ** 2)))
 
 
 def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> float:

@@ -8,7 +8,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.response_model import INTEGRAL, SCALES, Directions, ResponseModel, prior_factor
+from ctid_cli.inference.response_layout import INTEGRAL, prior_factor
+from ctid_cli.inference.response_model import Directions, ResponseModel
 
 #: Tails of the intervals [-].
 TAILS = (0.025, 0.975)
@@ -22,7 +23,7 @@ BETWEEN = 0.25
 #: A response is sure at so many standard deviations.
 SURE = 5.0
 #: A response has ended where the last quarter of its length changes it by less than this share.
-ENDED = 0.05
+ENDED = 0.1
 #: Powers of ``1 - exp(-s/T)`` with which a response may begin, and delays that are compared.
 STARTS, DELAYS = (0, 1, 2, 3), 12
 #: Weight of the likelihood of a delay. None of these beginnings is the true one: of 97 simulated records of one to four
@@ -56,6 +57,8 @@ def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
     products = columns.T @ columns - len(columns) * np.outer(columns.mean(axis=0), columns.mean(axis=0))
     covariance = model.taps(slow)[1] * variance
     power = (float(response @ response) + float(np.sum(products * covariance))) / len(columns)
+    if not power > 0:
+        return UNKNOWN
     along = columns.T @ response
     error = 2 * math.sqrt(float(along @ covariance @ along)) / len(columns) / power
     # The variance of coloured noise is as uncertain as that of fewer white samples.
@@ -136,6 +139,5 @@ def _criteria(model: ResponseModel, slow: Sequence[int], first: int) -> list[flo
         factor = prior_factor(part, smooth)
         for power in STARTS:
             directions = Directions.of(gram[first:, first:], begun[:, None] ** power * factor)
-            weighted = directions.weighted(SCALES / max(float(directions.squares[-1]), np.finfo(float).tiny))
-            values.append(float(weighted.criteria(slow, len(layout.columns)).min()))
+            values.append(float(directions.searched().criteria(slow, len(layout.columns)).min()))
     return values

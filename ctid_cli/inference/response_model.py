@@ -30,7 +30,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel, fit_residual_noise
-from ctid_cli.signals.held import HeldSignal
+from ctid_cli.inference.response_layout import CONSTANT, INTEGRAL, LINE, START, Layout, Signals, prior_factor
 
 #: Intervals of the impulse response while decay and noise are searched, and afterwards; so many sampling intervals long
 #: are the first third of them.
@@ -38,22 +38,15 @@ COARSE, FINE = 60, 120
 #: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
 #: of neighbours.
 FASTEST, SLOWEST, RATIO = 1.5, 1 / 4, 2.2
-#: The impulse response ends after this many decay times, where its prior deviation is e^-4 of the first.
-LENGTH = 8.0
 #: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
 SCALES = np.geomspace(1e-3, 1e9, 37)
 #: Poles of the AR(1) noise with which the search begins.
 NOISE_POLES = (0.0, 0.5, 0.8, 0.95)
-#: Times after which a free response has decayed by the factor e [decay times of the impulse response].
-FREE = (0.7, 2.0, 6.0)
-#: The longest of them [duration of the record]: longer ones are not told from a straight line.
-LONGEST_FREE = 1 / 6
 #: Rounding of products and factors, as a share of the diagonal.
 ROUNDING = 1e-11
+#: An input with less power than this does not vary while the output is known.
+LEAST = 1e-200
 
-#: Columns of X.
-CONSTANT, LINE, INTEGRAL, FIRST_FREE = range(4)
-START = tuple(range(FIRST_FREE, FIRST_FREE + len(FREE)))
 #: Slow terms that are compared while the response is chosen.
 SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE), (CONSTANT, *START), (CONSTANT, LINE, *START))
 
@@ -68,70 +61,11 @@ class Prior(NamedTuple):
     scale: float
 
 
-class Pulse(NamedTuple):
-    """Integral of an input about its value before the record."""
-
-    t: Array
-    values: Array
-    slopes: Array
-    sums: Array
-
-    @classmethod
-    def of(cls, signal: HeldSignal, before: float) -> "Pulse":
-        """Integrate exactly a signal that is held or joined by straight lines."""
-        w, steps, slopes = signal.values - before, np.diff(signal.t), np.zeros(signal.t.size)
-        if signal.hold != "zoh":
-            slopes[:-1] = np.diff(w) / steps
-        areas = steps * (w[:-1] + 0.5 * slopes[:-1] * steps)
-        return cls(signal.t, w, slopes, np.append(0.0, np.cumsum(areas)))
-
-    def at(self, times: Array) -> Array:
-        """Return the integral until given instants; zero before the record."""
-        k = np.maximum(np.searchsorted(self.t, times, side="right") - 1, 0)
-        since = np.maximum(times - self.t[k], 0.0)
-        return np.asarray(self.sums[k] + since * (self.values[k] + 0.5 * self.slopes[k] * since))
-
-
-class Signals(NamedTuple):
-    """Samples of an output, which need not be all of them, the input, and the sampling interval."""
-
-    t: Array
-    y: Array
-    input: HeldSignal
-    interval: float
-
-
-class Layout(NamedTuple):
-    """Columns for one decay time and one input before the record."""
-
-    before: float
-    decay: float
-    #: Ends of the intervals of the impulse response [s], shape (K + 1,).
-    edges: Array
-    #: Responses to the input over each interval, X and the output, shape (N, K + q + 1).
-    columns: Array
-
-    @classmethod
-    def of(cls, signals: Signals, before: float, decay: float, taps: int) -> "Layout":
-        """Lay signals out; ``taps`` is the greatest number of intervals."""
-        t, y, signal, interval = signals
-        duration = float(t[-1] - t[0])
-        since, pulse = t - t[0], Pulse.of(signal, before)
-        edges = _edges(min(LENGTH * decay, duration), interval, taps)
-        responses = -np.diff(pulse.at(t[:, None] - edges), axis=1)
-        free = [np.exp(-since / min(factor * decay, LONGEST_FREE * duration)) for factor in FREE]
-        columns = np.column_stack([responses, np.ones(t.size), since / duration, pulse.at(t), *free, y])
-        return cls(before, decay, edges, columns)
-
-    @property
-    def taps(self) -> int:
-        """Number of intervals."""
-        return int(self.edges.size - 1)
-
-
 class Weighted(NamedTuple):
     """Products of the columns of X and of the output, which come last, weighted by the inverse of their covariance."""
 
+    #: Scales of the prior, shape (scales,).
+    scales: Array
     #: At each scale of the prior, shape (scales, q + 1, q + 1).
     products: Array
     #: Logarithm of the determinant of that covariance over that of the noise, shape (scales,).
@@ -152,7 +86,7 @@ class Weighted(NamedTuple):
         right, left = self.products[:, k, -1], self.products[:, -1, -1]
         if k:
             normal = self.products[:, k][:, :, k]
-            normal = normal + ROUNDING * np.eye(len(k)) * np.einsum("lii->li", normal)[:, None]
+            normal = normal + np.eye(len(k)) * (ROUNDING * np.einsum("lii->li", normal)[:, None] + LEAST)
             left = left - np.einsum("li,li->l", right, np.linalg.solve(normal, right[..., None])[..., 0])
         left = np.maximum(left, np.finfo(float).tiny)
         return np.asarray(count * np.log(left / count) + self.log_determinants + len(k) * np.log(count))
@@ -180,7 +114,11 @@ class Directions(NamedTuple):
         """Weight the products at each scale l: each direction loses the share l s^2 / (1 + l s^2) of its own."""
         lost = scales[:, None] / (1 + scales[:, None] * self.squares)
         taken = np.einsum("lk,ki,kj->lij", lost, self.along, self.along, optimize=True)
-        return Weighted(self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
+        return Weighted(scales, self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
+
+    def searched(self) -> Weighted:
+        """Weight the products at all scales that are tried."""
+        return self.weighted(SCALES / max(float(self.squares[-1]), LEAST))
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,23 +179,6 @@ class ResponseModel:
         return response, signals[:, -1] - response - slow
 
 
-def _edges(length: float, interval: float, taps: int) -> Array:
-    """Ends of the intervals of an impulse response: as short as the clock's at first, then even."""
-    if length <= taps * interval:
-        return np.asarray(interval * np.arange(max(round(length / interval), 4) + 1.0))
-    first = interval * np.arange(taps // 3 + 1.0)
-    return np.append(first, np.linspace(first[-1], length, taps - taps // 3 + 1)[1:])
-
-
-def prior_factor(layout: Layout, smooth: bool) -> Array:
-    """Cholesky's factor of the prior covariance of an impulse response, of scale 1."""
-    theta = np.exp(-0.5 * (layout.edges[1:] + layout.edges[:-1]) / layout.decay)
-    least = np.minimum(theta[:, None], theta)
-    covariance = 0.5 * (3 * np.outer(theta, theta) * least - least**3) if smooth else least
-    covariance[np.diag_indices_from(covariance)] *= 1 + 10 * ROUNDING
-    return np.linalg.cholesky(covariance)
-
-
 def ar1(pole: float) -> NoiseModel:
     """AR(1) noise of innovation variance 1."""
     return NoiseModel(np.array([1.0, -pole]), np.array([1.0, pole]) / (1 - pole**2), 1.0)
@@ -303,8 +224,7 @@ def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrat
         determinant = 2 * float(np.log(first_factor(noise).diagonal()).sum())
         for smooth in (False, True):
             directions = Directions.of(gram, prior_factor(layout, smooth))
-            scales = SCALES / max(float(directions.squares[-1]), np.finfo(float).tiny)
-            weighted = directions.weighted(scales)
+            weighted = directions.searched()
             for slow, integrates in itertools.product(SLOW, integrating):
                 if integrates and LINE in slow:
                     # A slow response to an input that is not zero on average may look like both of them.
@@ -312,7 +232,7 @@ def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrat
                 values = determinant + weighted.criteria((*slow, INTEGRAL) if integrates else slow, count)
                 k = int(np.argmin(values))
                 if values[k] < least:
-                    least, prior = float(values[k]), Prior(layout.decay, smooth, float(scales[k]))
+                    least, prior = float(values[k]), Prior(layout.decay, smooth, float(weighted.scales[k]))
                     best = ResponseModel(layout, prior, noise, integrates)
     assert best is not None
     return best

@@ -13,6 +13,7 @@ import pandas as pd
 from ctid_cli.inference.record_facts import FEWEST_SAMPLES, HIGHEST_ORDER, LONG_INTERVAL, RecordFacts
 from ctid_cli.inference.record_tests import LEVEL, SlowTerm
 from ctid_cli.inference.response_estimates import Estimate
+from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.table import ROLES
@@ -25,10 +26,14 @@ LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
 JITTER = 0.05
 #: Below this order of excitation no model with a delay can be told from one without.
 ENOUGH_ORDER = 4
-#: An output is said not to respond where the probability of its response by chance is above this.
-NO_RESPONSE = 0.05
 #: A mean below this fraction of the standard deviation is what rounding leaves where a mean was subtracted.
 ROUNDING = 1e-9
+#: Keys of the estimates in JSON: value, and ends of the 95 % interval.
+KEYS = {
+    "signal_to_noise": ("snr_db", "snr_db_low", "snr_db_high"),
+    "response_time": ("response_time", "response_time_low", "response_time_high"),
+    "delay": ("delay", "delay_early", "delay_late"),
+}
 #: Columns of numbers; the value of a signal is its mean.
 NUMBERS = ("value", "standard deviation", "low", "high")
 
@@ -105,8 +110,8 @@ class RecordCheckResult(Result):
         """Return facts and command for JSON."""
         content = asdict(self.facts)
         beside = content.pop("beside")
-        for name in ("signal_to_noise", "response_time", "delay"):
-            beside[name] = getattr(self.facts.beside, name)._asdict()
+        for name, keys in KEYS.items():
+            beside.update(zip(keys, beside.pop(name), strict=True))
         columns = {
             role: {"column": getattr(self.measurement, role), "unit": getattr(self.measurement, f"{role}_unit")}
             for role in ROLES
@@ -134,6 +139,10 @@ def _label(level: str) -> str:
 def _digits(x: float, digits: int) -> str:
     """Rounded, without an exponent that is not needed."""
     return f"{float(f'{x:.{digits}g}'):.12g}"
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
 
 
 @dataclass(frozen=True)
@@ -237,7 +246,7 @@ class _Sentences:
 
     def _response(self) -> Finding:
         f = self.facts
-        p = f"p = {f.answer_p_value:.2g}"
+        p = _probability(f.answer_p_value)
         if f.answer_p_value > NO_RESPONSE:
             text = (
                 f"No response of the output to the input is seen: noise of its colour follows the input as much ({p})."
@@ -276,16 +285,14 @@ class _Sentences:
         for topic, term, words in named:
             size = self._interval(term, self.output)
             if term.detected:
-                yield Finding("warning", topic, f"{words} {size}, p = {term.p_value:.2g}.")
+                yield Finding("warning", topic, f"{words} {size}, {_probability(term.p_value)}.")
             else:
                 missed.append(f"{topic} {size}")
+        p = _probability(beside.feedback_p_value)
         if beside.feedback_p_value <= LEVEL:
-            text = (
-                f"The input goes with the noise of the output, as in a closed loop (p = {beside.feedback_p_value:.2g})."
-            )
-            yield Finding("warning", "feedback", text)
+            yield Finding("warning", "feedback", f"The input goes with the noise of the output, as in a loop ({p}).")
         else:
-            missed.append(f"feedback (p = {beside.feedback_p_value:.2g})")
+            missed.append(f"feedback ({p})")
         missed += ["outliers"] * (not beside.outliers) + ["saturation"] * (not self.facts.saturated)
         if missed:
             text = "; ".join(missed)

@@ -50,15 +50,6 @@ def test_the_structure_is_searched_with_that_hold(ctid, tmp_path):
     assert order.startswith("Structure by an order search, as --poles is not given: 2 poles, no zero")
 
 
-def test_check_searches_with_that_hold_and_names_it(ctid, tmp_path):
-    text = " ".join(ctid("check", moved(tmp_path / "a.csv", "foh")).stdout.split())
-    assert "Hold: foh, as --hold is not given: with 2 poles" in text
-    assert "Proposed: 2 poles, no zero" in text
-    assert "--hold foh" in text.partition("next: ")[2]
-    held = ctid("check", moved(tmp_path / "a.csv", "zoh")).stdout
-    assert "--hold" not in held.partition("next: ")[2]
-
-
 def test_a_record_that_does_not_tell_is_taken_as_held(ctid, tmp_path):
     done = ctid("fit", moved(tmp_path / "a.csv", "foh", deviation=3.0), "--poles", 2, "--out", tmp_path)
     said = " ".join(done.stdout.split())
