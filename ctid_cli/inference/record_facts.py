@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IntArray
 from ctid_cli.inference.input_response import InputResponse, analyse_response, regular_grid
 from ctid_cli.inference.record_tests import SlowTerm, feedback, outlying, slow_columns, slow_terms
 from ctid_cli.inference.response_estimates import (
@@ -35,6 +35,8 @@ MOST_SAMPLES = 5000
 FEWEST_SAMPLES = 50
 #: An offset of so many deviations of the output needs no test.
 FAR = 1000.0
+#: Quantiles between which the others lie where gross errors are left out.
+TAILS = (0.01, 0.99)
 #: Rounds in which outliers are left out and looked for again.
 ROUNDS = 3
 #: Delays up to this fraction of the record are tried where it is asked whether the output responds at all.
@@ -194,7 +196,7 @@ def beside_response(record: Record) -> Beside:
     middle = float(np.median(record.y[places]))
     # Products of so large an offset would round the rest away.
     shift = middle if abs(middle) > FAR * float(np.std(record.y[places])) else 0.0
-    wild, far = places[outliers(record.y[places])], np.zeros(0, dtype=np.int64)
+    wild, far = places[_gross(record.y[places])], np.zeros(0, dtype=np.int64)
     for _ in range(ROUNDS):
         wild = np.union1d(wild, far)
         used = np.setdiff1d(places[::every], wild)
@@ -217,6 +219,14 @@ def beside_response(record: Record) -> Beside:
         outliers=tuple(record.t[np.union1d(wild, far)].tolist()),
         feedback_p_value=feedback(record.input.at(record.t[used]), response, rest, model),
     )
+
+
+def _gross(y: Array) -> IntArray:
+    """Outliers so large that no response should be fitted to them: beyond the range of the others by as much again."""
+    low, high = np.quantile(y, TAILS)
+    found = outliers(y)
+    far: IntArray = found[np.abs(y[found] - 0.5 * (low + high)) > 1.5 * (high - low)]
+    return far
 
 
 def excitation_order(record: Record, moves: InputMoves, answer: InputResponse) -> int:

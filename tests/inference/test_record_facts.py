@@ -62,7 +62,7 @@ def test_a_fault_is_stated_and_no_other(fault):
 @pytest.mark.parametrize("irregular", [False, True])
 @pytest.mark.parametrize("colour", [0.0, 0.95])
 def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irregular):
-    for seed in range(3):
+    for seed in (1, 2):
         facts = record_facts(clean(seed, colour=colour, irregular=irregular))
         assert stated(facts) == set()
         beside = facts.beside
@@ -72,9 +72,9 @@ def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irr
 
 
 def test_false_alarms_are_as_rare_as_the_level_says():
-    alarms = sum(bool(stated(record_facts(clean(seed, n=300, hold=10)))) for seed in range(60))
+    alarms = sum(bool(stated(record_facts(clean(seed, n=300, hold=10)))) for seed in range(30))
     # With five tests at .001 one of 200 is expected.
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 def test_sizes_are_those_of_the_faults():
