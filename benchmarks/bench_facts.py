@@ -1,7 +1,7 @@
 """False alarms, detections and coverage of the facts that ``ctid check`` states, on simulated records.
 
-Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED]``. Clean records begin at rest, without offset, in open loop;
-each is then given one fault at a time, in white noise and in AR(1) noise of .9.
+Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED] [EVERY]``. Clean records begin at rest, without offset, in open
+loop; one in EVERY is then given one fault at a time, in white noise and in AR(1) noise of .9.
 """
 
 import sys
@@ -20,6 +20,8 @@ from ctid_cli.inference.record_tests import LEVEL
 from ctid_cli.inference.signal_features import saturated
 from ctid_cli.signals.held import regular_interval
 
+#: Clean records, seed, and how many of them there are for each that is given faults.
+DEFAULTS = ["400", "2026", "4"]
 INPUTS = ("prbs", "step", "multisine")
 
 
@@ -163,7 +165,7 @@ def held(estimate, truth):
     return None if np.isnan(estimate.value) else bool(estimate.low - 1e-9 <= truth <= estimate.high + 1e-9)
 
 
-def main(records, seed):
+def main(records, seed, every):
     rng = np.random.default_rng(seed)
     false, found, covered = Counter(), Counter(), {"signal to noise": [], "response time": [], "delay": []}
     tried, seconds = Counter(), 0.0
@@ -180,7 +182,7 @@ def main(records, seed):
         covered["delay"].append(held(beside.delay, case.system.delay))
         if not case.integrators:
             covered["response time"].append(held(beside.response_time, true_response_time(case)))
-        if number % 4:
+        if number % every:
             continue
         for name, of in (("white", 0.0), ("AR(1) .9", 0.9)):
             noise = noise_deviation(case) * draw_noise(rng, case.t.size, of)
@@ -208,4 +210,4 @@ def main(records, seed):
 
 
 if __name__ == "__main__":
-    main(*(int(value) for value in (*sys.argv[1:], "400", "2026")[:2]))
+    main(*(int(value) for value in (sys.argv[1:] + DEFAULTS[len(sys.argv) - 1 :])))
