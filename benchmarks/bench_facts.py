@@ -1,7 +1,7 @@
 """False alarms, detections and coverage of the facts that ``ctid check`` states, on simulated records.
 
-Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED] [EVERY]``. Clean records begin at rest, without offset, in open
-loop; one in EVERY is then given one fault at a time, in white noise and in AR(1) noise of .9.
+Usage: ``python benchmarks/bench_facts.py [RECORDS] [SEED] [EVERY]``. Clean records begin at rest, without offset, in
+open loop; one in EVERY is then given one fault at a time, in white noise and in AR(1) noise of .9.
 """
 
 import sys
