@@ -1,7 +1,10 @@
 """``ctid check``."""
 
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -9,6 +12,9 @@ from ctid_cli.cli._common import emit, guarded
 from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.errors import MismatchError
 from ctid_cli.signals.treatment import AskedHold
+
+if TYPE_CHECKING:
+    from ctid_cli.signals.measurement import Measurement
 
 
 @guarded
@@ -19,21 +25,38 @@ def check(
     hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
 ) -> None:
-    """Check a measured record, and propose a model to begin with.
+    """State facts on a measured record, and the command that identifies a model of it.
 
-    Sampling, gaps, excitation, offsets, trends, bandwidth against the sampling frequency, and a hint of the delay: what
-    is wrong with these data, the worst first; then a structure to begin with, by a short search of at most four poles.
-    Columns are found by their usual names (t, u, y) unless named.
+    Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
+    rest and feedback, tested beside the response to the input in noise of any colour. Columns are found by their usual
+    names (t, u, y) unless named.
     """
     from ctid_cli.identification.choice import Given
     from ctid_cli.identification.choose import choose
-    from ctid_cli.reporting.record_findings import check_record_quality
+    from ctid_cli.inference.record_facts import record_facts
     from ctid_cli.reporting.record_result import RecordCheckResult
 
     measured = columns.read(file, "zoh" if hold == "auto" else hold)
-    units = measured.time_unit or "s", measured.input_unit or "", measured.output_unit or ""
-    report = check_record_quality(measured.record, *units)
-    choice = None if report.worst == "problem" else choose(measured.record, Given(hold=hold))
-    emit(RecordCheckResult(measured, report, choice if choice and choice.seen else None), form.form)
-    if strict and report.worst == "problem":
+    facts = record_facts(measured.record)
+    result = RecordCheckResult(measured, facts)
+    if result.worst != "problem":
+        choice = choose(measured.record, Given(hold=hold))
+        result = replace(result, command=command_of(measured, choice.words()) if choice.seen else None)
+    emit(result, form.form)
+    if strict and result.worst == "problem":
         raise MismatchError(f"{file}: no model can be identified from this record as it is")
+
+
+def command_of(measured: "Measurement", chosen: Sequence[str]) -> str:
+    """Return the fit of a record by what was chosen, with the columns and the part that were asked for."""
+    from ctid_cli.signals.table import ROLES, USUAL_NAMES, split_header
+
+    words = ["ctid", "fit", measured.record.name]
+    for role in ROLES:
+        name = split_header(getattr(measured, role))[0]
+        if name.lower() not in USUAL_NAMES[role][:2] and Path(measured.record.name).suffix.lower() != ".mat":
+            words += [f"--{role}", name]
+    words += chosen
+    for option, value in (("--from", measured.start), ("--to", measured.stop)):
+        words += [] if value is None else [option, f"{value:.12g}"]
+    return shlex.join(words)

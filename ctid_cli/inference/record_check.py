@@ -7,7 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.input_response import DelayHint, InputResponse, analyse_response, regular_grid
+from ctid_cli.inference.input_response import DelayHint, InputResponse, analyse_response
+from ctid_cli.inference.record_facts import LONG_INTERVAL, Gap, excitation_order
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.record import Record
 
@@ -16,12 +17,8 @@ Level = Literal["ok", "note", "warning", "problem"]
 Start = Literal["flat", "moving", "unknown"]
 #: From the best to the worst.
 LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
-#: An interval longer than this many median intervals is a gap.
-LONG_INTERVAL = 3.0
 #: A mean counts as an offset above this fraction of the standard deviation.
 OFFSET = 0.3
-#: Persistence of excitation is counted up to this order.
-HIGHEST_ORDER = 50
 #: Below this order no model with a delay can be told from one without.
 ENOUGH_ORDER = 4
 #: A trend is one above this many standard errors.
@@ -35,16 +32,6 @@ class Finding:
     level: Level
     topic: str
     sentence: str
-
-
-@dataclass(frozen=True)
-class Gap:
-    """An interval without samples."""
-
-    #: Last instant before it [s].
-    start: float
-    #: Time to the next sample [s].
-    length: float
 
 
 @dataclass(frozen=True)
@@ -138,7 +125,7 @@ def examine(record: Record) -> Examined:
     """Numbers of a record; an input that excites fewer than four parameters shows no delay."""
     moves = input_moves(record)
     answer = analyse_response(record, moves)
-    order = _excitation_order(record, moves, answer)
+    order = excitation_order(record, moves, answer)
     if order < ENOUGH_ORDER and moves.kind != "steps":
         # A sine that comes later and one that is filtered look the same.
         answer = replace(answer, delay=None)
@@ -199,23 +186,6 @@ def _range(signal: str, x: Array) -> dict[str, Any]:
     """Fields of a report on the values of a signal."""
     values = {"mean": x.mean(), "deviation": x.std(), "low": x.min(), "high": x.max()}
     return {f"{signal}_{name}": float(value) for name, value in values.items()}
-
-
-def _excitation_order(record: Record, moves: InputMoves, answer: InputResponse) -> int:
-    """Rank of the autocovariance of the input, at most 50; directions 40 dB below the strongest do not count."""
-    grid = regular_grid(record)
-    u = record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
-    highest = answer.input_band[1]
-    if moves.kind == "continuous" and highest > 0:
-        # Of a slow input, neighbouring samples are all alike: look at it as fast as it moves.
-        u = u[:: max(1, int(math.pi / (1.5 * highest * grid.interval)))]
-    order = min(HIGHEST_ORDER, u.size // 3)
-    if order < 1 or moves.kind == "constant":
-        return 0
-    past = np.lib.stride_tricks.sliding_window_view(u, order)[:: max(1, u.size // 20_000)]
-    past = past - past.mean(axis=0)
-    strength = np.linalg.eigvalsh(past.T @ past)
-    return int(np.count_nonzero(strength > 1e-4 * strength[-1]))
 
 
 def _trend(t: Array, y: Array) -> tuple[float, float, float]:

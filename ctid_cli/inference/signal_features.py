@@ -144,7 +144,7 @@ def _level_about(surprise: Array, k: int) -> float:
 
 
 def saturated(y: Array) -> float:
-    """Fraction of the samples that a limit seems to have cut off; the output may begin at rest at its least value."""
+    """Fraction of the samples that a limit seems to have cut off; the output may begin, or end, at rest at a limit."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < 10:
         return 0.0
@@ -156,7 +156,7 @@ def saturated(y: Array) -> float:
         at = y == values[k]
         first, end = _runs(at)
         runs = end - first
-        in_runs = int(runs[(runs >= shortest) & (first > 0)].sum())
+        in_runs = int(runs[(runs >= shortest) & (first > 0) & (end < y.size)].sum())
         if in_runs >= fewest and counts[k] > 5 * counts[inner]:
             total += in_runs
     return total / y.size

@@ -1,4 +1,4 @@
-"""``ctid check``: from a file to findings that one can act on."""
+"""``ctid check``: from a file to facts and the command to run."""
 
 import json
 
@@ -31,7 +31,7 @@ def rig(tmp_path, arrays, monkeypatch):
 
 @pytest.mark.parametrize("form", ["text", "md"])
 def test_printed(ctid, rig, form, snapshot):
-    """Findings with the worst first, numbers, a structure, and the fit to go on with."""
+    """Facts with the worst first, numbers, and the command to run."""
     assert ctid("check", rig, *NAMED, "--format", form).stdout == snapshot
 
 
@@ -40,22 +40,11 @@ def test_json(ctid, rig):
     content = json.loads(done.stdout)
     assert content["columns"]["time"] == {"column": "time [h]", "unit": "h"}
     assert (content["file"], content["worst"], content["n_samples"]) == (rig, "warning", 2000)
-    assert content["findings"][0]["topic"] == "offset"
+    assert (content["findings"][0]["topic"], content["offset"]["detected"]) == ("offset", True)
     assert content["delay_early"] <= 1.3 <= content["delay_late"]
+    assert content["snr_db_low"] < content["snr_db"] < content["snr_db_high"]
     assert (content["input_levels"], content["output_quantum"]) == ([1.0, 3.0], None)
-    assert (content["proposed"]["poles"], content["proposed"]["zeros"]) == (1, 0)
-
-
-def test_a_part_of_a_long_record_is_enough(ctid, tmp_path):
-    rng = np.random.default_rng(1)
-    t = 0.1 * np.arange(6000)
-    # At rest for long, then two modes: the beginning of the file contains nothing.
-    u = np.where(t < 200, 0.0, np.repeat(rng.choice([-1.0, 1.0], 1200), 5))
-    y = simulate(TransferFunction([6, 1.6, 14], [1, 0.8, 10.12, 2.4, 9]), HeldSignal(t, u), t)
-    file = write(tmp_path / "long.csv", (t, u, y + 0.1 * rng.standard_normal(t.size)))
-    content = json.loads(ctid("check", file, "--json").stdout)
-    assert (content["proposed"]["poles"], content["proposed"]["zeros"]) == (4, 2)
-    assert "of the 6000 samples" in content["proposed"]["reason"]
+    assert content["command"] == "ctid fit rig.csv --input valve --output level"
 
 
 def test_a_window_and_a_hold(ctid, rig):

@@ -1,0 +1,248 @@
+r"""Response of an output to its input without a structure: a Gaussian process beside slow terms and coloured noise.
+
+.. math:: y(t) = \int_0^S g(s)\, (u(t - s) - u_b)\, ds + X(t) \beta + v(t)
+
+The impulse response g is constant over each of some hundred intervals, and a priori a Gaussian process that decays,
+with one of two covariances [1]_, :math:`\theta = e^{-s/T}`, :math:`m = \min(\theta, \theta')`:
+
+- rough ("tuned and correlated"): :math:`\lambda m`;
+- smooth ("stable spline"): :math:`\lambda (3 \theta \theta' m - m^3) / 2`.
+
+X holds what is not the response: a constant, a straight line, free responses that decay; and the integral of u where
+the system integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the
+system integrates have the least BIC; v is autoregressive noise by REML, beside all of these.
+
+References
+----------
+.. [1] G. Pillonetto, F. Dinuzzo, T. Chen, G. De Nicolao and L. Ljung, "Kernel methods in system identification,
+   machine learning and function estimation: A survey", *Automatica* 50 (2014) 657-682.
+   doi:10.1016/j.automatica.2014.01.001
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.inference.noise_model import NoiseModel, fit_residual_noise
+from ctid_cli.inference.response_layout import CONSTANT, INTEGRAL, LINE, START, Layout, Signals, prior_factor
+
+#: Intervals of the impulse response while decay and noise are searched, and afterwards; so many sampling intervals long
+#: are the first third of them.
+COARSE, FINE = 60, 120
+#: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
+#: of neighbours.
+FASTEST, SLOWEST, RATIO = 1.5, 1 / 4, 2.2
+#: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
+SCALES = np.geomspace(1e-3, 1e9, 37)
+#: Poles of the AR(1) noise with which the search begins.
+NOISE_POLES = (0.0, 0.5, 0.8, 0.95)
+#: Rounding of products and factors, as a share of the diagonal.
+ROUNDING = 1e-11
+#: An input with less power than this does not vary while the output is known.
+LEAST = 1e-200
+
+#: Slow terms that are compared while the response is chosen.
+SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE), (CONSTANT, *START), (CONSTANT, LINE, *START))
+
+
+class Prior(NamedTuple):
+    """What is assumed of the impulse response."""
+
+    #: Time after which its variance has decayed by the factor e [s].
+    decay: float
+    smooth: bool
+    #: Its first variance over that of the innovations.
+    scale: float
+
+
+class Weighted(NamedTuple):
+    """Products of the columns of X and of the output, which come last, weighted by the inverse of their covariance."""
+
+    #: Scales of the prior, shape (scales,).
+    scales: Array
+    #: At each scale of the prior, shape (scales, q + 1, q + 1).
+    products: Array
+    #: Logarithm of the determinant of that covariance over that of the noise, shape (scales,).
+    log_determinants: Array
+
+    def fit(self, columns: Sequence[int]) -> tuple[Array, Array, float]:
+        """Return coefficients of columns of X, their covariance over the variance, and the square of the rest."""
+        k, products = list(columns), self.products[0]
+        sizes = np.sqrt(np.maximum(products.diagonal()[k], np.finfo(float).tiny))
+        scaled = products[np.ix_(k, k)] / np.outer(sizes, sizes)
+        inverse = np.linalg.pinv(scaled, rcond=ROUNDING, hermitian=True) / np.outer(sizes, sizes)
+        coefficients = inverse @ products[k, -1]
+        return coefficients, inverse, float(products[-1, -1] - products[k, -1] @ coefficients)
+
+    def criteria(self, columns: Sequence[int], count: int) -> Array:
+        """Return BIC with some columns of X at each scale, but for a constant and the noise."""
+        k = list(columns)
+        right, left = self.products[:, k, -1], self.products[:, -1, -1]
+        if k:
+            normal = self.products[:, k][:, :, k]
+            normal = normal + np.eye(len(k)) * (ROUNDING * np.einsum("lii->li", normal)[:, None] + LEAST)
+            left = left - np.einsum("li,li->l", right, np.linalg.solve(normal, right[..., None])[..., 0])
+        left = np.maximum(left, np.finfo(float).tiny)
+        return np.asarray(count * np.log(left / count) + self.log_determinants + len(k) * np.log(count))
+
+
+class Directions(NamedTuple):
+    r"""Directions :math:`\Phi L = U S V'` of the response, from whitened columns and a factor L of the prior."""
+
+    #: S^2, rising, and V, shapes (K,) and (K, K).
+    squares: Array
+    right: Array
+    #: Products of the columns with S U, and with one another, shapes (K, q + 1) and (q + 1, q + 1).
+    along: Array
+    products: Array
+
+    @classmethod
+    def of(cls, gram: Array, factor: Array) -> "Directions":
+        """Find the directions from the products of all columns."""
+        taps = len(factor)
+        squares, right = np.linalg.eigh(factor.T @ gram[:taps, :taps] @ factor)
+        along = right.T @ (factor.T @ gram[:taps, taps:])
+        return cls(np.maximum(squares, 0.0), right, along, gram[taps:, taps:])
+
+    def weighted(self, scales: Array) -> Weighted:
+        """Weight the products at each scale l: each direction loses the share l s^2 / (1 + l s^2) of its own."""
+        lost = scales[:, None] / (1 + scales[:, None] * self.squares)
+        taken = np.einsum("lk,ki,kj->lij", lost, self.along, self.along, optimize=True)
+        return Weighted(scales, self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
+
+    def searched(self) -> Weighted:
+        """Weight the products at all scales that are tried."""
+        return self.weighted(SCALES / max(float(self.squares[-1]), LEAST))
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseModel:
+    """An impulse response with its uncertainty, what is beside it, and the noise."""
+
+    layout: Layout
+    prior: Prior
+    noise: NoiseModel
+    integrates: bool
+
+    @property
+    def own(self) -> tuple[int, ...]:
+        """Columns of X that belong to the response."""
+        return (INTEGRAL,) if self.integrates else ()
+
+    @cached_property
+    def gram(self) -> Array:
+        """Products of the whitened columns."""
+        white = whitened(self.layout.columns, self.noise)
+        return np.asarray(white.T @ white)
+
+    @cached_property
+    def factor(self) -> Array:
+        """Factor of the prior covariance of the taps over the variance of the innovations."""
+        return np.asarray(np.sqrt(self.prior.scale) * prior_factor(self.layout, self.prior.smooth))
+
+    @cached_property
+    def directions(self) -> Directions:
+        """Directions of the response."""
+        return Directions.of(self.gram, self.factor)
+
+    @cached_property
+    def weighted(self) -> Weighted:
+        """Weighted products of X and the output."""
+        return self.directions.weighted(np.ones(1))
+
+    def taps(self, columns: Sequence[int]) -> tuple[Array, Array]:
+        """Return the impulse response beside columns of X, and its covariance over the variance of the innovations."""
+        found, k = self.directions, list(columns)
+        beta, uncertain, _ = self.weighted.fit(k)
+        gain = self.factor @ found.right / (1 + found.squares)
+        moved = gain @ found.along[:, k]
+        # An integrating system responds with a constant beside what decays.
+        moved -= np.array(k) == INTEGRAL
+        mean = gain @ found.along[:, -1] - moved @ beta
+        return mean, gain @ (self.factor @ found.right).T + moved @ uncertain @ moved.T
+
+    def parts(self, columns: Sequence[int]) -> tuple[Array, Array]:
+        """Return the response to the input, and the residuals beside it and columns of X."""
+        taps, signals = self.layout.taps, self.layout.columns
+        values = dict(zip(columns, self.weighted.fit(columns)[0], strict=True))
+        response = signals[:, :taps] @ self.taps(columns)[0]
+        if INTEGRAL in values:
+            beyond = signals[:, taps + INTEGRAL] - signals[:, :taps].sum(axis=1)
+            response += values.pop(INTEGRAL) * beyond
+        slow = signals[:, [taps + column for column in values]] @ np.array(list(values.values()))
+        return response, signals[:, -1] - response - slow
+
+
+def ar1(pole: float) -> NoiseModel:
+    """AR(1) noise of innovation variance 1."""
+    return NoiseModel(np.array([1.0, -pole]), np.array([1.0, pole]) / (1 - pole**2), 1.0)
+
+
+def first_factor(noise: NoiseModel) -> Array:
+    """Cholesky's factor of the covariance of the first r samples of a noise over the variance of its innovations."""
+    lags = np.abs(np.subtract.outer(np.arange(noise.order), np.arange(noise.order)))
+    return np.asarray(np.linalg.cholesky(noise.first_autocovariances[lags] / noise.innovation_variance))
+
+
+def whitened(columns: Array, noise: NoiseModel) -> Array:
+    """Columns whose noise would be white with the variance of the innovations, the first rows included."""
+    white, r = columns.copy(), noise.order
+    for k in range(1, r + 1):
+        white[r:] += noise.coefficients[k] * columns[r - k : len(columns) - k]
+    if r:
+        white[:r] = np.linalg.solve(first_factor(noise), columns[:r])
+    return white
+
+
+def fit_response(signals: Signals) -> ResponseModel:
+    """Fit the response of an output to an input that varies."""
+    shortest = FASTEST * signals.interval
+    longest = max(SLOWEST * float(np.ptp(signals.t)), 2 * shortest)
+    decays = np.geomspace(shortest, longest, math.ceil(math.log(longest / shortest, RATIO)) + 1)
+    befores = sorted({0.0, float(signals.input.values[0])})
+    coarse = (Layout.of(signals, *pair, COARSE) for pair in itertools.product(befores, decays))
+    model = _likeliest(coarse, [ar1(pole) for pole in NOISE_POLES], (False, True))
+    near = np.clip(model.prior.decay * RATIO ** np.array([-0.5, 0.0, 0.5]), shortest, longest)
+    fine = [Layout.of(signals, model.layout.before, float(decay), FINE) for decay in near]
+    for _ in range(2):
+        model = _likeliest(fine, [noise_beside(model)], (model.integrates,))
+    return ResponseModel(model.layout, model.prior, noise_beside(model), model.integrates)
+
+
+def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrating: Sequence[bool]) -> ResponseModel:
+    """Return the model of the least BIC, whatever slow terms are beside the response."""
+    least, best = np.inf, None
+    for layout, noise in itertools.product(layouts, noises):
+        white = whitened(layout.columns, noise)
+        gram, count = white.T @ white, len(white)
+        determinant = 2 * float(np.log(first_factor(noise).diagonal()).sum())
+        for smooth in (False, True):
+            directions = Directions.of(gram, prior_factor(layout, smooth))
+            weighted = directions.searched()
+            for slow, integrates in itertools.product(SLOW, integrating):
+                if integrates and LINE in slow:
+                    # A slow response to an input that is not zero on average may look like both of them.
+                    continue
+                values = determinant + weighted.criteria((*slow, INTEGRAL) if integrates else slow, count)
+                k = int(np.argmin(values))
+                if values[k] < least:
+                    least, prior = float(values[k]), Prior(layout.decay, smooth, float(weighted.scales[k]))
+                    best = ResponseModel(layout, prior, noise, integrates)
+    assert best is not None
+    return best
+
+
+def noise_beside(model: ResponseModel) -> NoiseModel:
+    """Noise by REML, beside X and the directions of the response that the data determine to more than one half."""
+    fixed = (CONSTANT, LINE, *START, *model.own)
+    taps, columns, found = model.layout.taps, model.layout.columns, model.directions
+    determined = columns[:, :taps] @ (model.factor @ found.right[:, found.squares > 1.0])
+    psi = np.column_stack([determined, columns[:, [taps + k for k in fixed]]])
+    basis, singular, _ = np.linalg.svd(psi / np.linalg.norm(psi, axis=0), full_matrices=False)
+    return fit_residual_noise([basis[:, singular > 1e-9 * singular[0]]], [model.parts(fixed)[1]])

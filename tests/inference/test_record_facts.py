@@ -1,0 +1,144 @@
+"""Facts on a record: each fault on a record made to have it, none on a clean one, and estimates beside the truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from ctid_cli import HeldSignal, Record, TransferFunction, simulate
+from ctid_cli.inference.record_facts import record_facts
+from ctid_cli.inference.record_tests import LEVEL
+
+FIRST_ORDER = TransferFunction([1], [1, 1], delay=1.3)
+
+
+def clean(seed=0, n=1000, hold=20, colour=0.9, noise=0.1, irregular=False):
+    """A first-order system after a random binary input, from rest, in AR(1) noise."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.02, 0.18, n)) if irregular else 0.1 * np.arange(n)
+    u = np.repeat(rng.choice([-1.0, 1.0], n // hold + 1), hold)[:n]
+    v = lfilter([np.sqrt(1 - colour**2)], [1, -colour], rng.standard_normal(n + 200))[200:]
+    return Record.from_arrays(t, u, simulate(FIRST_ORDER, HeldSignal(t, u), t) + noise * v)
+
+
+def faulty(fault):
+    record = clean()
+    t, u, y = record.t, record.input.values, record.y
+    match fault:
+        case "offset":
+            return replace(record, y=y + 0.3)
+        case "drift":
+            return replace(record, y=y + 0.01 * t)
+        case "start":
+            return replace(record, y=y + np.exp(-t))
+        case "outliers":
+            return replace(record, y=y + 0.6 * (np.arange(y.size) == 500))
+        case "saturation":
+            return replace(record, y=np.minimum(y, np.quantile(y, 0.98)))
+        case "feedback":
+            z, w, x, level = np.zeros(y.size), u.copy(), 0.0, y - simulate(FIRST_ORDER, record.input, t)
+            for k in range(y.size):
+                z[k] = x + level[k]
+                w[k] -= 0.5 * z[k]
+                x = 0.905 * x + 0.095 * w[k]
+            return Record.from_arrays(t, w, z)
+    raise AssertionError(fault)
+
+
+def stated(facts):
+    """Faults that are stated."""
+    beside = facts.beside
+    found = {name for name in ("offset", "drift", "start") if getattr(beside, name).detected}
+    others = {"outliers": beside.outliers, "feedback": beside.feedback_p_value <= LEVEL, "saturation": facts.saturated}
+    return found | {name for name, value in others.items() if value}
+
+
+@pytest.mark.parametrize("fault", ["offset", "drift", "start", "outliers", "saturation", "feedback"])
+def test_a_fault_is_stated_and_no_other(fault):
+    assert stated(record_facts(faulty(fault))) == {fault}
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize("colour", [0.0, 0.95])
+def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irregular):
+    for seed in (1, 2):
+        facts = record_facts(clean(seed, colour=colour, irregular=irregular))
+        assert stated(facts) == set()
+        beside = facts.beside
+        assert beside.delay.low <= 1.3 <= beside.delay.high
+        assert beside.response_time.low - 0.1 <= 2.3 <= beside.response_time.high + 0.1
+        assert beside.signal_to_noise.low - 1 <= 18.2 <= beside.signal_to_noise.high + 1
+
+
+def test_false_alarms_are_as_rare_as_the_level_says():
+    alarms = sum(bool(stated(record_facts(clean(seed, n=300, hold=10)))) for seed in range(30))
+    # With five tests at .001 one of 200 is expected.
+    assert alarms <= 1
+
+
+def test_sizes_are_those_of_the_faults():
+    offset, drift = record_facts(faulty("offset")).beside.offset, record_facts(faulty("drift")).beside.drift
+    assert offset.low <= 0.3 <= offset.high
+    assert drift.low <= 1.0 <= drift.high
+    assert offset.high - offset.low < 0.15
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_units_do_not_matter(scale):
+    record = clean()
+    facts = record_facts(record)
+    scaled = record_facts(Record.from_arrays(record.t * scale, record.input.values, record.y / scale))
+    assert scaled.beside.signal_to_noise == pytest.approx(facts.beside.signal_to_noise, rel=1e-4)
+    assert scaled.beside.delay.high == pytest.approx(facts.beside.delay.high * scale)
+    assert stated(scaled) == set()
+
+
+def test_an_output_far_from_zero_is_as_good():
+    record = clean()
+    facts = record_facts(replace(record, y=record.y + 1e6))
+    assert facts.beside.offset.value == pytest.approx(1e6)
+    assert facts.beside.signal_to_noise == pytest.approx(record_facts(record).beside.signal_to_noise, abs=0.5)
+
+
+def test_no_response_is_no_estimate():
+    record = clean()
+    noise = lfilter([1], [1, -0.9], np.random.default_rng(6).standard_normal(record.n_samples))
+    facts = record_facts(replace(record, y=noise))
+    assert facts.answer_p_value > 0.05
+    assert np.isnan(facts.beside.signal_to_noise.value)
+
+
+def test_a_system_that_integrates_has_no_response_time():
+    record = clean(colour=0.0)
+    y = simulate(TransferFunction([1], [1, 0], delay=0.5), record.input, record.t)
+    facts = record_facts(replace(record, y=y + 0.1 * np.random.default_rng(1).standard_normal(y.size)))
+    assert np.isnan(facts.beside.response_time.value)
+    assert facts.beside.delay.low <= 0.5 <= facts.beside.delay.high
+    assert stated(facts) == set()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 9, 49, 50, 60])
+def test_short_records_and_missing_samples(n):
+    record = clean(hold=1)
+    y = np.where(np.arange(n) % 7 == 3, np.nan, record.y[:n])
+    facts = record_facts(Record.from_arrays(record.t[:n], record.input.values[:n], y))
+    assert (facts.beside.offset is None) == (np.isfinite(y).sum() < 50)
+
+
+@pytest.mark.parametrize("tones", [1, 2, 4])
+def test_excitation_counts_two_for_every_tone(tones):
+    t = 0.1 * np.arange(4000)
+    u = sum(np.sin(w * t + w) for w in (0.5, 1.3, 2.9, 4.7)[:tones])
+    facts = record_facts(Record.from_arrays(t, u, simulate(FIRST_ORDER, HeldSignal(t, u, "foh"), t)))
+    assert facts.excitation_order == 2 * tones
+
+
+def test_gaps_and_periods():
+    t = 0.1 * np.arange(4000)
+    u = np.tile(np.random.default_rng(8).choice([-1.0, 1.0], 200), 20)
+    keep = np.r_[0:2500, 2600:4000]
+    x = simulate(FIRST_ORDER, HeldSignal(t, u), t)
+    assert record_facts(Record.from_arrays(t, u, x)).input_period == pytest.approx(20.0)
+    (gap,) = record_facts(Record.from_arrays(t[keep], u[keep], x[keep])).gaps
+    assert (gap.start, gap.length) == (pytest.approx(249.9), pytest.approx(10.1))
