@@ -273,7 +273,8 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
     options: dict[str, Any] = {"dtype": {"converged": "Int64"}, "float_precision": "round_trip"}
-    return pd.read_csv(file, converters={"initial_delay": _initial_delay}, **options)
+    frame: pd.DataFrame = pd.read_csv(file, converters={"initial_delay": _initial_delay}, **options)
+    return frame
 
 
 def _initial_delay(text: str) -> float | str | None:
