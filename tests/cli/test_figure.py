@@ -68,8 +68,6 @@ def test_figures_of_the_additive_study_that_need_no_results(ctid, tmp_path):
     [
         ("additive/3", ["open_loop"]),
         ("additive/4", ["closed_loop"]),
-        ("additive/coloured", ["closed_loop_coloured"]),
-        ("additive/coverage", ["coverage_open_loop", "coverage_closed_loop"]),
     ],
 )
 def test_figures_of_results_say_what_to_run_first(ctid, tmp_path, name, configs):

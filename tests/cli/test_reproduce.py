@@ -171,7 +171,7 @@ def clean(monkeypatch):
     """A checkout without changes, whose code computed the results."""
     answers = {"status": "", "rev-parse": "1234abcd"}
     monkeypatch.setattr(publishing, "_git", lambda *arguments: answers[arguments[0]])
-    monkeypatch.setattr(publishing, "spec_from_canonical", lambda content: content)
+    monkeypatch.setattr(publishing, "spec_from_canonical", lambda content, folder: content)
     monkeypatch.setattr(publishing, "build_plan", lambda spec: spec)
     monkeypatch.setattr(publishing, "current_version", lambda plan: "c")
     return answers
@@ -180,8 +180,7 @@ def clean(monkeypatch):
 @pytest.fixture
 def target(monkeypatch, tmp_path):
     """The folder that everything is published in."""
-    for module in (publishing, claims):
-        monkeypatch.setattr(module, "published_folder", lambda study: tmp_path / "published")
+    monkeypatch.setattr(publishing, "published_folder", lambda study: tmp_path / "published")
     return tmp_path / "published"
 
 
