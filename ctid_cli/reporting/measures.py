@@ -202,7 +202,7 @@ def _measured(results: Results, name: str) -> pd.DataFrame:
     keys, rows = ["group", "parameter"], []
     columns = {key: values[key].to_numpy() for key in ("value", "standard_error", "quantile") if key in values}
     # Numbers in the order of appearance; slices of arrays, since a table for each of many groups would take seconds.
-    places = places_of(values.groupby(keys, sort=False, dropna=False).ngroup().to_numpy(dtype=np.int64))
+    places = places_of(np.asarray(values.groupby(keys, sort=False, dropna=False).ngroup(), dtype=np.intp))
     for (group, parameter), at in zip(values[keys].drop_duplicates().to_numpy(), places.values(), strict=True):
         own = {key: column[at] for key, column in columns.items()}
         found = measured_of(own, measure, bounds.get(group, {}).get(parameter, math.nan))

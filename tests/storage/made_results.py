@@ -88,7 +88,7 @@ class MadeResults(Estimates):
         image = export_image(self.plan, self.given_origins, self.results)
         return Export(h5py.File(io.BytesIO(image), "r"), Path("runs.h5"))
 
-    def _times(self, data_hash, estimator_hash):
+    def _times(self, data_hash, estimator_hash, *_):
         return {
             (key.replicate, key.start): (self.seconds.get(key, self.usual), result.get("cpu_seconds"))
             for key, result in self.results.items()
