@@ -272,15 +272,17 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
-    options: dict[str, Any] = {"dtype": {"converged": "Int64"}, "float_precision": "round_trip"}
-    frame: pd.DataFrame = pd.read_csv(file, converters={"initial_delay": _initial_delay}, **options)
-    return frame
+    frame: pd.DataFrame = pd.read_csv(file, dtype="str")
+    texts = ["experiment", "sampling", "method", "initial_delay"]
+    frame = frame.astype(dict.fromkeys(frame.columns.difference(texts), "float64"))
+    frame["initial_delay"] = frame["initial_delay"].astype(object).map(_initial_delay, na_action="ignore")
+    return frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
 
 
-def _initial_delay(text: str) -> float | str | None:
+def _initial_delay(text: str) -> float | str:
     """Return an initial delay of a table, which may be a word."""
     try:
-        return float(text) if text else None
+        return float(text)
     except ValueError:
         return text
 
