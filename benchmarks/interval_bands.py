@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.simulate import simulate
@@ -18,7 +19,7 @@ from ctid_cli.inference.fit import Status
 from ctid_cli.inference.fitted_model import STEP, FittedModel
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.layout import csv_text, markdown_table
+from ctid_cli.reporting.layout import markdown_table
 from ctid_cli.running.plan import build_plan
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.specification.load import load_spec
@@ -110,7 +111,7 @@ def main(runs: int = 1000) -> None:
     """Compute all rows and write them."""
     lines = [line for row in ROWS for line in coverage(*row, runs)]
     PUBLISHED.mkdir(parents=True, exist_ok=True)
-    (PUBLISHED / "bands.csv").write_text(csv_text(lines), encoding="utf-8")
+    (PUBLISHED / "bands.csv").write_text(pd.DataFrame(lines).to_csv(index=False, lineterminator="\n"), encoding="utf-8")
     (PUBLISHED / "bands.md").write_text(markdown(lines), encoding="utf-8")
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.interval_bands import PUBLISHED
 from ctid_cli.arrays import Array
@@ -22,7 +23,7 @@ from ctid_cli.inference.uncertainty import UNSAFE, shifts_of_ends
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.layout import csv_text, markdown_table
+from ctid_cli.reporting.layout import markdown_table
 from ctid_cli.signals.excitation import Excitation, Prbs, Step
 from ctid_cli.signals.noise import ArmaNoise, Noise, WhiteNoise
 from ctid_cli.signals.sampling import RegularSampling
@@ -158,7 +159,9 @@ def main(runs: int = 400, seed: int = 20261124) -> None:
     lines: list[Line] = []
     for line in study(runs, seed):
         lines.append(line)
-        (PUBLISHED / "defaults.csv").write_text(csv_text(lines), encoding="utf-8")
+        (PUBLISHED / "defaults.csv").write_text(
+            pd.DataFrame(lines).to_csv(index=False, lineterminator="\n"), encoding="utf-8"
+        )
         (PUBLISHED / "defaults.md").write_text(markdown(lines), encoding="utf-8")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,42 +32,14 @@ SIZES = 4
 SETTINGS = 6
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """Standard errors of one estimator on one kind of data by theory, with its formula, or the reason for none."""
-
-    #: Swept settings besides the number of samples.
-    settings: Mapping[str, Any]
-    samples: int
-    estimator: str
-    #: Swept options of the estimator.
-    options: Mapping[str, Any]
-    kind: str
-    #: Whether standard errors fall with the square root of the number of samples.
-    scales: bool = False
-    formula: str = ""
-    reason: str = ""
-    #: ``name``, ``value``, ``standard_error``, ``relative_percent``, ``half_width_95`` of each parameter.
-    parameters: Sequence[Mapping[str, Any]] = ()
-
-    @property
-    def where(self) -> str:
-        """Swept settings in words."""
-        return _words(self.settings)
-
-    @property
-    def title(self) -> str:
-        """Name of the estimator with its swept options and its kind."""
-        name = f"{self.estimator} with {_words(self.options)}" if self.options else self.estimator
-        return name if name == self.kind else f"{name} ({self.kind})"
-
-
 @dataclass(frozen=True, eq=False)
 class AccuracyResult(Result):
     """Expected accuracy of all estimators of an experiment, and what its stored results show beside it."""
 
     experiment: str
-    estimates: Sequence[Expectation]
+    #: Of each estimator, setting and number of samples: the standard errors by theory and their formula, or the reason
+    #: why there are none.
+    estimates: Sequence[Mapping[str, Any]]
     #: Number of combinations of swept settings that are not shown.
     left_out: int
     #: None where the experiment has no stored results.
@@ -75,20 +47,22 @@ class AccuracyResult(Result):
 
     def sections(self) -> list[Section]:
         """Return tables of standard errors, the formulas that they come from, and what is unexpected."""
-        known = [each for each in self.estimates if each.parameters]
-        unknown = _together((each.reason, each.title) for each in self.estimates if not each.parameters)
-        reasons = [f"{listed(titles)}: no theory: {reason}." for reason, titles in unknown.items()]
-        formulas = _together((each.formula, each) for each in known)
-        head = f"{self.experiment}: standard errors to expect by theory. The half width is 1.96 of them, for 95 %."
-        paragraphs = [*reasons, *(_formula(formula, members) for formula, members in formulas.items())]
+        frame = pd.DataFrame(self.estimates).assign(
+            where=[_words(each["settings"]) for each in self.estimates], title=[_title(each) for each in self.estimates]
+        )
+        frame = frame.reindex(columns=list(dict.fromkeys([*frame, "formula", "reason"])))
+        unknown = frame.groupby("reason", sort=False)["title"]
+        paragraphs = [f"{listed(titles)}: no theory: {reason}." for reason, titles in unknown]
+        paragraphs += [_formula(str(formula), own) for formula, own in frame.groupby("formula", sort=False)]
         if self.left_out:
             more = count(self.left_out, "further combination")
             paragraphs.append(
                 f"Not shown: {more} of swept settings and numbers of samples; --set gives a key one value."
             )
+        head = f"{self.experiment}: standard errors to expect by theory. The half width is 1.96 of them, for 95 %."
         return [
             Section("", [head]),
-            *_tables(known),
+            *_tables(frame.dropna(subset="formula")),
             *(Section("", [paragraph]) for paragraph in paragraphs),
             self._surprises(),
             Section("", [REMARK]),
@@ -103,20 +77,16 @@ class AccuracyResult(Result):
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each parameter of each estimator, setting and number of samples."""
         rows = [
-            {**each.settings, "samples": each.samples, "estimator": each.estimator, **each.options, **parameter}
-            for each in self.estimates
-            for parameter in each.parameters
+            {**e["settings"], "samples": e["samples"], "estimator": e["estimator"], **e["options"], **parameter}
+            for e in self.estimates
+            for parameter in e["parameters"]
         ]
         return pd.DataFrame(rows)
 
     def content(self) -> dict[str, Any]:
         """Return all numbers for JSON."""
-        estimates = []
-        for each in self.estimates:
-            empty = "reason" if each.parameters else "formula"
-            estimates.append({name: value for name, value in asdict(each).items() if name != empty})
         head = {"experiment": self.experiment, "left_out": self.left_out}
-        return {**head, "estimates": estimates, "surprises": self.surprises}
+        return {**head, "estimates": self.estimates, "surprises": self.surprises}
 
 
 def accuracy_of(plan: Plan, results: Results | None = None) -> AccuracyResult:
@@ -148,63 +118,63 @@ def _shown(cells: list[tuple[DataCell, SimulatedSource]]) -> list[tuple[DataCell
     return [cells[k] for k in sorted(shown)]
 
 
-def _expectation(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, plan: Plan) -> Expectation:
-    own, samples = _own(cell), source.sampling.length
-    found = Expectation(own, samples, estimator.name, dict(estimator.swept), estimator.kind)
+def _expectation(cell: DataCell, source: SimulatedSource, estimator: EstimatorCell, plan: Plan) -> dict[str, Any]:
+    """Return the standard errors of one estimator on one kind of data, or the reason for none."""
+    about = {"settings": _own(cell), "samples": source.sampling.length, "estimator": estimator.name}
+    about |= {"options": dict(estimator.swept), "kind": estimator.kind}
     try:
         expected = expected_accuracy(source, estimator.estimator, plan.terms)
     except BiasedError as error:
-        return replace(found, reason=f"the estimate is biased, as {error}")
+        return about | {"scales": False, "reason": f"the estimate is biased, as {error}", "parameters": []}
     except DataError as error:
-        return replace(found, reason=str(error))
+        return about | {"scales": False, "reason": str(error), "parameters": []}
     of = expected.parameters
     rows = [
         {
             "name": name,
-            "value": float(value),
-            "standard_error": float(error),
-            "relative_percent": float(100 * error / abs(value)) if value else None,
-            "half_width_95": float(normal_quantile() * error),
+            "value": value,
+            "standard_error": error,
+            "relative_percent": 100 * error / abs(value) if value else None,
+            "half_width_95": normal_quantile() * error,
         }
-        for name, value, error in zip(of.names, of.values, of.standard_errors, strict=True)
+        for name, value, error in zip(of.names, of.values.tolist(), of.standard_errors.tolist(), strict=True)
     ]
-    return replace(found, scales=expected.limit, formula=expected.formula, parameters=rows)
+    return about | {"scales": expected.limit, "formula": expected.formula, "parameters": rows}
 
 
-def _tables(known: Sequence[Expectation]) -> Iterator[Section]:
+def _tables(known: pd.DataFrame) -> Iterator[Section]:
     """Return one table for each estimator and setting, and one for estimators that can do the same."""
     same: dict[tuple[str, str], tuple[Section, list[str]]] = {}
-    for (where, title), members in _together(((each.where, each.title), each) for each in known).items():
-        table = _table(sorted(members, key=lambda each: each.samples))
-        same.setdefault((where, repr(aligned_lines(table))), (table, []))[1].append(title)
+    for (where, title), members in known.groupby(["where", "title"], sort=False):
+        table = _table(members.sort_values("samples", kind="stable").to_dict("records"))
+        same.setdefault((str(where), repr(aligned_lines(table))), (table, []))[1].append(str(title))
     for (where, _), (table, titles) in same.items():
         yield replace(table, title=f"{listed(titles)}: standard errors{where and f' at {where}'}")
 
 
-def _table(entries: Sequence[Expectation]) -> Section:
+def _table(entries: Sequence[Mapping[Any, Any]]) -> Section:
     """Return parameters down and numbers of samples across; the last columns are about the greatest number."""
-    last = pd.DataFrame(entries[-1].parameters)
+    last = pd.DataFrame(entries[-1]["parameters"])
     columns: dict[str, Any] = {"parameter": last["name"], "true value": last["value"]}
-    columns |= {f"N = {each.samples}": [row["standard_error"] for row in each.parameters] for each in entries}
+    columns |= {f"N = {e['samples']}": [row["standard_error"] for row in e["parameters"]] for e in entries}
     columns |= {"relative [%]": last["relative_percent"].astype(float), "half width": last["half_width_95"]}
     formats = {name: ".3g" for name in columns if name != "true value"}
-    note = [f"relative, half width: of {entries[-1].samples} samples."] if len(entries) > 1 else []
+    note = [f"relative, half width: of {entries[-1]['samples']} samples."] if len(entries) > 1 else []
     return Section(frame=pd.DataFrame(columns), formats=formats, notes=note)
 
 
-def _formula(formula: str, entries: Sequence[Expectation]) -> str:
+def _formula(formula: str, entries: pd.DataFrame) -> str:
     """Return a formula with the numbers of samples and the estimators that it is for."""
-    sizes = ", ".join(map(str, sorted({entry.samples for entry in entries})))
-    scaling = " Standard errors fall with the square root of N." if entries[0].scales else ""
-    return f"{listed(entry.estimator for entry in entries)}, N = {sizes}: {formula}.{scaling}"
+    sizes = ", ".join(map(str, sorted(set(entries["samples"]))))
+    scaling = " Standard errors fall with the square root of N." if entries["scales"].iloc[0] else ""
+    return f"{listed(entries['estimator'])}, N = {sizes}: {formula}.{scaling}"
 
 
-def _together(pairs: Any) -> dict[Any, list[Any]]:
-    """Return the second members of pairs by the first."""
-    found: dict[Any, list[Any]] = {}
-    for key, value in pairs:
-        found.setdefault(key, []).append(value)
-    return found
+def _title(estimate: Mapping[str, Any]) -> str:
+    """Return the name of an estimator with its swept options and its kind."""
+    name, options, kind = (estimate[key] for key in ("estimator", "options", "kind"))
+    name = f"{name} with {_words(options)}" if options else name
+    return name if name == kind else f"{name} ({kind})"
 
 
 def _words(settings: Mapping[str, Any]) -> str:

@@ -1,10 +1,7 @@
 """How numbers and tables are written as text."""
 
-import csv
-import io
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from ctid_cli.text import count as count  # for those who draw
@@ -31,20 +28,6 @@ _LATEX = str.maketrans(
 def latex(text: str) -> str:
     """A text for LaTeX."""
     return text.translate(_LATEX)
-
-
-def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str] | None = None) -> str:
-    """Rows as CSV: an empty field where a row lacks a column, JSON for lists and mappings."""
-    rows = [
-        {key: json.dumps(value) if isinstance(value, dict | list) else value for key, value in row.items()}
-        for row in rows
-    ]
-    names = list(dict.fromkeys(key for row in rows for key in row) if columns is None else columns)
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, names, restval="", lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    writer.writerows(rows)
-    return buffer.getvalue()
 
 
 def picked(item: object, names: Iterable[str]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, wilson_interval
@@ -36,6 +37,7 @@ from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import base_name
 from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.estimates import CLOCKS
+from ctid_cli.storage.groups import places_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
 from ctid_cli.text import did_you_mean, listed
 
@@ -197,8 +199,12 @@ def _measured(results: Results, name: str) -> pd.DataFrame:
     measure, values = measure_of(name, results), values_of(results, name)
     bounds = _bounds(results) if name.partition(":")[0] == "efficiency" else {}
     truths = [true_values(cell) for cell in results.manifest["data_cells"]]
-    rows = []
-    for (group, parameter), own in parts_of(values, "group", "parameter"):
+    keys, rows = ["group", "parameter"], []
+    columns = {key: values[key].to_numpy() for key in ("value", "standard_error", "quantile") if key in values}
+    # Numbers in the order of appearance; slices of arrays, since a table for each of many groups would take seconds.
+    places = places_of(np.asarray(values.groupby(keys, sort=False, dropna=False).ngroup(), dtype=np.intp))
+    for (group, parameter), at in zip(values[keys].drop_duplicates().to_numpy(), places.values(), strict=True):
+        own = {key: column[at] for key, column in columns.items()}
         found = measured_of(own, measure, bounds.get(group, {}).get(parameter, math.nan))
         unit = measure.unit
         if measure.source == "errors":
@@ -208,20 +214,19 @@ def _measured(results: Results, name: str) -> pd.DataFrame:
     rows += [
         (group, None, measure.unit, *Measured(), 0) for group in set(results.groups.index).difference(values["group"])
     ]
-    columns = ["group", "parameter", "unit", *Measured._fields, "without_value"]
-    frame = pd.DataFrame(rows, columns=columns).astype(dict.fromkeys(Measured._fields, "float64"))
+    names = ["group", "parameter", "unit", *Measured._fields, "without_value"]
+    frame = pd.DataFrame(rows, columns=names).astype(dict.fromkeys(Measured._fields, "float64"))
     frame.insert(2, "measure", name)
     return frame.set_index("group")
 
 
-def measured_of(values: pd.DataFrame, measure: Measure, bound: float = math.nan) -> Measured:
+def measured_of(columns: Mapping[str, Array], measure: Measure, bound: float = math.nan) -> Measured:
     """Return a measure of the values of one group, of those that are known."""
-    known = values[values["value"].notna()]
-    found = known["value"].to_numpy()
+    known = ~np.isnan(columns["value"])
+    own = {key: column[known] for key, column in columns.items()}
     if measure.source == "errors":
-        widths, reach = known["standard_error"].to_numpy(), known["quantile"].to_numpy()
-        return measure.compute(Sample(found, widths, bound, reach))
-    return measure.compute(found)
+        return measure.compute(Sample(own["value"], own["standard_error"], bound, own["quantile"]))
+    return measure.compute(own["value"])
 
 
 def _bounds(results: Results) -> dict[int, dict[str, float]]:

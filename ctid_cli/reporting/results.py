@@ -15,7 +15,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.running.theory import readable_plan
 from ctid_cli.storage.estimates import Estimates, read_stored
 from ctid_cli.storage.folder import experiment_folders
-from ctid_cli.storage.groups import error_frame, group_numbers, planned_groups
+from ctid_cli.storage.groups import error_frame, group_numbers, places_of, planned_groups
 from ctid_cli.storage.manifest import Manifest, true_values
 from ctid_cli.text import did_you_mean
 
@@ -90,9 +90,13 @@ class Results:
         cell, estimator, start = self.groups.iloc[group]
         return cell, estimator, start
 
+    @cached_property
+    def _places(self) -> dict[int, IndexArray]:
+        return places_of(self.numbers)
+
     def members(self, group: int) -> Estimates:
         """Return the estimates of one group."""
-        return self.stored.chosen(self.numbers == group)
+        return self.stored.chosen(self._places[group])
 
     @property
     def is_simulated(self) -> bool:

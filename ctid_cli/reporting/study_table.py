@@ -82,7 +82,7 @@ def _results_called(name: str, study: Study, out: Path) -> Results:
     if results is None:
         known = [*map(str, study.tables), study.name, *experiments_in(out)]
         hint = did_you_mean(name, known) or "."
-        wrong = f"{name!r} is neither a table nor an experiment with results in the folder {out}{hint}"
+        wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
         raise UsageError(f"{wrong} Known: {', '.join(known)}")
     return results
 
@@ -272,14 +272,17 @@ def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
 
 def read_tables(file: Path) -> pd.DataFrame:
     """Read tables that ``ctid table --format csv`` wrote."""
-    converters, types = {"initial_delay": _initial_delay}, {"converged": "Int64"}
-    return pd.read_csv(file, converters=converters, dtype=types, float_precision="round_trip")
+    frame: pd.DataFrame = pd.read_csv(file, dtype="str")
+    texts = ["experiment", "sampling", "method", "initial_delay"]
+    frame = frame.astype(dict.fromkeys(frame.columns.difference(texts), "float64"))
+    frame["initial_delay"] = frame["initial_delay"].astype(object).map(_initial_delay, na_action="ignore")
+    return frame.astype(dict.fromkeys(("table", "n", "failed"), "int64") | {"converged": "Int64"})
 
 
-def _initial_delay(text: str) -> float | str | None:
+def _initial_delay(text: str) -> float | str:
     """Return an initial delay of a table, which may be a word."""
     try:
-        return float(text) if text else None
+        return float(text)
     except ValueError:
         return text
 

@@ -54,6 +54,13 @@ def group_numbers(stored: Estimates) -> IndexArray:
     return found
 
 
+def places_of(numbers: IndexArray) -> dict[int, IndexArray]:
+    """Return the places of the estimates of each group, from the numbers of the groups of all."""
+    order = np.argsort(numbers, kind="stable")
+    groups, first = np.unique(numbers[order], return_index=True)
+    return dict(zip(groups.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
+
+
 def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
     """Return a row for each parameter of each estimate of a simulated system, from the numbers of their groups.
 
@@ -65,7 +72,7 @@ def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
 
     groups = planned_groups(stored.manifest)
     truths = [true_values(cell) for cell in stored.manifest["data_cells"]]
-    members = {number: stored.chosen(numbers == number) for number in np.unique(numbers).tolist()}
+    members = {number: stored.chosen(places) for number, places in places_of(numbers).items()}
     cells = groups["cell"].to_dict()
     found = {number: rows.found(tuple(truths[cells[number]])) for number, rows in members.items()}
     parts, given = [], _given_delays(groups, truths, found)

@@ -95,18 +95,6 @@ def test_every_resonance_is_drawn(drawn):
         assert np.abs(submodel.frequency_response(frequencies)).max() == pytest.approx(exact, rel=1e-3)
 
 
-def test_phases_are_followed_or_interrupted(drawn):
-    frequencies = np.linspace(1, 10, 200)
-    curve = frequency_plot.Response("delay", frequencies, np.exp(-1j * frequencies))
-    for unwrap in (True, False):
-        frequency_plot.response_svg([curve], "title", "Hz", unwrap=unwrap)
-    (_, followed), (_, wrapped) = (content(figure.axes[1])[0] for figure in drawn)
-    assert followed == pytest.approx(-np.rad2deg(frequencies))
-    assert np.isnan(wrapped).sum() == 2
-    kept = np.isfinite(wrapped)
-    assert wrapped[kept] == pytest.approx(((followed + 180) % 360 - 180)[kept])
-
-
 def test_a_response_without_a_model_knows_the_hold():
     rng = np.random.default_rng(1)
     h, count = 0.01, 20000

@@ -10,7 +10,7 @@ from ctid_cli.reporting.study import data_folder
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
-from ctid_cli.studies.claims import check_claims
+from ctid_cli.studies.claims import check_claims, near, within
 from ctid_cli.studies.publishing import published_texts
 from tests.reporting.ideal_results import ideal_results
 from tests.storage.made_results import export_image
@@ -231,3 +231,11 @@ def test_what_is_published(study):
         assert float(row["ratio"]) == pytest.approx(float(row["theory"]), abs=6 * float(row["standard_error"]))
     for heading in ("Open loop, section 6.1", "Closed loop, section 6.2", "SIMULATED stand-in", "Coverage of 95 %"):
         assert heading in texts["tables.md"]
+
+
+def test_a_missed_number_is_noticed():
+    assert near("name", 1.04, 1.0, 0.05).holds
+    assert not near("name", 1.06, 1.0, 0.05).holds
+    assert not within("name", None, high=3.0).holds
+    assert not within("name", float("nan"), 0.0, 1.0).holds
+    assert within("name", 1.0, low=0.5).required == "at least 0.5"

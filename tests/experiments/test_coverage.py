@@ -6,7 +6,6 @@ from scipy import stats
 
 from benchmarks import interval_defaults as defaults
 from ctid_cli.studies.catalogue import find_study, read_study
-from ctid_cli.studies.publishing import published_texts
 from tests.reporting.frequency_results import run_here
 
 STUDY = find_study("coverage")
@@ -66,25 +65,10 @@ def test_only_the_formula_meant_for_a_row_is_judged(found):
     assert [claim.holds for claim in claims.white_formula_is_misused(found["first-order-coloured"])][:2] == [True, True]
 
 
-def test_the_table_names_the_misuse(found, summary):
-    text = published_texts(found)["coverage.md"]
-    assert text.count("white (misused)") == 3
-    assert text.count("\n") == len(summary) + 2
-    assert published_texts(found)["coverage.csv"].startswith(
-        "row,formula,parameter,true,runs,not_converged,covered,percent,"
-    )
-
-
 def test_rows_are_the_experiments_of_the_study_and_all_but_the_biased_one_must_cover():
     assert set(tables.ROWS) == {name.rpartition("/")[2] for name in STUDY.configs}
     judged = [tables.ROWS[name][0] for (name,) in STUDY.claims["intervals_cover"]]
     assert judged == ["a", "b", "c", "d", "f", "g"]
-
-
-def test_rows_b_and_e_see_the_same_data_sets():
-    exact, sampled = (STUDY.plan(f"case1-irregular-{kind}").data_cells[0].dataset(3) for kind in ("exact", "sampled"))
-    assert (exact.record.y == sampled.record.y).all()
-    assert exact.record.input.values.size != sampled.record.input.values.size
 
 
 def test_published_intervals_of_default_settings_cover():
@@ -98,11 +82,3 @@ def test_published_intervals_of_default_settings_cover():
     short = lines[(lines["system"] != "all") & (lines["percent"] < 90.0) & (lines["snr_db"] == 30.0)]
     assert len(short) == 2
     assert (short["called_unsafe"] > 0.9 * short["runs"]).all()
-
-
-def test_a_small_study_of_default_settings_covers():
-    lines = pd.DataFrame(defaults.study(10, 3, [("prbs", 20.0, "AR(1) .9")]))
-    assert lines["system"].tolist() == [*defaults.SYSTEMS, "all"]
-    assert (lines["robust"] == lines["converged"]).all()
-    # Ten records, of whose intervals those of one estimate go together.
-    assert lines["percent"].iloc[-1] > 80.0

@@ -11,7 +11,7 @@ from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
-from tests.experiments import frequency_acceptance as acceptance
+from tests.experiments import paper_signals as acceptance
 from tests.reporting.frequency_results import STUDY, run_here
 
 as_printed, claims, figures, measured = (STUDY.module(n) for n in ("as_printed", "claims", "figures", "measures"))

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.reporting.results import read_results
 from ctid_cli.studies.catalogue import find_figures, require_results
-from experiments.finite_time_frequency import error_plot
 from experiments.finite_time_frequency.error_plot import Curve, Group, Row, errors_svg
 from tests.reporting.frequency_results import STUDY, run_here
 
@@ -25,11 +23,6 @@ def out(tmp_path_factory):
     for name in NAMES:
         run_here(name, folder, SHORT)
     return folder
-
-
-def lines_of(axes, style):
-    """Curves of a look, told by their width."""
-    return [line for line in axes.lines if line.get_linewidth() == style["linewidth"]]
 
 
 def legend_texts(legend):
@@ -57,55 +50,12 @@ def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, 
     assert ("nonlinear least squares, whole record" in common) is (number in "23")
 
 
-def test_lines_are_the_tracks_of_the_first_data_set_and_thick_where_valid(out, drawn):
-    results = read_results(out, "finite-time-frequency/step")
-    figures.figure_4(results)
-    plan = STUDY.plan("step", SHORT)
-    panels = np.array(drawn[0].axes).reshape(4, 3)
-    for k, reading in enumerate(("jump", "continuous")):
-        (cell,) = (cell for cell in plan.data_cells if cell.swept["phase_at_steps"] == reading)
-        for column, names in enumerate(figures.GROUPS.values()):
-            above, below = panels[2 * k : 2 * k + 2, column]
-            for place, name in enumerate(names):
-                (part,) = (part for part in plan.estimators if part.name == name)
-                track = part.estimator.prepare(cell.dataset(0).record).fit().track
-                t, omega, valid = track.t[::10], track.frequencies[::10], track.valid[::10]
-                truth = np.where((t >= 30 - 1e-9)[:, None], [2.0, 3.0], [1.8, 3.2])
-                for tone in (0, 1):
-                    thin = lines_of(above, error_plot.FAINT)[2 * place + tone]
-                    firm = lines_of(above, error_plot.FIRM)[2 * place + tone]
-                    assert np.array_equal(thin.get_ydata(), omega[:, tone], equal_nan=True)
-                    assert np.array_equal(firm.get_ydata(), np.where(valid, omega[:, tone], np.nan), equal_nan=True)
-                error = np.maximum(np.abs(omega - truth).max(axis=1), 1e-16)
-                assert lines_of(below, error_plot.FAINT)[place].get_ydata() == pytest.approx(error, nan_ok=True)
-            true = [line.get_ydata() for line in lines_of(above, error_plot.TRUTH)]
-            assert np.column_stack(true) == pytest.approx(truth)
-    # Exact in finite time before the step, and only the estimators with a short memory again within 3 s after it.
-    finite, gradient = lines_of(panels[1, 0], error_plot.FAINT)
-    window, restarting, _ = lines_of(panels[1, 1], error_plot.FAINT)
-    at = np.searchsorted(finite.get_xdata(), 20.0)
-    assert finite.get_ydata()[at] < 1e-12 < 1e-9 < gradient.get_ydata()[at]
-    assert restarting.get_ydata()[-1] < 1e-9
-    assert min(finite.get_ydata()[-1], gradient.get_ydata()[-1], window.get_ydata()[-1]) > 1e-3
-
-
 def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):
     for number, end in (("1", 0.66), ("2", 4.74), ("3", 3.2), ("4", 3.6)):
         (item,) = find_figures([f"finite-time-frequency/{number}"])
         item.svg(out)
         (band,) = drawn[-1].axes[3].patches
         assert (band.get_x(), band.get_width()) == pytest.approx((0.0, end))
-
-
-def test_the_reference_is_the_worse_tone_over_all_data_sets(out, drawn):
-    results = read_results(out, "finite-time-frequency/random")
-    figures.figure_3(results)
-    errors = [row["measures"] for row in results.stored if row["estimator"] == "nonlinear_least_squares"]
-    assert len(errors) == 2
-    expected = max(np.sqrt(np.mean([e[f"rms_{k}"] ** 2 for e in errors])) for k in (1, 2))
-    for axes in drawn[0].axes[3:]:
-        (line,) = lines_of(axes, error_plot.WHOLE)
-        assert line.get_ydata() == pytest.approx([expected] * 2)
 
 
 def test_an_svg_file_is_the_same_every_time():

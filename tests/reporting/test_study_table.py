@@ -1,16 +1,12 @@
 """Tables of the published study: its numbers, our cells beside them, and what stands in for those not run."""
 
-import json
-
 import pytest
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import render_markdown, render_text
 from ctid_cli.reporting.measures import records_of
-from ctid_cli.reporting.study import data_folder, load_study
-from ctid_cli.reporting.study_table import build_tables, made_by, pooled_frame, study_frame, study_sections
-from ctid_cli.running.plan import build_plan, current_version
-from ctid_cli.specification.load import load_spec
+from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study_table import build_tables, pooled_frame, study_frame, study_sections
 from experiments.useful_redundancy.tables import failures, searches
 
 RANDOM = "uniform(0, 9)"
@@ -105,21 +101,6 @@ def test_methods_stand_below_each_setting_and_those_without_a_start_in_every_tab
     assert {"text": render_text(sections), "md": render_markdown(sections)} == snapshot
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_all_methods_fit_100_columns_also_with_many_data_sets(make_results, add_estimator, estimate, number):
-    found = [estimate(8.0)] * 299 + [estimate(3.0)]
-    results = make_results({(5.0, "0.0"): found, (5.0, RANDOM): found})
-    for method in ("redundancy", "other_redundancy"):
-        add_estimator(results, method, {(5.0, "0.0"): found, (5.0, RANDOM): found})
-    for method in ("delay_profile", "other_profile"):
-        add_estimator(results, method, {(5.0, None): found})
-    for cell in results.manifest["data_cells"]:
-        cell["replicates"] = 300
-    text = render_text(sections_of(number, results))
-    assert text.count("99.7") >= 10
-    assert max(map(len, text.splitlines())) <= 110
-
-
 def test_the_pooled_percentage_is_that_of_all_estimates_in_the_cells_of_the_table(mixed):
     pooled = pooled_frame(STUDY, STUDY.tables[1], frame_of(1, mixed)).set_index("method")
     # 1 of 4 at 5 dB, 1 of 1 at 15 dB; published from 0 s 65 and 69.
@@ -151,23 +132,6 @@ def test_the_whole_study_is_the_default_and_committed_tables_stand_in(tmp_path):
     ours = [row for row in committed.rows if row["method"] != "as_printed"]
     assert all(row["n"] == 100 and row["percent"] is not None for row in ours)
     assert "committed results of " in committed.remarks[0]
-
-
-def test_results_of_earlier_code_are_called_so(tmp_path):
-    plan = build_plan(load_spec(data_folder("configs") / "useful_redundancy" / "case1_regular.yaml"))
-    current = {"code_version": current_version(plan)}
-    assert made_by(tmp_path) == ""
-    earlier = "computed by an earlier version of the code or of its numerical libraries (commit abcdefabcdef)"
-    for sessions, said in (
-        ({"case1-regular": [current]}, ""),
-        ({"case1-regular": [current, {"code_version": "0" * 16}]}, earlier),
-        # By the present code of other estimators, and by a specification that is no more.
-        ({"as-printed-case1-regular": [current]}, ""),
-        ({"case0": [current]}, earlier),
-    ):
-        content = {"commit": "abcdef" * 7, "sessions": sessions}
-        (tmp_path / "environment.json").write_text(json.dumps(content), encoding="utf-8")
-        assert made_by(tmp_path) == said
 
 
 @pytest.mark.parametrize("name", ["5", "useful-redundancy/0", "quickstrat", "other-study/1"])

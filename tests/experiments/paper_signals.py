@@ -1,0 +1,93 @@
+"""The four signals of the finite-time paper, by direct simulation, and what is measured on them.
+
+The signals are A: two tones without noise, B: with a third, unmodelled one, C: with uniform noise, D: with a step of
+both frequencies, read in two ways: the phase jumps with the frequency, or goes on.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.frequency.base import FrequencyTrack
+
+#: Standard deviation of noise between -0.2 and 0.2.
+SIGMA = 0.4 / np.sqrt(12.0)
+TRUTH = np.array([2.0, 3.0])
+INITIAL = (2.0, 5.0)
+STEP = 30.0
+#: h, d, epsilon, gamma of the delay estimators for each signal, as printed.
+TUNING: dict[str, dict[str, Any]] = {
+    "A": {"h": 0.1, "d": 0.13, "epsilon": 100.0, "gamma": 0.005},
+    "B": {"h": 1.0, "d": 0.37, "epsilon": 0.1, "gamma": 1.0},
+    "C": {"h": 0.6, "d": 0.4, "epsilon": 0.1, "gamma": 1.0},
+    "D": {"h": 0.7, "d": 0.4, "epsilon": 0.1, "gamma": 1.0},
+}
+
+
+# Signals -----------------------------------------------------------------------------------------------
+
+
+def clock(interval: float, duration: float) -> Array:
+    return np.asarray(interval * np.arange(round(duration / interval)), dtype=float)
+
+
+def stepped(interval: float, duration: float = 90.0) -> tuple[Array, Array]:
+    """Frequencies of signal D, shape (N, 2), and the clock."""
+    t = clock(interval, duration)
+    after = (t >= STEP - 1e-9)[:, None]
+    return np.where(after, [2.0, 3.0], [1.8, 3.2]), t
+
+
+def from_frequencies(omega: Array, interval: float, *, jump: bool) -> Array:
+    """``sin + cos`` of two changing frequencies: ``w(t) t``, or the integral of w, as phase."""
+    t = interval * np.arange(len(omega))
+    if jump:
+        phase = omega * t[:, None]
+    else:
+        phase = np.vstack([np.zeros(2), np.cumsum(omega[:-1], axis=0)]) * interval
+    return np.asarray(np.sin(phase[:, 0]) + np.cos(phase[:, 1]))
+
+
+def signal(name: str, interval: float, duration: float, seed: int | None = None, *, jump: bool = True) -> Array:
+    """One of the signals A to D; C with the noise of a seed."""
+    t = clock(interval, duration)
+    if name == "A":
+        return np.asarray(np.sin(2 * t) + np.cos(3 * t))
+    if name == "B":
+        return np.asarray(np.sin(2 * t) + np.sin(3 * t) + 0.25 * np.sin(15 * t))
+    if name == "C":
+        noise = np.random.default_rng(seed).uniform(-0.2, 0.2, t.size)
+        return np.asarray(np.sin(2 * t) + np.sin(3 * t) + noise)
+    return from_frequencies(stepped(interval, duration)[0], interval, jump=jump)
+
+
+# Measures ----------------------------------------------------------------------------------------------
+
+
+def settle(track: FrequencyTrack, truth: Array, band: float, since: float = 0.0, until: float = np.inf) -> float:
+    """Time after `since` from which on both errors stay below a band; infinite if they do not."""
+    chosen = (track.t >= since - 1e-9) & (track.t < until - 1e-9)
+    error = np.abs(track.frequencies - truth).max(axis=1)[chosen]
+    outside = np.flatnonzero(~(error < band))
+    if not outside.size:
+        return 0.0
+    return np.inf if outside[-1] == error.size - 1 else float(track.t[chosen][outside[-1] + 1] - since)
+
+
+def cramer_rao(duration: float, interval: float, sigma: float, phases: tuple[float, float] = (0.0, 0.0)) -> Array:
+    """Smallest standard deviations of the frequencies of ``sin(2 t + p1) + sin(3 t + p2)`` in white Gaussian noise."""
+    t = clock(interval, duration)
+    t = t - t.mean()
+    columns = []
+    for omega, phase in zip(TRUTH, phases, strict=True):
+        angle = omega * t + phase
+        columns += [t * np.cos(angle), np.cos(angle), np.sin(angle)]
+    J = np.column_stack(columns)
+    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J))[::3]), dtype=float)
+
+
+def drem(kind: type[Any], name: str, **options: Any) -> Any:
+    return kind(tones=2, initial_frequencies=INITIAL, **{**TUNING[name], **options})
