@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def read_measurement(
     labelled with another unit is refused unless it is named with that unit.
     """
     require_choice("hold", hold, get_args(Hold))
-    asked = {"time": time, "input": input, "output": output} | ({} if reference is None else {"reference": reference})
+    asked = {"time": time, "input": input, "output": output, "reference": reference}
     columns = open_table(path).select(asked, in_seconds=in_seconds)
     t, notes = columns.values["time"], columns.notes
     used = columns.window(t, start, stop)
@@ -128,8 +128,18 @@ def read_measurement(
     u, y = columns.input(used), columns.output(used)
     r = None if reference is None else columns.input(used, "reference")
     record = Record(t[used], y, HeldSignal(t[used], u, hold), name=columns.file)
-    units, named = (columns.unit(role) for role in ROLES), (columns.names[role] for role in ROLES)
-    return Measurement(record, *units, *named, start, stop, notes, Path(path), columns.names.get("reference"), r)
+    known: dict[str, Any] = {role: columns.names[role] for role in ROLES}
+    known |= {f"{role}_unit": columns.unit(role) for role in ROLES}
+    return Measurement(
+        record,
+        **known,
+        start=start,
+        stop=stop,
+        notes=notes,
+        path=Path(path),
+        reference=columns.names.get("reference"),
+        reference_values=r,
+    )
 
 
 def read_held_signal(

@@ -83,7 +83,8 @@ def read_sampled_signal(
         table = open_table(path)
     columns = _selected(table, time, signal, without_times=interval is not None)
     column, times = columns.names["signal"], columns.names.get("time")
-    values, notes, time_unit, first = columns.values["signal"], list(columns.notes), "s", 0.0
+    values, notes, first = columns.values["signal"], list(columns.notes), 0.0
+    time_unit: str | None = "s"
     if np.isinf(values).any():
         values = np.where(np.isinf(values), np.nan, values)
     if interval is None:
@@ -95,7 +96,7 @@ def read_sampled_signal(
         times = None
     require_steps(f"{table.file}: the clock", np.array([0.0, interval]))
     require_scale(f"{table.file}: the clock", np.array([interval]), LONGEST)
-    used = columns.window(first + interval * np.arange(values.size), start, stop, 1e-6 * interval)
+    used = columns.window(first + interval * np.arange(values.size, dtype=float), start, stop, 1e-6 * interval)
     values = values[used]
     if not np.isfinite(values).any():
         raise DataError(f"{table.file}: no sample of {column!r} is a finite number")

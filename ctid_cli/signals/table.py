@@ -28,7 +28,6 @@ USUAL_NAMES: dict[str, tuple[str, ...]] = {
         *("y", "signal", "output", "value", "values", "x"),
         *("amplitude", "data", "audio", "sound", "wave", "voltage"),
     ),
-    "reference": (),
 }
 #: Names whose unit may stand behind a slash; elsewhere the slash is part of the name.
 BEFORE_SLASH = {name for role in ROLES for name in USUAL_NAMES[role]}
@@ -161,12 +160,25 @@ class Table:
         Where times must be in seconds, a column that is labelled with another unit is refused unless it is named with
         that unit. Without times, their column is found but not read, and may be absent.
         """
-        chosen = {role: self.named(wanted) for role, wanted in asked.items() if wanted is not None}
-        for role in asked:
+        chosen, notes = self._choose(asked, ("time",) if without_times else ())
+        if in_seconds:
+            self._require_seconds(chosen["time"], asked["time"])
+        read = {role: name for role, name in chosen.items() if not (without_times and role == "time")}
+        columns = self.read(list(read.values()))
+        values = {role: columns.values[name] for role, name in read.items()}
+        columns = replace(columns, values=values, names=chosen, notes=(*self.notes, *columns.notes, *notes))
+        return columns if without_times else columns.timed()
+
+    def _choose(self, asked: Mapping[str, str | None], optional: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+        """Return the column of each role, and what was assumed."""
+        # A reference has no usual names: it is only taken where it is named.
+        roles = [role for role in asked if role in USUAL_NAMES]
+        chosen = {role: self.named(wanted) for role in roles if (wanted := asked[role]) is not None}
+        for role in roles:
             if role not in chosen and (name := self._recognised(role, chosen)):
                 chosen[role] = name
-        optional = ("time",) if without_times else ()
-        notes = self._take_by_position(chosen, [role for role in asked if role in chosen or role not in optional])
+        notes = self._take_by_position(chosen, [role for role in roles if role in chosen or role not in optional])
+        chosen |= {role: self.named(wanted) for role, wanted in asked.items() if role not in roles and wanted}
         for one, other in itertools.combinations(filter(chosen.get, asked), 2):
             if chosen[one] == chosen[other]:
                 raise DataError(f"{self.head}: {chosen[one]!r} cannot be both the {one} and the {other}")
@@ -174,17 +186,7 @@ class Table:
         if unused and self.is_text:
             words = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
             notes.append(f"{words[0]} {listed(unused)} {words[1]} not used.")
-        if in_seconds:
-            self._require_seconds(chosen["time"], asked["time"])
-        roles = [role for role in chosen if role not in optional]
-        columns = self.read([chosen[role] for role in roles])
-        columns = replace(
-            columns,
-            values={role: columns.values[chosen[role]] for role in roles},
-            names=chosen,
-            notes=(*self.notes, *columns.notes, *notes),
-        )
-        return columns if without_times else columns.timed()
+        return chosen, notes
 
     def named(self, wanted: str) -> str:
         """Return the column whose header is ``wanted``, with or without its unit."""
@@ -238,9 +240,10 @@ class Table:
         if len(self.names) < len(roles) and not self.hint:
             needs = "a record needs a time, an input and an output" if "output" in roles else "a signal needs its times"
             raise DataError(f"{self.head}: {self._listing} and nothing else; {needs}")
+        left = [name for name in self.names if name not in chosen.values()]
         usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
         other = "other " if self._called(USUAL_NAMES[role], {}) else ""
-        close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, self.names))), None)
+        close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, left))), None)
         meant = f"; did you mean {close!r}?" if close else ""
         message = f"{self.head}: no {other}{self.noun} is called {usual}; {self._listing}"
         parts = [message, f"Say which one is the {role} (option {role}){meant}", self.hint]

@@ -29,9 +29,9 @@ def test_usual_names(tmp_path, header):
 
 def test_named_columns_and_units(tmp_path):
     file = write(tmp_path / "a.csv", (np.arange(50.0), Y, 2 * Y), "clock [ms],left,right (mV)")
-    with pytest.raises(DataError, match="--time"):
-        read_sampled_signal(file)
-    with pytest.raises(DataError, match="--signal"):
+    with pytest.raises(DataError, match=r"option time.*--interval"):
+        read_sampled_signal(file, signal="left")
+    with pytest.raises(DataError, match="option signal"):
         read_sampled_signal(file, time="clock")
     signal = read_sampled_signal(file, time="clock", signal="right")
     assert signal.samples == pytest.approx(2 * Y)
