@@ -30,7 +30,7 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float]:
     try:
         with soundfile.SoundFile(os.fspath(path)) as sound:
             rate, channels = sound.samplerate, sound.channels
-            require_values(file, "samples", sound.frames * channels)
+            require_values(f"{file}: 'samples'", sound.frames * channels)
             samples = sound.read(dtype="float64", always_2d=True)
     except (soundfile.SoundFileError, ValueError, RuntimeError):
         form = Path(path).suffix[1:].upper()
