@@ -225,8 +225,7 @@ def _values(course: float | tuple[Piece, ...]) -> Array:
 
 
 def _ends(course: float | tuple[Piece, ...]) -> Array:
-    pieces = course if isinstance(course, tuple) else ()
-    return np.array([piece.until for piece in pieces if piece.until is not None], dtype=float)
+    return np.array([piece.until for piece in course[:-1]] if isinstance(course, tuple) else [], dtype=float)
 
 
 def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:

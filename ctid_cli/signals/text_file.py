@@ -139,16 +139,21 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
     raise DataError(f"{file}: {NO_TEXT}")
 
 
-def _fields(line: str, separator: str) -> list[str]:
-    """Return the fields of a line up to the last one that is not empty."""
+def _split(line: str, separator: str) -> list[str]:
+    """Return the fields of a line as they are written."""
     line = line.strip("\r\n")
     if separator == " ":
         # The unit of a name stays with it.
         line = re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
     try:
-        fields = [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:  # a field of more than 131072 letters
         return []
+
+
+def _fields(line: str, separator: str) -> list[str]:
+    """Return the fields of a line without blanks around them, up to the last one that is not empty."""
+    fields = [field.strip() for field in _split(line, separator)]
     while fields and not fields[-1]:
         del fields[-1]
     return fields
@@ -299,9 +304,8 @@ def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
                 there = f"the line has {len(fields)} fields where line {layout.header} names {width}"
                 commas = "; numbers with decimal commas need another separator, such as the semicolon"
                 raise DataError(f"{layout.file}:{line}: {there}{commas if layout.separator == ',' else ''}")
-            for place in (place for place in places if place < len(fields)):
-                field = fields[place]
-                if field not in MISSING and not number.fullmatch(field):
+            for place, field in enumerate(_split(written, layout.separator)):
+                if place in places and field not in MISSING and not number.fullmatch(field := field.strip()):
                     found = f"column {layout.columns[place]!r} holds {quoted(field)}"
                     raise DataError(f"{layout.file}:{line}: {found}, which is {_instead_of_number(field, layout)}")
     raise DataError(
