@@ -96,7 +96,10 @@ def read_sampled_signal(
         times = None
     require_steps(f"{table.file}: the clock", np.array([0.0, interval]))
     require_scale(f"{table.file}: the clock", np.array([interval]), LONGEST)
-    used = columns.window(first + interval * np.arange(values.size, dtype=float), start, stop, 1e-6 * interval)
+    used = slice(0, values.size)
+    if start is not None or stop is not None:
+        instants = first + interval * np.arange(values.size, dtype=float)
+        used = columns.window(instants, start, stop, 1e-6 * interval)
     values = values[used]
     if not np.isfinite(values).any():
         raise DataError(f"{table.file}: no sample of {column!r} is a finite number")

@@ -80,9 +80,13 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
 def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     """Find out how a file is written."""
     text, encoding = _head(path, file)
-    lines = [(k, line) for k, line in enumerate(io.StringIO(text, newline=None), start=1) if line.strip()]
-    comments = [(k, line) for k, line in lines if line.lstrip().startswith(COMMENTS)]
-    content = [(k, line) for k, line in lines if not line.lstrip().startswith(COMMENTS)][:HEAD_LINES]
+    comments: list[tuple[int, str]] = []
+    content: list[tuple[int, str]] = []
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if line.strip():
+            (comments if line.lstrip().startswith(COMMENTS) else content).append((number, line))
+        if len(content) == HEAD_LINES:
+            break
     if not content:
         raise DataError(f"{file}:{EMPTY}")
     separator = _separator([line for _, line in content])

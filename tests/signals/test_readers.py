@@ -59,6 +59,7 @@ READ = {
 
 TOGETHER = "which is a number with a decimal point, unlike the first 50 lines; write all with one decimal sign"
 THREE = "and nothing else; a record needs a time, an input and an output"
+FOUR = "'t', 'a', 'b', 'c'"
 ONE = "; say which one (option time)"
 WHICH = ". Say which one is the input (option input)"
 SIX = "the line has 6 fields where line 1 names 3"
@@ -85,7 +86,7 @@ REFUSED = {
     "two columns": ("t u\n0 1\n", f":1: the file has 't', 'u' {THREE}"),
     "names twice": ("t,u,u,y\n0,1,2,3\n", ":1: 2 columns are called 'u'; rename all but one"),
     "two times": ("t [s],t (h),u,y\n0,1,2,3\n", f":1: 't [s]' and 't (h)' may all be the time{ONE}"),
-    "unknown names": ("t,a,b,c\n0,1,2,3\n", f":1: no column is called 'u' or 'input'; the file has 't', 'a', 'b', 'c'{WHICH}"),
+    "unknown names": ("t,a,b,c\n0,1,2,3\n", f":1: no column is called 'u' or 'input'; the file has {FOUR}{WHICH}"),
     "word": ("t,u,y\n0,1,2\n\n1,one,2\n", f":4: column 'u' holds 'one', {NUMBER}"),
     "thousands mark": ("t;u;y\n0;1;2\n1;1.000,5;2\n", f":3: column 'u' holds '1.000,5', {NUMBER}"),
     "other decimal sign": ("t;u;y\n0;1,5;2,5\n1;1.5;2\n", f":3: column 'u' holds '1.5', {TOGETHER}"),
