@@ -107,16 +107,6 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def write(tmp_path):
-    def to_file(content, name="pump.csv"):
-        path = tmp_path / name
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return path
-
-    return to_file
-
-
 @pytest.mark.parametrize("kind", READ)
 def test_one_record_in_many_ways(write, kind):
     content, notes = READ[kind]
