@@ -65,22 +65,20 @@ def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[
             kind = "a MATLAB file" if Path(path).suffix.lower() in MATLAB else "an HDF5 file"
             raise DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(path)}")
         told: dict[str, Any] = json.loads((folder / "told.json").read_text(encoding="utf-8"))
-        right = [name for name in told.get("names", ()) if name not in told["wrong"]]
-        with np.load(folder / "vectors.npz", allow_pickle=False) as stored:
-            return told, dict(zip(right, stored.values(), strict=True))
+        right = {name: k for k, name in enumerate(told.get("names", ())) if name not in told["wrong"]}
+        return told, {name: np.load(folder / f"{k}.npy", allow_pickle=False) for name, k in right.items()}
 
 
 def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
     """Write the vectors of a file to a folder, and why other variables are none."""
     faulthandler.disable()  # a crash is no news
-    told: dict[str, Any] = {}
-    vectors: list[Array] = []
+    told: dict[str, Any]
     try:
         arrays, objects = _arrays(path)
         told = {"names": list(arrays), "objects": objects, "wrong": {}}
-        for name, value in arrays.items():
+        for k, (name, value) in enumerate(arrays.items()):
             try:
-                vectors.append(_vector(value))
+                np.save(folder / f"{k}.npy", _vector(value), allow_pickle=False)
             except ValueError as error:
                 told["wrong"][name] = str(error)
     except DataError as error:
@@ -89,7 +87,6 @@ def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
         told = {"refused": f"cannot be read: {error.strerror}"}
     except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
         raise SystemExit(1) from None
-    np.savez(folder / "vectors.npz", *vectors)
     (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
 
 

@@ -175,7 +175,7 @@ class Table:
         roles = [role for role in asked if role in USUAL_NAMES]
         chosen = {role: self.named(wanted) for role in roles if (wanted := asked[role]) is not None}
         for role in roles:
-            if role not in chosen and (name := self._recognised(role, chosen)):
+            if role not in chosen and (name := self._recognised(role, chosen, sure=role not in optional)):
                 chosen[role] = name
         notes = self._take_by_position(chosen, [role for role in roles if role in chosen or role not in optional])
         chosen |= {role: self.named(wanted) for role, wanted in asked.items() if role not in roles and wanted}
@@ -200,16 +200,16 @@ class Table:
             parts.append(f"Did you mean {close!r}?")
         raise DataError(". ".join(filter(None, [*parts, self.hint])))
 
-    def _recognised(self, role: str, chosen: Mapping[str, str]) -> str | None:
-        """Return the column with the most telling of the usual names of a role."""
+    def _recognised(self, role: str, chosen: Mapping[str, str], *, sure: bool) -> str | None:
+        """Return the column with the most telling of the usual names of a role; of several the first, unless sure."""
         for usual in USUAL_NAMES[role]:
             matching = self._called((usual,), chosen)
             # What lies in the same struct as the columns that are known belongs to them.
             homes = {name.rpartition(".")[0] for name in chosen.values()}
             close = [name for name in matching if not self.is_text and name.rpartition(".")[0] in homes]
             matching = close or matching
-            self._require_single(matching)
-            if len(matching) > 1:
+            self._require_single(matching if sure else ())
+            if len(matching) > 1 and sure:
                 several = listed(map(repr, matching))
                 raise DataError(f"{self.head}: {several} may all be the {role}; say which one (option {role})")
             if matching:
