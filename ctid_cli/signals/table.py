@@ -64,9 +64,8 @@ class Columns:
             if not (np.isfinite(interval) and interval > 0):
                 raise DataError(f"{self.file}: {name!r} is {interval:g}; a sampling interval must be a positive number")
             require_steps(f"{self.file}: the sampling interval {name!r}", np.array([0.0, interval]))
-            note = (
-                f"{name!r} is one number: it was taken as the sampling interval, {interval:g} {unit}, from 0 {unit} on."
-            )
+            taken = f"{name!r} is one number: it was taken as the sampling interval"
+            note = f"{taken}, {interval:g} {unit}, from 0 {unit} on."
             times = {"time": interval * np.arange(size, dtype=float)}
             found = replace(self, values={**self.values, **times}, notes=(*self.notes, note))
         for role, values in found.values.items():
@@ -110,7 +109,7 @@ class Columns:
 
     def window(self, t: Array, start: float | None, stop: float | None, slack: float = 0.0) -> slice:
         """Return the rows between two instants, up to some slack."""
-        unit = (self.unit("time") if "time" in self.names else None) or "s"
+        unit = (self.unit("time") if "time" in self.values else None) or "s"
         low, high = -np.inf if start is None else start, np.inf if stop is None else stop
         if not low < high:
             raise DataError(f"{self.file}: the window from {low:g} to {high:g} {unit} ends before it begins")
@@ -218,8 +217,9 @@ class Table:
 
     def _called(self, usual: Sequence[str], chosen: Mapping[str, str]) -> list[str]:
         """Return the columns that are not taken yet and have a usual name, without their unit and their struct."""
-        leaf = {name: split_header(name)[0].rpartition("\n" if self.is_text else ".")[2] for name in self.names}
-        return [name for name in self.names if leaf[name].lower() in usual and name not in chosen.values()]
+        bare = {name: split_header(name)[0] for name in self.names if name not in chosen.values()}
+        leaves = {name: text if self.is_text else text.rpartition(".")[2] for name, text in bare.items()}
+        return [name for name in self.names if leaves.get(name, "").lower() in usual]
 
     def _take_by_position(self, chosen: dict[str, str], roles: Sequence[str]) -> list[str]:
         """Take the columns of the roles that are still open in their order, where no name contradicts; say so."""
