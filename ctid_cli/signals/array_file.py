@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,98 +31,83 @@ LEAST_PATIENCE, SLOWEST = 50.0, 5e6
 def read_array_table(path: str | os.PathLike[str]) -> Table:
     """Read the variables of a MATLAB file, or the data sets of an HDF5 file, which has a unit as attribute ``unit``."""
     file = require_file(path, f" the file is empty; {_how_to_save(path)}")
-    content = _read_in_own_process(path, file)
-    if "refused" in content:
-        raise DataError(content["refused"])
-    vectors, wrong, objects = content["vectors"], content["wrong"], content["objects"]
-    hint = " ".join(_how_to_export(path, name, kind) for name, kind in objects.items())
-    if not vectors and not wrong:
+    told, vectors = _read_in_own_process(path, file)
+    if "refused" in told:
+        raise DataError(f"{file}: {told['refused']}")
+    names, wrong = told["names"], told["wrong"]
+    hint = " ".join(_how_to_export(path, name, kind) for name, kind in told["objects"].items())
+    if not names:
         raise DataError(f"{file}: {hint}" if hint else f"{file}: the file holds no arrays; {_how_to_save(path)}")
+    noun = "variable" if Path(path).suffix.lower() in MATLAB else "data set"
 
-    def read(names: Sequence[str]) -> Columns:
-        for name in names:
+    def read(asked: Sequence[str]) -> Columns:
+        for name in asked:
             if name in wrong:
                 raise DataError(f"{file}: {noun} {name!r} {wrong[name]}")
-        return Columns(file, {name: vectors[name] for name in names})
+        return Columns(file, {name: vectors[name] for name in asked})
 
-    noun = "variable" if Path(path).suffix.lower() in MATLAB else "data set"
-    return Table(file, tuple(content["names"]), read, head=file, noun=noun, hint=hint)
+    return Table(file, tuple(names), read, head=file, noun=noun, hint=hint)
 
 
-def _read_in_own_process(path: str | os.PathLike[str], file: str) -> dict[str, Any]:
+def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return what ``_write_content`` has found; refuse a file that crashes it, or takes too long."""
-    patience = LEAST_PATIENCE + Path(path).stat().st_size / SLOWEST
     with TemporaryFolder() as folder:
         with warnings.catch_warnings():
             # The process does nothing but this, so that threads of others do not matter.
             warnings.simplefilter("ignore", DeprecationWarning)
-            process = multiprocessing.get_context("fork").Process(target=_write_content, args=(path, file, folder))
+            process = multiprocessing.get_context("fork").Process(target=_write_content, args=(path, folder))
             process.start()
-        process.join(patience)
+        process.join(LEAST_PATIENCE + Path(path).stat().st_size / SLOWEST)
         if process.is_alive():
             process.kill()
             process.join()
         if process.exitcode != 0:
-            raise _damaged(path, file)
-        content: dict[str, Any] = json.loads((folder / "content.json").read_text(encoding="utf-8"))
-        stored = {name: k for k, name in enumerate(content.get("names", ())) if name not in content["wrong"]}
-        content["vectors"] = {name: np.load(folder / f"{k}.npy", allow_pickle=False) for name, k in stored.items()}
-    return content
+            kind = "a MATLAB file" if Path(path).suffix.lower() in MATLAB else "an HDF5 file"
+            raise DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(path)}")
+        told: dict[str, Any] = json.loads((folder / "told.json").read_text(encoding="utf-8"))
+        right = {name: k for k, name in enumerate(told.get("names", ())) if name not in told["wrong"]}
+        return told, {name: np.load(folder / f"{k}.npy", allow_pickle=False) for name, k in right.items()}
 
 
-def _write_content(path: str | os.PathLike[str], file: str, folder: Path) -> None:
+def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
     """Write the vectors of a file to a folder, and why other variables are none."""
     faulthandler.disable()  # a crash is no news
-    content: dict[str, Any]
+    told: dict[str, Any]
     try:
-        arrays, objects = _arrays(path, file)
-        content = {"names": list(arrays), "objects": objects, "wrong": {}}
+        arrays, objects = _arrays(path)
+        told = {"names": list(arrays), "objects": objects, "wrong": {}}
         for k, (name, value) in enumerate(arrays.items()):
             try:
                 np.save(folder / f"{k}.npy", _vector(value), allow_pickle=False)
             except ValueError as error:
-                content["wrong"][name] = str(error)
+                told["wrong"][name] = str(error)
     except DataError as error:
-        content = {"refused": str(error)}
+        told = {"refused": str(error)}
+    except PermissionError as error:
+        told = {"refused": f"cannot be read: {error.strerror}"}
     except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
         raise SystemExit(1) from None
-    (folder / "content.json").write_text(json.dumps(content), encoding="utf-8")
+    (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
 
 
-def _arrays(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, str]]:
+def _arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return arrays by name, and the classes of objects by name."""
     import scipy.io
 
-    try:
-        if Path(path).suffix.lower() in HDF5:
-            return hdf5_arrays(path)
-        with warnings.catch_warnings():
-            # Two objects in one file share a placeholder name, which is no concern of the arrays next to them.
-            warnings.simplefilter("ignore")
-            for name, shape in _shapes(path).items():
-                require_values(file, name, math.prod(shape))
-            return _flat(scipy.io.loadmat(path))
-    except DataError as error:
-        raise DataError(str(error) if str(error).startswith(file) else f"{file}: {error}") from None
-    except NotImplementedError:  # version 7.3 is HDF5
+    if Path(path).suffix.lower() in HDF5:
+        return hdf5_arrays(path)
+    claimed: list[Any] = []
+    with warnings.catch_warnings():
+        # Two objects in one file share a placeholder name, which is no concern of the arrays next to them.
+        warnings.simplefilter("ignore")
+        with suppress(Exception):  # objects have no headers of this kind; what else is wrong the reader itself says
+            claimed = scipy.io.whosmat(path)
+        for name, shape, _ in claimed:
+            require_values(repr(name), math.prod(shape))
         try:
+            return _flat(scipy.io.loadmat(path))
+        except NotImplementedError:  # version 7.3 is HDF5
             return hdf5_arrays(path)
-        except DataError as error:
-            raise DataError(f"{file}: {error}") from None
-    except PermissionError as error:
-        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-
-
-def _shapes(path: str | os.PathLike[str]) -> dict[str, tuple[int, ...]]:
-    """Return what the headers of a file claim; nothing where objects are in it, which have no such headers."""
-    import scipy.io
-
-    try:
-        return {name: tuple(shape) for name, shape, _ in scipy.io.whosmat(path)}
-    except NotImplementedError:
-        raise
-    except Exception:  # the reader itself says what is wrong
-        return {}
 
 
 def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -170,11 +156,6 @@ def _vector(value: Any) -> Array:
             raise ValueError("holds complex numbers; save its real or imaginary part")
         array = array.real
     return np.array(array, dtype=float).reshape(-1)
-
-
-def _damaged(path: str | os.PathLike[str], file: str) -> DataError:
-    kind = "a MATLAB file" if Path(path).suffix.lower() in MATLAB else "an HDF5 file"
-    return DataError(f"{file}: this is not {kind}, or a damaged one; {_how_to_save(path)}")
 
 
 def _how_to_save(path: str | os.PathLike[str]) -> str:

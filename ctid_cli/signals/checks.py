@@ -4,7 +4,11 @@ The sentence begins with the name of the option, or with a label that says more.
 """
 
 import math
+import types
+from dataclasses import fields
+from functools import cache
 from numbers import Integral, Real
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -39,17 +43,17 @@ def require_positive(name: str, value: float, unit: str, label: str = "") -> Non
         raise OptionError(name, f"{label or name} must be a positive number [{unit}], not {value!r}.")
 
 
-def require_not_negative(name: str, value: float, unit: str) -> None:
+def require_not_negative(name: str, value: float, unit: str, label: str = "") -> None:
     """Refuse anything but zero or a positive finite number."""
     if not _is_number(value) or value < 0:
-        raise OptionError(name, f"{name} must be zero or a positive number [{unit}], not {value!r}.")
+        raise OptionError(name, f"{label or name} must be zero or a positive number [{unit}], not {value!r}.")
 
 
-def require_share(name: str, value: float, *, whole: bool = True) -> None:
+def require_share(name: str, value: float, label: str = "", *, whole: bool = True) -> None:
     """Refuse anything but a number above 0, and up to 1 or below it."""
     if not _is_number(value) or not 0 < value <= 1 or (value == 1 and not whole):
         most = "at most" if whole else "below"
-        raise OptionError(name, f"{name} must be a number above 0 and {most} 1 [-], not {value!r}.")
+        raise OptionError(name, f"{label or name} must be a number above 0 and {most} 1 [-], not {value!r}.")
 
 
 def require_finite(name: str, value: float, unit: str, label: str = "") -> None:
@@ -86,6 +90,41 @@ def freeze(owner: object, **values: object) -> None:
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
         object.__setattr__(owner, name, value)
+
+
+class Checked:
+    """Base of option dataclasses whose annotations say what is allowed.
+
+    A number is annotated with its check and what that takes after the value, as in
+    ``Annotated[float, require_positive, "s"]``; words are a ``Literal``. Each item of a tuple is checked, which may be
+    given as a list.
+    """
+
+    def __post_init__(self) -> None:
+        kind: Any = type(self)
+        hints = _hints(kind)
+        for option in fields(self):  # type: ignore[arg-type]  # of subclasses, which are dataclasses
+            value = _checked(option.name, getattr(self, option.name), hints[option.name])
+            object.__setattr__(self, option.name, value)
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+def _checked(name: str, value: Any, hint: Any, label: str = "") -> Any:
+    """Return the value of an option; refuse what its annotation does not allow."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        parts[1](name, value, *parts[2:], label=label)
+    elif origin is Literal:
+        require_choice(name, value, parts)
+    elif origin in (Union, types.UnionType) and value is not None:  # what may be absent too
+        return _checked(name, value, parts[0])
+    elif origin is tuple:
+        return tuple(_checked(name, item, parts[0], f"each of the {name}") for item in value)
+    return value
 
 
 def _is_number(value: object) -> bool:

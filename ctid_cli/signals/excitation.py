@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, get_args
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,31 +14,19 @@ from ctid_cli.signals import checks
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal, Hold
 from ctid_cli.signals.measurement import read_held_signal
 
-#: Lags of a maximal-length feedback register by its number of stages: ``c[k]`` is the parity of the
-#: ``c[k - lag]``. The polynomial 1 + sum of x^lag is primitive over GF(2), hence the period is 2^stages - 1.
+# fmt: off
+#: Taps of a maximal-length feedback register by its number of stages n: ``c[k + n]`` is the parity of ``c[k]`` and the
+#: ``c[k + tap]``. The polynomial 1 + sum of x^(n - tap) + x^n is primitive over GF(2), hence the period is 2^n - 1.
 #: These are the customary choices with two or four taps (P. Alfke, Xilinx application note XAPP 052, 1996);
 #: the tests verify every period.
 TAPS: dict[int, tuple[int, ...]] = {
-    2: (2, 1),
-    3: (3, 2),
-    4: (4, 3),
-    5: (5, 3),
-    6: (6, 5),
-    7: (7, 6),
-    8: (8, 6, 5, 4),
-    9: (9, 5),
-    10: (10, 7),
-    11: (11, 9),
-    12: (12, 6, 4, 1),
-    13: (13, 4, 3, 1),
-    14: (14, 5, 3, 1),
-    15: (15, 14),
-    16: (16, 15, 13, 4),
-    17: (17, 14),
-    18: (18, 11),
-    19: (19, 6, 2, 1),
-    20: (20, 17),
+    2: (1,), 3: (1,), 4: (1,), 5: (2,), 6: (1,), 7: (1,), 8: (2, 3, 4), 9: (4,), 10: (3,), 11: (2,),
+    12: (6, 8, 11), 13: (9, 10, 12), 14: (9, 11, 13), 15: (1,), 16: (1, 3, 12), 17: (3,), 18: (7,),
+    19: (13, 17, 18), 20: (3,),
 }
+# fmt: on
+#: A positive number, or the clock of the sampling.
+ClockPeriod = Annotated[float, checks.require_positive, "s"] | None
 
 
 class Excitation(ABC):
@@ -74,12 +62,6 @@ class Excitation(ABC):
 # --- the clock of an input ------------------------------------------------------------------------------------------
 
 
-def check_clock(period: float | None) -> None:
-    """Refuse a clock that does not advance; None is the clock of the sampling."""
-    if period is not None:
-        checks.require_positive("clock_period", period, "s")
-
-
 def clock_instants(sample_times: Array, period: float | None) -> Array:
     """Return the instants at which an input takes a new value, from the first sample to the last."""
     if period is None:
@@ -93,28 +75,16 @@ def clock_instants(sample_times: Array, period: float | None) -> Array:
 # --- random inputs --------------------------------------------------------------------------------------------------
 
 
-def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.uint8]:
-    """Return the output of a maximal-length feedback shift register.
+def maximal_length_sequence(stages: int, length: int, state: int) -> NDArray[np.int8]:
+    """Return the output of a maximal-length feedback shift register."""
+    from scipy.signal import max_len_seq
 
-    Over GF(2) the square of the feedback polynomial has the same coefficients at twice the exponents, so a
-    sequence that obeys the recurrence at lags ``l`` obeys it at ``2 l``, ``4 l``, … too. Doubling the lags as
-    soon as the history reaches back far enough yields ever longer blocks at once.
-    """
-    bits = np.empty(max(length, stages), dtype=np.uint8)
-    bits[:stages] = [(state >> k) & 1 for k in range(stages)]
-    lags = np.array(TAPS[stages])
-    known = stages
-    while known < length:
-        if 2 * lags.max() <= known:
-            lags = 2 * lags
-        block = min(int(lags.min()), length - known)
-        bits[known : known + block] = np.bitwise_xor.reduce([bits[known - lag : known - lag + block] for lag in lags])
-        known += block
-    return bits[:length]
+    first = [(state >> k) & 1 for k in range(stages)]
+    return np.asarray(max_len_seq(stages, first, length, TAPS[stages])[0])
 
 
 @dataclass(frozen=True)
-class Prbs(Excitation):
+class Prbs(checks.Checked, Excitation):
     """Pseudo-random binary sequence from a maximal-length feedback register.
 
     Parameters
@@ -144,14 +114,9 @@ class Prbs(Excitation):
 
     kind: ClassVar[str] = "prbs"
 
-    stages: int
-    clock_period: float
-    amplitude: float = 1.0
-
-    def __post_init__(self) -> None:
-        checks.require_integer("stages", self.stages, min(TAPS), max(TAPS))
-        checks.require_positive("clock_period", self.clock_period, "s")
-        checks.require_positive("amplitude", self.amplitude, "input unit")
+    stages: Annotated[int, checks.require_integer, min(TAPS), max(TAPS)]
+    clock_period: Annotated[float, checks.require_positive, "s"]
+    amplitude: Annotated[float, checks.require_positive, "input unit"] = 1.0
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the sequence on its clock from the first instant on; the first state of the register is drawn."""
@@ -161,7 +126,7 @@ class Prbs(Excitation):
 
 
 @dataclass(frozen=True)
-class Gbn(Excitation):
+class Gbn(checks.Checked, Excitation):
     """Generalised binary noise: two values, with a chance of changing at every tick of a clock.
 
     Parameters
@@ -184,14 +149,9 @@ class Gbn(Excitation):
 
     kind: ClassVar[str] = "gbn"
 
-    clock_period: float
-    switching_probability: float = 0.5
-    amplitude: float = 1.0
-
-    def __post_init__(self) -> None:
-        checks.require_positive("clock_period", self.clock_period, "s")
-        checks.require_share("switching_probability", self.switching_probability)
-        checks.require_positive("amplitude", self.amplitude, "input unit")
+    clock_period: Annotated[float, checks.require_positive, "s"]
+    switching_probability: Annotated[float, checks.require_share] = 0.5
+    amplitude: Annotated[float, checks.require_positive, "input unit"] = 1.0
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the values on their clock from the first instant on; the first value and all changes are drawn."""
@@ -202,7 +162,7 @@ class Gbn(Excitation):
 
 
 @dataclass(frozen=True)
-class Gaussian(Excitation):
+class Gaussian(checks.Checked, Excitation):
     """Independent Gaussian values, held between clock instants.
 
     Parameters
@@ -215,12 +175,8 @@ class Gaussian(Excitation):
 
     kind: ClassVar[str] = "gaussian"
 
-    standard_deviation: float = 1.0
-    clock_period: float | None = None
-
-    def __post_init__(self) -> None:
-        checks.require_positive("standard_deviation", self.standard_deviation, "input unit")
-        check_clock(self.clock_period)
+    standard_deviation: Annotated[float, checks.require_positive, "input unit"] = 1.0
+    clock_period: ClockPeriod = None
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return independent values on the clock."""
@@ -232,7 +188,7 @@ class Gaussian(Excitation):
 
 
 @dataclass(frozen=True)
-class Step(Excitation):
+class Step(checks.Checked, Excitation):
     """A step from zero.
 
     Parameters
@@ -246,14 +202,13 @@ class Step(Excitation):
     kind: ClassVar[str] = "step"
     deterministic: ClassVar[bool] = True
 
-    amplitude: float = 1.0
-    time: float = 0.0
+    amplitude: Annotated[float, checks.require_finite, "input unit"] = 1.0
+    time: Annotated[float, checks.require_not_negative, "s"] = 0.0
 
     def __post_init__(self) -> None:
-        checks.require_finite("amplitude", self.amplitude, "input unit")
+        super().__post_init__()
         if self.amplitude == 0:
             raise OptionError("amplitude", "amplitude must not be zero [input unit]: such a step excites nothing.")
-        checks.require_not_negative("time", self.time, "s")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the step, which must come before the last instant; nothing is drawn."""
@@ -261,7 +216,7 @@ class Step(Excitation):
 
 
 @dataclass(frozen=True)
-class Steps(Excitation):
+class Steps(checks.Checked, Excitation):
     """A staircase: values that follow one another at given instants.
 
     Parameters
@@ -280,14 +235,11 @@ class Steps(Excitation):
     kind: ClassVar[str] = "steps"
     deterministic: ClassVar[bool] = True
 
-    times: tuple[float, ...]
-    levels: tuple[float, ...]
+    times: tuple[Annotated[float, checks.require_finite, "s"], ...]
+    levels: tuple[Annotated[float, checks.require_finite, "input unit"], ...]
 
     def __post_init__(self) -> None:
-        for name, unit in (("times", "s"), ("levels", "input unit")):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
-            for value in getattr(self, name):
-                checks.require_finite(name, value, unit, label=f"each of the {name}")
+        super().__post_init__()
         if len(self.times) != len(self.levels):
             counts = f"there are {len(self.levels)} of them and {len(self.times)} times"
             raise OptionError("levels", f"levels must be as many as times, and {counts}.")
@@ -317,7 +269,7 @@ def _staircase(sample_times: Array, times: tuple[float, ...], levels: tuple[floa
 
 
 @dataclass(frozen=True)
-class InputFile(Excitation):
+class InputFile(checks.Checked, Excitation):
     """The user's own input, from a text (.csv), MATLAB or HDF5 file.
 
     Parameters
@@ -349,7 +301,7 @@ class InputFile(Excitation):
     sha256: str | None = None
 
     def __post_init__(self) -> None:
-        checks.require_choice("hold", self.hold, get_args(Hold))
+        super().__post_init__()
         if self.time == self.input:
             raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 

@@ -48,10 +48,10 @@ def require_file(path: str | os.PathLike[str], empty: str = " the file is empty"
     return file
 
 
-def require_values(file: str, name: str, count: int) -> None:
+def require_values(what: str, count: int) -> None:
     """Refuse an array whose header asks for more memory than any record needs."""
     if count > MAX_VALUES:
-        raise DataError(f"{file}: {name!r} claims to hold {count} values; at most {MAX_VALUES} are read")
+        raise DataError(f"{what} claims to hold {count} values; at most {MAX_VALUES} are read")
 
 
 def is_inside(path: str | os.PathLike[str], folder: Path) -> bool:

@@ -1,5 +1,6 @@
 """HDF5 files that somebody else may have made: only plain arrays in the file itself, of bounded size."""
 
+import itertools
 import os
 from collections.abc import Iterator
 from typing import Any
@@ -19,45 +20,31 @@ MAX_DATA_SETS, MAX_UNIT = 10_000, 60
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
-def members(group: Any) -> Iterator[tuple[str, Any]]:
-    """What a group holds itself; links to other places and other files are refused, not followed."""
+def _items(
+    group: Any, name: str = "", depth: int = 0, counter: Iterator[int] | None = None
+) -> Iterator[tuple[str, Any]]:
+    """Return all groups and data sets by their path; refuse links, external data and numbers beyond all bounds."""
     import h5py
 
-    for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise DataError(f"{name[:60]!r} in it is a link to another place; only what is in the file itself is read")
-        yield name, group[name]
-
-
-def require_plain(name: str, item: Any) -> None:
-    """Refuse an array that lies in other files, claims more than can be read, or holds objects."""
-    name = name[:60]
-    if item.external or item.is_virtual:
-        raise DataError(f"{name!r} in it lies in another file; only what is in the file itself is read")
-    if item.size is not None and (item.size > MAX_VALUES or item.nbytes > MAX_FILE_BYTES):
-        raise DataError(f"{name!r} in it claims to hold {item.size} values; at most {MAX_VALUES} are read")
-
-
-def require_plain_tree(group: Any, *, kinds: str = PLAIN) -> None:
-    """Refuse a file of which any part is not plain, before any of it is read."""
-    waiting, seen, total = [(group, "", 0)], 0, 0
-    while waiting:
-        here, name, depth = waiting.pop()
-        _require_small_attributes(here, name)
-        for key, item in members(here):
-            path, seen = f"{name}/{key}", seen + 1
-            if seen > MAX_MEMBERS or depth >= MAX_DEPTH:
-                raise DataError("it holds too many groups")
-            if hasattr(item, "dtype"):
-                require_plain(path, item)
-                _require_small_attributes(item, path)
-                if item.dtype.kind not in kinds or item.shape is None:
-                    raise DataError(f"{path[:60]!r} in it holds neither numbers nor plain text")
-                total += item.nbytes
-            else:
-                waiting.append((item, path, depth + 1))
-        if total > MAX_FILE_BYTES:
-            raise DataError(f"it claims to hold {total} bytes; at most {MAX_FILE_BYTES} are read")
+    counter = counter or itertools.count()
+    _require_small_attributes(group, name)
+    for key in group:
+        path = f"{name}/{key}" if name else key
+        told = path[:60]
+        if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            raise DataError(f"{told!r} in it is a link to another place; only what is in the file itself is read")
+        if next(counter) >= MAX_MEMBERS or depth >= MAX_DEPTH:
+            raise DataError("it holds too many groups or data sets")
+        item = group[key]
+        if isinstance(item, h5py.Dataset):
+            if item.external or item.is_virtual:
+                raise DataError(f"{told!r} in it lies in another file; only what is in the file itself is read")
+            if item.size is not None and (item.size > MAX_VALUES or item.nbytes > MAX_FILE_BYTES):
+                raise DataError(f"{told!r} in it claims to hold {item.size} values; at most {MAX_VALUES} are read")
+            _require_small_attributes(item, path)
+        yield path, item
+        if isinstance(item, h5py.Group):
+            yield from _items(item, path, depth + 1, counter)
 
 
 def _require_small_attributes(item: Any, name: str) -> None:
@@ -65,6 +52,18 @@ def _require_small_attributes(item: Any, name: str) -> None:
         # A scalar text has the size of a pointer here; HDF5 itself bounds its length.
         if item.attrs.get_id(key).get_storage_size() > MAX_ATTRIBUTE:
             raise DataError(f"the attribute {key[:60]!r} of {name[:60] or '/'!r} is too large")
+
+
+def require_plain_tree(group: Any) -> None:
+    """Refuse a file of which any part is not plain, before any of it is read."""
+    total = 0
+    for path, item in _items(group):
+        if hasattr(item, "dtype"):
+            if item.dtype.kind not in PLAIN or item.shape is None:
+                raise DataError(f"{path[:60]!r} in it holds neither numbers nor plain text")
+            total += item.nbytes
+            if total > MAX_FILE_BYTES:
+                raise DataError(f"it claims to hold {total} bytes; at most {MAX_FILE_BYTES} are read")
 
 
 def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -76,31 +75,22 @@ def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str,
 
     arrays: dict[str, Any] = {}
     objects: dict[str, str] = {}
-
-    def visit(name: str, item: Any) -> None:
-        _require_small_attributes(item, name)
-        kind = text_of(item.attrs.get("MATLAB_class", b"double"))
-        if "MATLAB_object_decode" in item.attrs:
-            objects[name] = kind
-        elif isinstance(item, h5py.Group):
-            visit_members(item, f"{name}.")
-        elif "MATLAB_empty" in item.attrs:
-            arrays[name] = np.empty((0, 0))
-        else:
-            require_plain(name, item)
-            unit = text_of(item.attrs.get("unit", ""))[:MAX_UNIT].strip("[]() ")
-            numeric = kind in NUMERIC and item.dtype.kind in PLAIN
-            arrays[f"{name} [{unit}]" if unit else name] = item[()] if numeric else np.array("text", dtype=object)
-
-    def visit_members(group: Any, prefix: str) -> None:
-        for name, item in members(group):
-            if prefix.count(".") > MAX_DEPTH or len(arrays) > MAX_DATA_SETS:
-                raise DataError("it holds too many groups or data sets")
-            if not name.startswith("#"):  # MATLAB's own store of what objects and cells refer to
-                visit(prefix + name, item)
-
     with h5py.File(path, "r") as store:
-        visit_members(store, "")
+        for place, item in _items(store):
+            name, kind = place.replace("/", "."), text_of(item.attrs.get("MATLAB_class", b"double"))
+            # What begins with # is MATLAB's own store of what objects and cells refer to.
+            if name.startswith(("#", *(f"{known}." for known in objects))):
+                continue
+            if "MATLAB_object_decode" in item.attrs:
+                objects[name] = kind
+            elif isinstance(item, h5py.Dataset):
+                if len(arrays) >= MAX_DATA_SETS:
+                    raise DataError("it holds too many groups or data sets")
+                unit = text_of(item.attrs.get("unit", ""))[:MAX_UNIT].strip("[]() ")
+                value = item[()] if kind in NUMERIC and item.dtype.kind in PLAIN else np.array("text", dtype=object)
+                arrays[f"{name} [{unit}]" if unit else name] = (
+                    np.empty((0, 0)) if "MATLAB_empty" in item.attrs else value
+                )
     return arrays, objects
 
 

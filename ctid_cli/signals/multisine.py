@@ -3,14 +3,14 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.signals import checks
-from ctid_cli.signals.excitation import Excitation, check_clock, clock_instants
+from ctid_cli.signals.excitation import ClockPeriod, Excitation, clock_instants
 from ctid_cli.signals.held import COINCIDENCE, HeldSignal
 
 Spacing = Literal["linear", "logarithmic"]
@@ -20,7 +20,7 @@ MAX_FILLED, MAX_HARMONIC = 10_000, 1_000_000
 
 
 @dataclass(frozen=True)
-class Multisine(Excitation):
+class Multisine(checks.Checked, Excitation):
     r"""Sum of sinusoids with equal amplitudes, held between clock instants.
 
     Parameters
@@ -73,27 +73,22 @@ class Multisine(Excitation):
     #: Values of an option with which no random number is drawn.
     deterministic_with: ClassVar[dict[str, tuple[str, ...]]] = {"phases": ("schroeder",)}
 
-    lowest_frequency: float | None = None
-    highest_frequency: float | None = None
-    tones: int | None = None
-    amplitude: float = 1.0
-    clock_period: float | None = None
-    frequencies: tuple[float, ...] | None = None
+    lowest_frequency: Annotated[float, checks.require_positive, "rad/s"] | None = None
+    highest_frequency: Annotated[float, checks.require_positive, "rad/s"] | None = None
+    tones: Annotated[int, checks.require_integer, 1] | None = None
+    amplitude: Annotated[float, checks.require_positive, "input unit"] = 1.0
+    clock_period: ClockPeriod = None
+    frequencies: tuple[Annotated[float, checks.require_positive, "rad/s"], ...] | None = None
     spacing: Spacing = "linear"
-    period: float | None = None
+    period: Annotated[float, checks.require_positive, "s"] | None = None
     phases: Phases = "random"
 
     def __post_init__(self) -> None:
-        checks.require_positive("amplitude", self.amplitude, "input unit")
-        check_clock(self.clock_period)
-        checks.require_choice("spacing", self.spacing, get_args(Spacing))
-        checks.require_choice("phases", self.phases, get_args(Phases))
-        if self.period is not None:
-            checks.require_positive("period", self.period, "s")
+        super().__post_init__()
         if self.frequencies is None:
             self._check_band()
         else:
-            self._check_frequencies(self.frequencies)
+            self._check_no_band()
         if self.period is not None:
             self._check_harmonics(self.period)
         if self.frequencies is not None and self.frequencies_used.size < len(self.frequencies):
@@ -111,10 +106,7 @@ class Multisine(Excitation):
         if highest * period / (2 * math.pi) > most:
             raise OptionError("period", f"{what} up to harmonic {most} of the period; give a shorter one.")
 
-    def _check_frequencies(self, frequencies: tuple[float, ...]) -> None:
-        object.__setattr__(self, "frequencies", tuple(frequencies))
-        for frequency in frequencies:
-            checks.require_positive("frequencies", frequency, "rad/s", label="each of the frequencies")
+    def _check_no_band(self) -> None:
         if self.spacing != "linear":
             raise OptionError("spacing", "spacing is how a band is filled, and frequencies are given; leave it out.")
         for name in ("lowest_frequency", "highest_frequency", "tones"):
@@ -125,20 +117,16 @@ class Multisine(Excitation):
         for name in ("lowest_frequency", "highest_frequency"):
             if getattr(self, name) is None:
                 raise OptionError(name, f"{name} is missing [rad/s]; give a band, or a list of frequencies.")
-            checks.require_positive(name, getattr(self, name), "rad/s")
         low, high = self.band
-        if self.tones is not None:
-            checks.require_integer("tones", self.tones, 1)
-        elif self.period is None:
+        if self.tones is None and self.period is None:
             raise OptionError("tones", "tones is missing: the number of tones; with a period it may be left out.")
-        elif self.spacing == "logarithmic":
+        if self.tones is None and self.spacing == "logarithmic":
             raise OptionError("tones", "tones is missing: the number of tones that are spaced logarithmically.")
         ends = f"{low:g} and {high:g} rad/s"
         if low > high:
-            raise OptionError(
-                "lowest_frequency", f"lowest_frequency must not exceed highest_frequency; they are {ends}."
-            )
-        if self.tones is not None and self.tones > 1 and low == high:
+            message = f"lowest_frequency must not exceed highest_frequency; they are {ends}."
+            raise OptionError("lowest_frequency", message)
+        if (self.tones or 1) > 1 and low == high:
             raise OptionError("tones", f"{self.tones} tones need a band, but its ends are {ends}.")
 
     @property

@@ -2,19 +2,21 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.signals.checks import require_finite, require_not_negative
+from ctid_cli.signals.checks import Checked, require_finite, require_not_negative
 
 Role = Literal["input", "sampling", "noise", "start", "parameters"]
 
 #: First component of every spawn key. Results are repeatable only while these numbers stay what they are.
 ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
+Decibels = Annotated[float, require_finite, "dB"] | None
+Variance = Annotated[float, require_not_negative, "output unit^2"] | None
 #: Unit of every way to say how strong noise is.
 LEVEL_UNITS = {
     "snr_db": "dB",
@@ -35,7 +37,7 @@ def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROLES[role], replicate)))
 
 
-class Noise:
+class Noise(Checked):
     """What is added to an output: white innovations through a filter, at an absolute or a relative level.
 
     It is stationary from the first sample on.
@@ -48,16 +50,14 @@ class Noise:
     snr_db: float | None
     variance: float | None
 
-    def _require_one_level(self) -> None:
-        """Refuse anything but exactly one level, a signal-to-noise ratio or a number that is not negative."""
+    def __post_init__(self) -> None:
+        super().__post_init__()
         levels = {name: getattr(self, name) for name in LEVEL_UNITS if hasattr(self, name)}
         given = [name for name, value in levels.items() if value is not None]
         if len(given) != 1:
             choices = [f"{name} [{LEVEL_UNITS[name]}]" for name in levels]
             found = f"{' and '.join(given)} were" if given else "none was"
             raise ValueError(f"noise needs exactly one of {', '.join(choices)}; {found} given.")
-        check = require_finite if given == ["snr_db"] else require_not_negative
-        check(given[0], levels[given[0]], LEVEL_UNITS[given[0]])
         if self.snr_db is not None and abs(self.snr_db) > MAX_SNR_DB:
             raise OptionError("snr_db", f"snr_db must be within plus or minus {MAX_SNR_DB} dB, not {self.snr_db!r}.")
 
@@ -65,12 +65,6 @@ class Noise:
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
         return (1.0,), (1.0,)
-
-    @property
-    def _given_innovation_variance(self) -> float | None:
-        """Variance of the innovations [output unit^2], where the level says it."""
-        deviation: float | None = getattr(self, "standard_deviation", None)
-        return None if deviation is None else deviation**2
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
         """Return the variance of the innovations.
@@ -90,13 +84,12 @@ class Noise:
         DataError
             If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
         """
-        given = self._given_innovation_variance
-        if given is not None:
-            return given
-        variance = self.variance
-        if self.snr_db is not None:
-            variance = _variance_at(self.snr_db, noise_free)
-        assert variance is not None
+        if (variance := getattr(self, "innovation_variance", None)) is not None:
+            return float(variance)
+        if (deviation := getattr(self, "standard_deviation", None)) is not None:
+            return float(deviation**2)
+        variance = self.variance if self.snr_db is None else _variance_at(self.snr_db, noise_free)
+        assert variance is not None  # one level is always given
         return variance / self._unit_variance
 
     def variance_of(self, noise_free: Array | None = None) -> float:
@@ -233,12 +226,9 @@ class WhiteNoise(Noise):
     kind: ClassVar[str] = "white"
     coloured: ClassVar[bool] = False
 
-    snr_db: float | None = None
-    standard_deviation: float | None = None
-    variance: float | None = None
-
-    def __post_init__(self) -> None:
-        self._require_one_level()
+    snr_db: Decibels = None
+    standard_deviation: Annotated[float, require_not_negative, "output unit"] | None = None
+    variance: Variance = None
 
 
 @dataclass(frozen=True)
@@ -287,9 +277,9 @@ class ArmaNoise(Noise):
 
     numerator: tuple[float, ...]
     denominator: tuple[float, ...]
-    innovation_variance: float | None = None
-    variance: float | None = None
-    snr_db: float | None = None
+    innovation_variance: Variance = None
+    variance: Variance = None
+    snr_db: Decibels = None
 
     def __post_init__(self) -> None:
         for name in ("numerator", "denominator"):
@@ -305,16 +295,12 @@ class ArmaNoise(Noise):
         if largest >= 1.0:
             why = f"denominator has a zero of magnitude {largest:.6g}: the noise would grow without bound"
             raise OptionError("denominator", f"{why}; all must lie inside the unit circle.")
-        self._require_one_level()
+        super().__post_init__()
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
         return self.numerator, self.denominator
-
-    @property
-    def _given_innovation_variance(self) -> float | None:
-        return self.innovation_variance
 
 
 def _variance_at(snr_db: float, noise_free: Array | None) -> float:

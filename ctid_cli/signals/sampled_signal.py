@@ -10,15 +10,10 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, require_positive, require_scale, require_steps
-from ctid_cli.signals.measurement import no_sample, open_table
+from ctid_cli.signals.measurement import open_table
 from ctid_cli.signals.sound import is_sound, read_sound
-from ctid_cli.signals.table import USUAL_NAMES, Columns, Table, split_header
+from ctid_cli.signals.table import Columns, Table, split_header
 
-#: Names by which the signal is recognised when nobody says which column it is, the most telling first.
-SIGNAL_NAMES = (
-    *("y", "signal", "output", "value", "values", "x"),
-    *("amplitude", "data", "audio", "sound", "wave", "voltage"),
-)
 #: An instant may lie so many sampling intervals beside the grid.
 CLOCK_TOLERANCE = 0.01
 #: A record with more samples missing between its lines than this many times those it has is not on one grid.
@@ -81,87 +76,54 @@ def read_sampled_signal(
     """Read a signal from a text, MATLAB, HDF5 or sound file."""
     if interval is not None:
         require_positive("interval", interval, "s")
-    notes: list[str] = []
     if is_sound(path):
-        table, rate, note = read_sound(path)
-        interval = 1.0 / rate if interval is None else interval
-        notes.append(note)
+        table, rate = read_sound(path)
+        interval, signal = interval or 1.0 / rate, signal or table.names[0]
     else:
         table = open_table(path)
-    times, column, more = _columns(table, time, signal, interval is not None)
-    name, unit = split_header(column)
-    clocked = interval is None and times is not None
-    try:
-        columns = table.read([column, *filter(None, [times if clocked else None])])
-    except DataError as error:
-        if not clocked:
-            raise
-        table.read([column])  # says what is wrong with the signal itself
-        raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
-    notes += [*table.notes, *columns.notes, *more]
-    values = columns.values[column]
-    infinite = np.isinf(values)
-    if infinite.any():
-        values = np.where(infinite, np.nan, values)
+    columns = _selected(table, time, signal, without_times=interval is not None)
+    column, times = columns.names["signal"], columns.names.get("time")
+    values, notes, first = columns.values["signal"], list(columns.notes), 0.0
     time_unit: str | None = "s"
-    if interval is None and times is not None:
-        time_unit = split_header(times)[1]
-        clock = columns.values[times]
-        if clock.size == 1 and values.size > 1:
-            interval, first, time_unit = columns.lone_interval(times), 0.0, time_unit or "s"
-            notes.append(f"{times!r} is one number and was taken as the sampling interval.")
-        else:
-            columns.require_as_many(times, clock, column)
-            values, interval, note = _on_grid(columns, times, clock, values, time_unit or "s")
-            first = float(clock[0])
-            notes += [note] if note else []
-    else:
-        first = 0.0
-        if times is not None:
-            notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
-            times = None
-    assert interval is not None  # every way above has set it
+    if np.isinf(values).any():
+        values = np.where(np.isinf(values), np.nan, values)
+    if interval is None:
+        time_unit, first = columns.unit("time"), float(columns.values["time"][0])
+        values, interval, missing = _on_grid(columns, values, time_unit or "s")
+        notes += missing
+    elif times is not None:
+        notes.append(f"The times {times!r} are not used, since the sampling interval was given.")
+        times = None
     require_steps(f"{table.file}: the clock", np.array([0.0, interval]))
     require_scale(f"{table.file}: the clock", np.array([interval]), LONGEST)
-    low, high = _window(table, first, interval, values.size, start, stop, time_unit or "s")
-    values = values[low:high]
+    used = slice(0, values.size)
+    if start is not None or stop is not None:
+        instants = first + interval * np.arange(values.size, dtype=float)
+        used = columns.window(instants, start, stop, 1e-6 * interval)
+    values = values[used]
     if not np.isfinite(values).any():
         raise DataError(f"{table.file}: no sample of {column!r} is a finite number")
     require_scale(f"{table.file}: the signal {column!r}", values)
-    begin = first + low * interval
+    name, unit = split_header(column)
+    begin = first + used.start * interval
     return SampledSignal(values, interval, begin, table.file, name, times, time_unit, unit, tuple(notes))
 
 
-def _columns(table: Table, time: str | None, signal: str | None, clocked: bool) -> tuple[str | None, str, list[str]]:
-    """Columns of the times and of the signal, and what was assumed."""
-    times = table.named(time) if time is not None else _usual(table, USUAL_NAMES["time"], signal)
-    if times is None and not clocked:
-        ways = "Say which one holds the times (--time), or give the clock (--interval SECONDS or --rate HERTZ)"
-        raise DataError(f"{table.head}: no {table.noun} is called 't' or 'time'; {table.listing}. {ways}")
-    column = table.named(signal) if signal is not None else _usual(table, SIGNAL_NAMES, times)
-    left = [name for name in table.names if name != times]
-    notes = []
-    if column is None:
-        if len(left) != 1 and table.noun != "channel":
-            which = f"{table.listing}. Say which one is the signal (--signal)"
-            raise DataError(f"{table.head}: no {table.noun} is called 'y' or 'signal'; {which}")
-        column = left[0]
-    if column == times:
-        raise DataError(f"{table.head}: {column!r} cannot be both the time and the signal")
-    unused = [name for name in left if name != column]
-    if unused and table.is_text:
-        notes.append(f"Not used: {', '.join(map(repr, unused))}.")
-    return times, column, notes
+def _selected(table: Table, time: str | None, signal: str | None, *, without_times: bool) -> Columns:
+    """Read the signal, and its times if they are not known otherwise."""
+    asked = {"time": time, "signal": signal}
+    try:
+        return table.select(asked, without_times=without_times)
+    except DataError as error:
+        if without_times:
+            raise
+        table.select(asked | {"time": None}, without_times=True)  # says what is wrong with the signal itself
+        raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
 
 
-def _usual(table: Table, usual: tuple[str, ...], taken: str | None) -> str | None:
-    found = [name for word in usual for name in table.names if table.leaf(name).lower() == word]
-    return next((name for name in found if taken not in (name, table.leaf(name))), None)
-
-
-def _on_grid(columns: Columns, name: str, t: Array, values: Array, unit: str) -> tuple[Array, float, str]:
-    """Samples at all instants of the grid that the times lie on, its interval, and a note on what is missing."""
-    columns.check_times(name, t, unit)
+def _on_grid(columns: Columns, values: Array, unit: str) -> tuple[Array, float, list[str]]:
+    """Return samples at all instants of the grid that the times lie on, its interval, and notes on what is missing."""
+    t = columns.values["time"]
     if t.size < 2:
         raise DataError(f"{columns.file}: one sample has no frequency")
     steps = np.diff(t)
@@ -179,10 +141,11 @@ def _on_grid(columns: Columns, name: str, t: Array, values: Array, unit: str) ->
         some = f"of {places[-1] + 1:.6g} instants of a clock of {interval:.6g} {unit} the file has only {t.size}"
         raise DataError(f"{columns.file}: {some}; use a part with fewer gaps (--from, --to), or resample the record")
     if places[-1] + 1 == t.size:
-        return values, interval, ""
+        return values, interval, []
     filled = np.full(int(places[-1]) + 1, np.nan)
     filled[places.astype(np.int64)] = values
-    return filled, interval, f"The times leave out {filled.size - t.size} instants of the clock; they count as missing."
+    left_out = f"The times leave out {filled.size - t.size} instants of the clock; they count as missing."
+    return filled, interval, [left_out]
 
 
 def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:
@@ -191,14 +154,3 @@ def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:
     # The grid that fits all instants best in the sense of its two ends.
     interval = float((t[-1] - t[0]) / places[-1])
     return places, interval, np.abs(t - (t[0] + places * interval))
-
-
-def _window(
-    table: Table, first: float, interval: float, count: int, start: float | None, stop: float | None, unit: str
-) -> tuple[int, int]:
-    low = 0 if start is None else int(np.ceil(np.clip((start - first) / interval - 1e-6, 0.0, count)))
-    high = count if stop is None else int(np.floor(np.clip((stop - first) / interval + 1e-6, -1.0, count - 1))) + 1
-    if low >= high:
-        window = (-np.inf if start is None else start, np.inf if stop is None else stop)
-        raise no_sample(table, *window, first, first + (count - 1) * interval, unit)
-    return low, high

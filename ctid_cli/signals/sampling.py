@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, get_args
+from functools import partial
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from ctid_cli.signals import checks
 from ctid_cli.signals.measurement import read_instants
 
 InputRecord = Literal["sampled", "exact"]
+#: Number of samples of a record.
+Samples = Annotated[int, checks.require_integer, 2]
 
 
 def geometric_sizes(first: int, last: int, count: int) -> list[int]:
@@ -64,16 +67,11 @@ class Sampling(ABC):
 
 
 @dataclass(frozen=True)
-class OfInterval(Sampling):
+class OfInterval(checks.Checked, Sampling):
     """What schemes have in common that are given by an interval, of a clock or on average."""
 
-    interval: float
-    samples: int = field(metadata={"geometric": True})
-
-    def __post_init__(self) -> None:
-        checks.require_positive("interval", self.interval, "s")
-        checks.require_integer("samples", self.samples, 2)
-        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
+    interval: Annotated[float, checks.require_positive, "s"]
+    samples: Samples = field(metadata={"geometric": True})
 
     @property
     def mean_interval(self) -> float:
@@ -114,7 +112,7 @@ class RegularSampling(OfInterval):
 
 
 @dataclass(frozen=True)
-class UniformIntervals(Sampling):
+class UniformIntervals(checks.Checked, Sampling):
     """Samples at independent random intervals, each uniform between two bounds, from 0 s.
 
     Parameters
@@ -137,18 +135,15 @@ class UniformIntervals(Sampling):
 
     kind: ClassVar[str] = "uniform_intervals"
 
-    low: float
-    high: float
-    samples: int = field(metadata={"geometric": True})
+    low: Annotated[float, checks.require_positive, "s"]
+    high: Annotated[float, checks.require_positive, "s"]
+    samples: Samples = field(metadata={"geometric": True})
     input_record: InputRecord = "exact"
 
     def __post_init__(self) -> None:
-        checks.require_positive("low", self.low, "s")
-        checks.require_positive("high", self.high, "s")
+        super().__post_init__()
         if self.low > self.high:
             raise OptionError("low", f"low must not exceed high; they are {self.low:g} s and {self.high:g} s.")
-        checks.require_integer("samples", self.samples, 2)
-        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
 
     @property
     def mean_interval(self) -> float:
@@ -182,12 +177,8 @@ class IrregularSampling(OfInterval):
 
     kind: ClassVar[str] = "irregular"
 
-    spread: float = 0.5
+    spread: Annotated[float, partial(checks.require_share, whole=False)] = 0.5
     input_record: InputRecord = "exact"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.require_share("spread", self.spread, whole=False)
 
     def times(self, rng: np.random.Generator) -> Array:
         """Return instants at intervals that are drawn."""
@@ -218,12 +209,11 @@ class JitteredSampling(OfInterval):
 
     kind: ClassVar[str] = "jitter"
 
-    largest_shift: float
+    largest_shift: Annotated[float, checks.require_not_negative, "s"]
     input_record: InputRecord = "exact"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.require_not_negative("largest_shift", self.largest_shift, "s")
         if self.largest_shift >= 0.5 * self.interval:
             most = f"half the interval, {0.5 * self.interval:g} s; it is {self.largest_shift:g} s"
             raise OptionError("largest_shift", f"largest_shift must be less than {most}: samples would change places.")
@@ -236,7 +226,7 @@ class JitteredSampling(OfInterval):
         return ticks
 
 
-class GivenInstants(Sampling):
+class GivenInstants(checks.Checked, Sampling):
     """Samples at instants that are known before any data are made; the record begins at the first of them."""
 
     kind: ClassVar[str] = "irregular"
@@ -284,9 +274,6 @@ class InstantsFile(GivenInstants):
     time: str = "t"
     sha256: str | None = None
     input_record: InputRecord = "exact"
-
-    def __post_init__(self) -> None:
-        checks.require_choice("input_record", self.input_record, get_args(InputRecord))
 
     def times(self, rng: np.random.Generator) -> Array:
         """Return the instants of the file; nothing is drawn."""

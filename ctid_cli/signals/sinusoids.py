@@ -1,14 +1,14 @@
 """Sums of sinusoids whose frequencies and amplitudes may step, and what disturbs them."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, cast, get_args
+from typing import Annotated, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import OptionError
-from ctid_cli.signals.checks import require_choice, require_finite, require_positive
+from ctid_cli.signals.checks import Checked, require_finite, require_positive
 from ctid_cli.signals.held import COINCIDENCE
 from ctid_cli.signals.noise import Noise
 
@@ -31,8 +31,26 @@ class Piece:
     until: float | None = None
 
 
+def _require_course(name: str, course: float | tuple[Piece, ...], unit: str, label: str = "") -> None:
+    """Refuse values that are not positive, and pieces that do not follow one another."""
+    if not isinstance(course, tuple):
+        require_positive(name, course, unit)
+        return
+    if not course:
+        raise OptionError(name, f"{name} must hold at least one piece.")
+    for piece in course:
+        require_positive(name, piece.value, unit, label=f"the value of a piece of {name}")
+    *ends, last = (piece.until for piece in course)
+    if last is not None or None in ends:
+        raise OptionError(name, f"every piece of {name} but the last needs 'until' [s], and the last has none.")
+    for end in ends:
+        require_positive(name, cast(float, end), "s", label=f"'until' of a piece of {name}")
+    if (np.diff(_ends(course)) <= 0).any():
+        raise OptionError(name, f"the pieces of {name} must follow one another; their ends are {ends} s.")
+
+
 @dataclass(frozen=True)
-class Tone:
+class Tone(Checked):
     """One sinusoid.
 
     Parameters
@@ -50,18 +68,13 @@ class Tone:
         If a value is not positive, or the pieces do not follow one another.
     """
 
-    frequency: float | tuple[Piece, ...]
-    amplitude: float | tuple[Piece, ...] = 1.0
-    phase: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, unit in (("frequency", "rad/s"), ("amplitude", "signal unit")):
-            _check_course(name, getattr(self, name), unit)
-        require_finite("phase", self.phase, "rad")
+    frequency: Annotated[float | tuple[Piece, ...], _require_course, "rad/s"]
+    amplitude: Annotated[float | tuple[Piece, ...], _require_course, "signal unit"] = 1.0
+    phase: Annotated[float, require_finite, "rad"] = 0.0
 
 
 @dataclass(frozen=True)
-class SumOfSinusoids:
+class SumOfSinusoids(Checked):
     r"""A sum of sinusoids and a constant.
 
     Parameters
@@ -94,14 +107,13 @@ class SumOfSinusoids:
     """
 
     tones: tuple[Tone, ...]
-    bias: float = 0.0
+    bias: Annotated[float, require_finite, "signal unit"] = 0.0
     phase_at_steps: PhaseAtSteps = "continuous"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.tones:
             raise OptionError("tones", "tones must hold at least one sinusoid.")
-        require_finite("bias", self.bias, "signal unit")
-        require_choice("phase_at_steps", self.phase_at_steps, get_args(PhaseAtSteps))
         instants = [0.0, *self.frequency_steps]
         for instant, row in zip(instants, self.frequencies_at(instants), strict=True):
             if (np.diff(row) == 0.0).any():
@@ -141,7 +153,7 @@ class SumOfSinusoids:
 
 
 @dataclass(frozen=True)
-class UniformDisturbance:
+class UniformDisturbance(Checked):
     """Independent samples, uniform between two bounds of one size.
 
     Parameters
@@ -157,10 +169,7 @@ class UniformDisturbance:
 
     kind: ClassVar[str] = "uniform"
 
-    half_width: float
-
-    def __post_init__(self) -> None:
-        require_positive("half_width", self.half_width, "signal unit")
+    half_width: Annotated[float, require_positive, "signal unit"]
 
     def generate(self, undisturbed: Array, rng: np.random.Generator) -> Array:
         """Draw the disturbance of one record; of the signal only the length matters."""
@@ -168,7 +177,7 @@ class UniformDisturbance:
 
 
 @dataclass(frozen=True)
-class SineDisturbance:
+class SineDisturbance(Checked):
     """One more sinusoid, whose frequency is not estimated.
 
     Parameters
@@ -190,14 +199,9 @@ class SineDisturbance:
     #: No random number is drawn.
     deterministic: ClassVar[bool] = True
 
-    amplitude: float
-    frequency: float
-    phase: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_positive("amplitude", self.amplitude, "signal unit")
-        require_positive("frequency", self.frequency, "rad/s")
-        require_finite("phase", self.phase, "rad")
+    amplitude: Annotated[float, require_positive, "signal unit"]
+    frequency: Annotated[float, require_positive, "rad/s"]
+    phase: Annotated[float, require_finite, "rad"] = 0.0
 
     def at(self, times: ArrayLike) -> Array:
         """Return the disturbance at some instants [signal unit]."""
@@ -216,30 +220,12 @@ def disturb(signal: Array, times: Array, disturbance: Disturbance | None, rng: n
     return signal + disturbance.generate(signal, rng)
 
 
-def _check_course(name: str, course: float | tuple[Piece, ...], unit: str) -> None:
-    if not isinstance(course, tuple):
-        require_positive(name, course, unit)
-        return
-    if not course:
-        raise OptionError(name, f"{name} must hold at least one piece.")
-    for piece in course:
-        require_positive(name, piece.value, unit, label=f"the value of a piece of {name}")
-    *ends, last = (piece.until for piece in course)
-    if last is not None or None in ends:
-        raise OptionError(name, f"every piece of {name} but the last needs 'until' [s], and the last has none.")
-    for end in ends:
-        require_positive(name, cast(float, end), "s", label=f"'until' of a piece of {name}")
-    if (np.diff(_ends(course)) <= 0).any():
-        raise OptionError(name, f"the pieces of {name} must follow one another; their ends are {ends} s.")
-
-
 def _values(course: float | tuple[Piece, ...]) -> Array:
     return np.array([piece.value for piece in course] if isinstance(course, tuple) else [course], dtype=float)
 
 
 def _ends(course: float | tuple[Piece, ...]) -> Array:
-    pieces = course if isinstance(course, tuple) else ()
-    return np.array([piece.until for piece in pieces if piece.until is not None], dtype=float)
+    return np.array([piece.until for piece in course[:-1]] if isinstance(course, tuple) else [], dtype=float)
 
 
 def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:

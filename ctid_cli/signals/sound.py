@@ -19,8 +19,8 @@ def is_sound(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() in SOUNDS
 
 
-def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
-    """Return the channels of a sound file as fractions of full scale, its sampling rate [Hz], and a note."""
+def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float]:
+    """Return the channels of a sound file as fractions of full scale, and its sampling rate [Hz]."""
     file = require_file(path)
     try:
         import soundfile
@@ -30,7 +30,7 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
     try:
         with soundfile.SoundFile(os.fspath(path)) as sound:
             rate, channels = sound.samplerate, sound.channels
-            require_values(file, "samples", sound.frames * channels)
+            require_values(f"{file}: 'samples'", sound.frames * channels)
             samples = sound.read(dtype="float64", always_2d=True)
     except (soundfile.SoundFileError, ValueError, RuntimeError):
         form = Path(path).suffix[1:].upper()
@@ -45,4 +45,4 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float, str]:
     note = f"Sound of {rate} Hz; amplitudes are fractions of full scale."
     if channels > 1:
         note += f" The first of {channels} channels is used unless --signal names another."
-    return Table(file, names, read, head=file, noun="channel"), float(rate), note
+    return Table(file, names, read, head=file, noun="channel", notes=(note,)), float(rate)

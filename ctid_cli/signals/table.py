@@ -1,8 +1,9 @@
-"""Named columns of numbers, whatever file they come from, and the checks that make a record of three of them."""
+"""Named columns of numbers, whatever file they come from, and the checks that make a record or a signal of them."""
 
+import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal, NoReturn, get_args
 
 import numpy as np
@@ -11,20 +12,25 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, require_scale, require_steps
 from ctid_cli.signals.files import MAX_NAMES, quoted
-from ctid_cli.text import closest
+from ctid_cli.text import closest, listed
 
 Role = Literal["time", "input", "output"]
 
+#: Roles of the columns of a record. A signal has a time and a signal; a record of a loop has a reference too.
 ROLES: tuple[Role, ...] = get_args(Role)
 
 #: Names by which a column is recognised when nobody says which one it is, the most telling first; case is ignored.
-USUAL_NAMES: dict[Role, tuple[str, ...]] = {
+USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("t", "time", "times", "seconds", "timestamp", "samplinginstants", "ts", "sampletime"),
     "input": ("u", "input", "inputs", "inputdata"),
     "output": ("y", "output", "outputs", "outputdata"),
+    "signal": (
+        *("y", "signal", "output", "value", "values", "x"),
+        *("amplitude", "data", "audio", "sound", "wave", "voltage"),
+    ),
 }
 #: Names whose unit may stand behind a slash; elsewhere the slash is part of the name.
-BEFORE_SLASH = {name for names in USUAL_NAMES.values() for name in names}
+BEFORE_SLASH = {name for role in ROLES for name in USUAL_NAMES[role]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,64 +38,89 @@ class Columns:
     """Columns of numbers that were read, and the lines that they come from in a text file."""
 
     file: str
+    #: Numbers by the name of their column, or by its role once roles are known.
     values: Mapping[str, Array]
     lines: Sequence[int] | None = None
     notes: tuple[str, ...] = ()
+    #: Names by roles, also of times that are known otherwise and not read.
+    names: Mapping[str, str] = field(default_factory=dict)
 
-    def row(self, k: int) -> str:
-        """Return the name of a row."""
-        return f"sample {k + 1}" if self.lines is None else f"line {self.lines[k]}"
+    def unit(self, role: str) -> str | None:
+        """Return the unit in the header of a column."""
+        return split_header(self.names[role])[1]
 
     def place(self, k: int) -> str:
         """Return the place of a row, for the beginning of a message."""
         return f"{self.file}: sample {k + 1}" if self.lines is None else f"{self.file}:{self.lines[k]}"
 
-    def lone_interval(self, name: str) -> float:
-        """Return the one number that stands for all times."""
-        value = float(self.values[name][0])
-        if not (np.isfinite(value) and value > 0):
-            raise DataError(f"{self.file}: {name!r} is {value:g}; a sampling interval must be a positive number")
-        require_steps(f"{self.file}: the sampling interval {name!r}", np.array([0.0, value]))
-        return value
+    def timed(self) -> "Columns":
+        """Return the columns with an instant for each row; one number in their place is the sampling interval."""
+        main = next(role for role in ("output", "signal", "input", "time") if role in self.values)
+        t, size = self.values["time"], self.values[main].size
+        name, unit = self.names["time"], self.unit("time") or "s"
+        found = self
+        if t.size == 1 < size:
+            interval = float(t[0])
+            if not (np.isfinite(interval) and interval > 0):
+                raise DataError(f"{self.file}: {name!r} is {interval:g}; a sampling interval must be a positive number")
+            require_steps(f"{self.file}: the sampling interval {name!r}", np.array([0.0, interval]))
+            taken = f"{name!r} is one number: it was taken as the sampling interval"
+            note = f"{taken}, {interval:g} {unit}, from 0 {unit} on."
+            times = {"time": interval * np.arange(size, dtype=float)}
+            found = replace(self, values={**self.values, **times}, notes=(*self.notes, note))
+        for role, values in found.values.items():
+            if values.size != size:
+                sizes = f"{self.names[role]!r} has {values.size} values and {self.names[main]!r} has {size}"
+                raise DataError(f"{self.file}: {sizes}; they must be equally many")
+        found._check_times(f"time {name!r}", unit)
+        return found
 
-    def require_as_many(self, name: str, t: Array, other: str) -> None:
-        """Refuse two columns of different lengths."""
-        if t.size != self.values[other].size:
-            sizes = f"{name!r} has {t.size} values and {other!r} has {self.values[other].size}"
-            raise DataError(f"{self.file}: {sizes}; they must be equally many")
-
-    def check_times(self, name: str, t: Array, unit: str = "s") -> Array:
+    def _check_times(self, what: str, unit: str) -> None:
         """Refuse instants that are missing or do not increase."""
-        every = "sample" if self.lines is None else "line"
-        self._refuse(
-            ~np.isfinite(t), f"time {name!r} is missing or not finite; every {every} needs its instant [{unit}]"
-        )
-        self._require_scale(f"time {name!r}", t, 0, LONGEST)
+        t, every = self.values["time"], "sample" if self.lines is None else "line"
+        self._refuse(~np.isfinite(t), f"{what} is missing or not finite; every {every} needs its instant [{unit}]")
+        self._require_scale(what, t, 0, LONGEST)
         steps = np.diff(t)
-        k = int(np.argmax(steps <= 0)) if steps.size else 0
-        if steps.size and steps[k] <= 0:
+        if not steps.size:
+            return
+        k = int(np.argmax(steps <= 0))
+        if steps[k] <= 0:
+            row = f"sample {k + 1}" if self.lines is None else f"line {self.lines[k]}"
             how = "repeats" if steps[k] == 0 else "goes back to"
-            found = f"{t[k + 1]:.12g} {unit} after {t[k]:.12g} {unit} on {self.row(k)}"
-            raise DataError(f"{self.place(k + 1)}: time {name!r} {how} {found}; times must increase strictly")
-        if steps.size:
-            require_steps(f"{self.place(int(np.argmin(steps)) + 1)}: time {name!r}", t)
-        return t
+            found = f"{how} {t[k + 1]:.12g} {unit} after {t[k]:.12g} {unit} on {row}"
+            raise DataError(f"{self.place(k + 1)}: {what} {found}; times must increase strictly")
+        require_steps(f"{self.place(int(np.argmin(steps)) + 1)}: {what}", t)
 
-    def check_input(self, name: str, u: Array, first: int = 0, role: str = "input") -> Array:
-        """Refuse an input with gaps: the system responds to its input whether or not that was recorded."""
-        self._refuse(~np.isfinite(u), f"{role} {name!r} is missing or not finite; only the output may have gaps", first)
-        self._require_scale(f"{role} {name!r}", u, first)
+    def input(self, used: slice = slice(0, None), role: str = "input") -> Array:
+        """Return an input without gaps: the system responds to its input whether or not that was recorded."""
+        u, what = self.values[role][used], f"{role} {self.names[role]!r}"
+        self._refuse(~np.isfinite(u), f"{what} is missing or not finite; only the output may have gaps", used.start)
+        self._require_scale(what, u, used.start)
         return u
 
-    def check_output(self, name: str, y: Array, first: int = 0) -> Array:
-        """Refuse an output that is infinite somewhere or missing everywhere."""
-        self._refuse(
-            np.isinf(y), f"output {name!r} is infinite; leave the field empty where a sample is missing", first
-        )
+    def output(self, used: slice) -> Array:
+        """Return an output that is nowhere infinite and not missing everywhere."""
+        y, what = self.values["output"][used], f"output {self.names['output']!r}"
+        self._refuse(np.isinf(y), f"{what} is infinite; leave the field empty where a sample is missing", used.start)
         if not np.isfinite(y).any():
-            raise DataError(f"{self.place(first)}: no sample of the output {name!r} is a finite number")
-        self._require_scale(f"output {name!r}", y, first)
+            raise DataError(f"{self.place(used.start)}: no sample of the {what} is a finite number")
+        self._require_scale(what, y, used.start)
         return y
+
+    def window(self, t: Array, start: float | None, stop: float | None, slack: float = 0.0) -> slice:
+        """Return the rows between two instants, up to some slack."""
+        unit = (self.unit("time") if "time" in self.values else None) or "s"
+        low, high = -np.inf if start is None else start, np.inf if stop is None else stop
+        if not low < high:
+            raise DataError(f"{self.file}: the window from {low:g} to {high:g} {unit} ends before it begins")
+        first = int(np.searchsorted(t, low - slack, side="left"))
+        last = int(np.searchsorted(t, high + slack, side="right"))
+        if first >= last:
+            where = f"between {low:g} and {high:g}" if np.isfinite([low, high]).all() else f"after {low:g}"
+            where = f"before {high:g}" if np.isinf(low) else where
+            runs = f"the record runs from {t[0]:.9g} to {t[-1]:.9g} {unit}"
+            raise DataError(f"{self.file}: no sample lies {where} {unit}; {runs}")
+        return slice(first, last)
 
     def _refuse(self, wrong: BoolArray, message: str, first: int = 0) -> None:
         """Refuse a column that is wrong somewhere, and name the first row where it is."""
@@ -120,39 +151,122 @@ class Table:
     is_text: bool = False
     notes: tuple[str, ...] = ()
 
+    def select(
+        self, asked: Mapping[str, str | None], *, without_times: bool = False, in_seconds: bool = False
+    ) -> Columns:
+        """Read the column of each role: that which is asked for, or else that which its name or its place tells.
+
+        Where times must be in seconds, a column that is labelled with another unit is refused unless it is named with
+        that unit. Without times, their column is found but not read, and may be absent.
+        """
+        chosen, notes = self._choose(asked, ("time",) if without_times else ())
+        if in_seconds:
+            self._require_seconds(chosen["time"], asked["time"])
+        read = {role: name for role, name in chosen.items() if not (without_times and role == "time")}
+        columns = self.read(list(read.values()))
+        values = {role: columns.values[name] for role, name in read.items()}
+        columns = replace(columns, values=values, names=chosen, notes=(*self.notes, *columns.notes, *notes))
+        return columns if without_times else columns.timed()
+
+    def _choose(self, asked: Mapping[str, str | None], optional: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+        """Return the column of each role, and what was assumed."""
+        # A reference has no usual names: it is only taken where it is named.
+        roles = [role for role in asked if role in USUAL_NAMES]
+        chosen = {role: self.named(wanted) for role in roles if (wanted := asked[role]) is not None}
+        for role in roles:
+            if role not in chosen and (name := self._recognised(role, chosen, sure=role not in optional)):
+                chosen[role] = name
+        notes = self._take_by_position(chosen, [role for role in roles if role in chosen or role not in optional])
+        chosen |= {role: self.named(wanted) for role, wanted in asked.items() if role not in roles and wanted}
+        for one, other in itertools.combinations(filter(chosen.get, asked), 2):
+            if chosen[one] == chosen[other]:
+                raise DataError(f"{self.head}: {chosen[one]!r} cannot be both the {one} and the {other}")
+        unused = [repr(name) for name in self.names if name not in chosen.values()]
+        if unused and self.is_text:
+            words = ("Column", "is") if len(unused) == 1 else ("Columns", "are")
+            notes.append(f"{words[0]} {listed(unused)} {words[1]} not used.")
+        return chosen, notes
+
     def named(self, wanted: str) -> str:
         """Return the column whose header is ``wanted``, with or without its unit."""
         matching = [name for name in self.names if name == wanted]
         matching = matching or [name for name in self.names if split_header(name)[0] == wanted]
-        self.require_single(matching)
-        if len(matching) != 1:
-            self._refuse_missing(wanted)
-        return matching[0]
+        self._require_single(matching)
+        if len(matching) == 1:
+            return matching[0]
+        parts = [f"{self.head}: there is no {self.noun} {wanted!r}; {self._listing}"]
+        if close := closest(wanted, self.names):
+            parts.append(f"Did you mean {close!r}?")
+        raise DataError(". ".join(filter(None, [*parts, self.hint])))
 
-    def leaf(self, name: str) -> str:
-        """Return a name without its unit, and without the struct that it belongs to."""
-        bare = split_header(name)[0]
-        return bare if self.is_text else bare.rpartition(".")[2]
+    def _recognised(self, role: str, chosen: Mapping[str, str], *, sure: bool) -> str | None:
+        """Return the column with the most telling of the usual names of a role; of several the first, unless sure."""
+        for usual in USUAL_NAMES[role]:
+            matching = self._called((usual,), chosen)
+            # What lies in the same struct as the columns that are known belongs to them.
+            homes = {name.rpartition(".")[0] for name in chosen.values()}
+            close = [name for name in matching if not self.is_text and name.rpartition(".")[0] in homes]
+            matching = close or matching
+            self._require_single(matching if sure else ())
+            if len(matching) > 1 and sure:
+                several = listed(map(repr, matching))
+                raise DataError(f"{self.head}: {several} may all be the {role}; say which one (option {role})")
+            if matching:
+                return matching[0]
+        return None
 
-    def require_single(self, names: Sequence[str]) -> None:
+    def _called(self, usual: Sequence[str], chosen: Mapping[str, str]) -> list[str]:
+        """Return the columns that are not taken yet and have a usual name, without their unit and their struct."""
+        bare = {name: split_header(name)[0] for name in self.names if name not in chosen.values()}
+        leaves = {name: text if self.is_text else text.rpartition(".")[2] for name, text in bare.items()}
+        return [name for name in self.names if leaves.get(name, "").lower() in usual]
+
+    def _take_by_position(self, chosen: dict[str, str], roles: Sequence[str]) -> list[str]:
+        """Take the columns of the roles that are still open in their order, where no name contradicts; say so."""
+        missing = [role for role in roles if role not in chosen]
+        if not missing:
+            return []
+        left = [name for name in self.names if name not in chosen.values()]
+        # A column with a usual name is not put in another place than its name says.
+        contradicts = any(self._called(USUAL_NAMES[role], chosen) for role in roles)
+        ordered = self.is_text or missing == ["signal"]
+        if not ordered or len(self.names) != len(roles) or len(left) != len(missing) or contradicts:
+            self._refuse_unrecognised(missing[0], chosen, roles)
+        chosen.update(zip(missing, left, strict=True))
+        taken = [f"{chosen[role]!r} as the {role}" for role in missing]
+        return [f"Columns were taken by their position: {listed(taken)}."]
+
+    def _refuse_unrecognised(self, role: str, chosen: Mapping[str, str], roles: Sequence[str]) -> NoReturn:
+        if len(self.names) < len(roles) and not self.hint:
+            needs = "a record needs a time, an input and an output" if "output" in roles else "a signal needs its times"
+            raise DataError(f"{self.head}: {self._listing} and nothing else; {needs}")
+        left = [name for name in self.names if name not in chosen.values()]
+        usual = " or ".join(map(repr, USUAL_NAMES[role][:2]))
+        other = "other " if self._called(USUAL_NAMES[role], {}) else ""
+        close = next((match for name in USUAL_NAMES[role][1:] if (match := closest(name, left))), None)
+        meant = f"; did you mean {close!r}?" if close else ""
+        message = f"{self.head}: no {other}{self.noun} is called {usual}; {self._listing}"
+        parts = [message, f"Say which one is the {role} (option {role}){meant}", self.hint]
+        raise DataError(". ".join(filter(None, parts)))
+
+    def _require_seconds(self, name: str, asked: str | None) -> None:
+        unit = split_header(name)[1]
+        if unit not in (None, "s", "sec", "seconds") and asked != name:
+            wrong = f"the time {name!r} is in {unit}, and seconds are expected"
+            raise DataError(f"{self.head}: {wrong}; convert the column, or name it {name!r} to count in {unit}")
+
+    def _require_single(self, names: Sequence[str]) -> None:
         """Refuse columns that have one name."""
         if len(names) > 1 and len(set(names)) == 1:
             raise DataError(f"{self.head}: {len(names)} columns are called {names[0]!r}; rename all but one")
 
     @property
-    def listing(self) -> str:
+    def _listing(self) -> str:
         """The columns of the file, for messages."""
         if not self.names:
             return f"the file has no {self.noun} of numbers"
         more = f" and {len(self.names) - MAX_NAMES} more" if len(self.names) > MAX_NAMES else ""
         return f"the file has {', '.join(map(quoted, self.names[:MAX_NAMES]))}{more}"
-
-    def _refuse_missing(self, wanted: str) -> NoReturn:
-        """Say which columns there are in place of one that there is not."""
-        parts = [f"{self.head}: there is no {self.noun} {wanted!r}; {self.listing}"]
-        if close := closest(wanted, self.names):
-            parts.append(f"Did you mean {close!r}?")
-        raise DataError(". ".join(filter(None, [*parts, self.hint])))
 
 
 def split_header(header: str) -> tuple[str, str | None]:

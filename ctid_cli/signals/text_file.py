@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -46,6 +47,8 @@ NO_TEXT = "this is not a text file; records are read from text (.csv, .txt), MAT
 class Layout:
     """How a file is written, its columns, and the lines of their names and of the first sample."""
 
+    path: str | os.PathLike[str]
+    file: str
     encoding: str
     separator: str
     decimal: str
@@ -54,17 +57,21 @@ class Layout:
     first: int
     notes: tuple[str, ...]
 
+    def opened(self) -> io.TextIOBase:
+        """Open the file at its first sample."""
+        # What cannot be decoded there can be no number, and need not be one where it is not used.
+        text = open(self.path, encoding=self.encoding, errors="replace", newline="")  # noqa: SIM115
+        for _ in range(self.first - 1):
+            text.readline()
+        return text
+
 
 def read_text_table(path: str | os.PathLike[str]) -> Table:
     """Open a text file with one line per instant, whose first line names the columns."""
-    file = require_file(path, EMPTY)
-    layout = _layout(path, file)
-
-    def read(names: Sequence[str]) -> Columns:
-        return _read_columns(path, file, layout, names)
-
-    head = f"{file}:{layout.header}"
-    return Table(file, tuple(filter(None, layout.columns)), read, head=head, is_text=True, notes=layout.notes)
+    layout = _layout(path, require_file(path, EMPTY))
+    names = tuple(filter(None, layout.columns))
+    head = f"{layout.file}:{layout.header}"
+    return Table(layout.file, names, partial(_read_columns, layout), head=head, is_text=True, notes=layout.notes)
 
 
 # --- the first lines ------------------------------------------------------------------------------
@@ -73,30 +80,27 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
 def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     """Find out how a file is written."""
     text, encoding = _head(path, file)
-    comments, content = [], []
+    comments: list[tuple[int, str]] = []
+    content: list[tuple[int, str]] = []
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
-        if line.lstrip().startswith(COMMENTS):
-            comments.append((number, line))
-        elif line.strip():
-            content.append((number, line))
+        if line.strip():
+            (comments if line.lstrip().startswith(COMMENTS) else content).append((number, line))
         if len(content) == HEAD_LINES:
             break
     if not content:
         raise DataError(f"{file}:{EMPTY}")
     separator = _separator([line for _, line in content])
     rows = [(k, _fields(line, separator)) for k, line in content]
-    header, names = rows[0]
-    if not names:
-        raise DataError(f"{file}:{header}: the line names no columns; it must name them, as in t,u,y")
-    if _all_numbers(names):
+    if not rows[0][1]:
+        raise DataError(f"{file}:{rows[0][0]}: the line names no columns; it must name them, as in t,u,y")
+    if _all_numbers(rows[0][1]):
         # Some programs write the names of the columns as a comment.
-        before, comment = next(((k, line) for k, line in reversed(comments) if k < header), (0, ""))
-        named = _fields(comment.lstrip().lstrip("#%/"), separator)
-        if len(named) != len(names) or _all_numbers(named):
-            raise DataError(
-                f"{file}:{header}: the first line holds numbers; it must name the columns, for example t,u,y"
-            )
-        header, names, rows = before, named, [(before, named), *rows]
+        before, comment = next(((k, line) for k, line in reversed(comments) if k < rows[0][0]), (0, ""))
+        rows.insert(0, (before, _fields(comment.lstrip().lstrip("#%/"), separator)))
+        if len(rows[0][1]) != len(rows[1][1]) or _all_numbers(rows[0][1]):
+            wrong = "the first line holds numbers; it must name the columns, for example t,u,y"
+            raise DataError(f"{file}:{rows[1][0]}: {wrong}")
+    header, names = rows[0]
     notes = []
     if encoding == "cp1252":
         notes.append("The file is not UTF-8; it was read as Windows-1252.")
@@ -111,7 +115,7 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     decimal = _decimal(itertools.chain.from_iterable(fields for _, fields in rows[1:]))
     if decimal == ",":
         notes.append("Numbers were read with decimal commas.")
-    return Layout(encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes))
+    return Layout(path, file, encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes))
 
 
 def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
@@ -139,16 +143,21 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
     raise DataError(f"{file}: {NO_TEXT}")
 
 
-def _fields(line: str, separator: str) -> list[str]:
-    """Return the fields of a line up to the last one that is not empty."""
+def _split(line: str, separator: str) -> list[str]:
+    """Return the fields of a line as they are written."""
     line = line.strip("\r\n")
     if separator == " ":
         # The unit of a name stays with it.
         line = re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
     try:
-        fields = [field.strip() for field in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+        return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:  # a field of more than 131072 letters
         return []
+
+
+def _fields(line: str, separator: str) -> list[str]:
+    """Return the fields of a line without blanks around them, up to the last one that is not empty."""
+    fields = [field.strip() for field in _split(line, separator)]
     while fields and not fields[-1]:
         del fields[-1]
     return fields
@@ -206,36 +215,43 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 # --- the columns ----------------------------------------------------------------------------------
 
 
-def _read_columns(path: str | os.PathLike[str], file: str, layout: Layout, names: Sequence[str]) -> Columns:
+def _read_columns(layout: Layout, names: Sequence[str]) -> Columns:
     """Read some columns; a line without a single field is left out."""
     places = [layout.columns.index(name) for name in names]
     parts: list[Any] = []
     try:
-        for frame in _chunks(path, layout, places, dtype=float):
+        for frame in _chunks(layout, places):
             if frame[len(layout.columns)].notna().any():
-                _refuse_fields(path, file, layout, places)
+                raise ValueError("a line has too many fields")
             parts.append(frame[places].to_numpy().T)
-    except ValueError:  # some field is no number, or a quotation mark is never closed
-        _refuse_fields(path, file, layout, places)
+    except ValueError as error:  # some field is no number, or a quotation mark is never closed
+        _refuse(layout, places, str(error))
     values = np.concatenate(parts, axis=1)
     parts.clear()
     last = values.shape[1] - 1
-    lines: Any = range(layout.first, layout.first + last + 1)
     missing = np.isnan(values)
     doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist()) | ({last} if missing[:, last:].any() else set())
     left_out, notes = [], []
-    for k, line in _lines(path, layout, doubtful):
+    for k, line in _lines(layout, doubtful):
         fields = _fields(line, layout.separator)
         if not fields:
             left_out.append(k)
         elif k == last and not line.endswith(("\r", "\n")) and _is_short(line, layout):
             left_out.append(k)
-            notes.append(f"Line {lines[k]}, the last, breaks off before its last field; it was left out.")
+            notes.append(f"Line {layout.first + k}, the last, breaks off before its last field; it was left out.")
+    lines: Any = range(layout.first, layout.first + last + 1)
     if left_out:
         values, lines = np.delete(values, left_out, axis=1), np.delete(np.array(lines), left_out)
     if not len(lines):
-        raise DataError(f"{file}:{layout.header + 1}: the file has a header and no data")
-    return Columns(file, dict(zip(names, values, strict=True)), lines, tuple(notes))
+        raise DataError(f"{layout.file}:{layout.header + 1}: the file has a header and no data")
+    return Columns(layout.file, dict(zip(names, values, strict=True)), lines, tuple(notes))
+
+
+def _lines(layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
+    """Return some lines of a file as they are."""
+    if rows:
+        with layout.opened() as text:
+            yield from ((k, line) for k, line in enumerate(text) if k in rows)
 
 
 def _is_short(line: str, layout: Layout) -> bool:
@@ -264,16 +280,7 @@ class _Widened:
         return iter(self._text)
 
 
-def _opened(path: str | os.PathLike[str], layout: Layout) -> io.TextIOBase:
-    """Open a file at its first sample."""
-    # What cannot be decoded there can be no number, and need not be one where it is not used.
-    text = open(path, encoding=layout.encoding, errors="replace", newline="")  # noqa: SIM115
-    for _ in range(layout.first - 1):
-        text.readline()
-    return text
-
-
-def _chunks(path: str | os.PathLike[str], layout: Layout, places: Sequence[int], dtype: type) -> Iterator["DataFrame"]:
+def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
     """Read columns by their places, and one more that is empty if no line has too many fields."""
     import pandas as pd  # a second of start-up time that only a command that reads a file should pay
 
@@ -281,51 +288,33 @@ def _chunks(path: str | os.PathLike[str], layout: Layout, places: Sequence[int],
     options: Any = {"header": None, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
     options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
     options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
-    options |= {"skipinitialspace": True, "dtype": dtype, "chunksize": ROWS, "engine": "c"}
-    with _opened(path, layout) as text:
+    options |= {"skipinitialspace": True, "dtype": float, "chunksize": ROWS, "engine": "c"}
+    with layout.opened() as text:
         widened: Any = _Widened(text, layout)
         for k, frame in enumerate(pd.read_csv(widened, **options)):
             yield frame if k else frame.iloc[1:]
 
 
-def _lines(path: str | os.PathLike[str], layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
-    """Return lines of a file as they are."""
-    if rows:
-        with _opened(path, layout) as text:
-            yield from ((k, line) for k, line in enumerate(text) if k in rows)
-
-
-def _refuse_fields(path: str | os.PathLike[str], file: str, layout: Layout, places: Sequence[int]) -> NoReturn:
+def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
     """Refuse the first line with too many fields or without a number, and say which."""
-    number, width, row = NUMBERS[layout.decimal], len(layout.columns), 0
-    try:
-        for frame in _chunks(path, layout, places, dtype=str):
-            wrong = frame.notna()
-            for place in places:
-                wrong[place] &= ~frame[place].str.strip().str.fullmatch(number).fillna(False).astype(bool)
-            for k in np.flatnonzero(wrong.any(axis=1))[:1]:
-                line = layout.first + row + int(k)
-                if wrong[width].iloc[k]:
-                    _refuse_long(file, line, next(_lines(path, layout, {row + int(k)}))[1], layout)
-                place = next(place for place in places if wrong[place].iloc[k])
-                text = str(frame[place].iloc[k]).strip()
-                found = f"column {layout.columns[place]!r} holds {quoted(text)}"
-                raise DataError(f"{file}:{line}: {found}, which is {_instead_of_number(text, layout)}")
-            row += len(frame)
-    except ValueError as error:
-        opened = re.search(r"inside string starting at row (\d+)", str(error))
-        where = "" if opened is None else f":{layout.first + int(opened[1]) - 1}"
-        why = "a quotation mark is opened and never closed" if opened else f"not a table of text ({error})"
-        raise DataError(f"{file}{where}: {why}; export the file anew, or correct the line") from None
-    raise DataError(f"{file}: the columns cannot be read as numbers; write them with digits and one decimal sign")
-
-
-def _refuse_long(file: str, line: int, text: str, layout: Layout) -> NoReturn:
-    """Refuse a line with more fields than there are columns."""
-    seen = len(_fields(text, layout.separator))
-    there = f"the line has {seen} fields where line {layout.header} names {len(layout.columns)}"
-    commas = "; numbers with decimal commas need another separator, such as the semicolon"
-    raise DataError(f"{file}:{line}: {there}{commas if layout.separator == ',' else ''}")
+    number, width = NUMBERS[layout.decimal], len(layout.columns)
+    if opened := re.search(r"inside string starting at row (\d+)", error):
+        why = "a quotation mark is opened and never closed; export the file anew, or correct the line"
+        raise DataError(f"{layout.file}:{layout.first + int(opened[1]) - 1}: {why}")
+    with layout.opened() as text:
+        for line, written in enumerate(text, start=layout.first):
+            fields = _fields(written, layout.separator)
+            if len(fields) > width:
+                there = f"the line has {len(fields)} fields where line {layout.header} names {width}"
+                commas = "; numbers with decimal commas need another separator, such as the semicolon"
+                raise DataError(f"{layout.file}:{line}: {there}{commas if layout.separator == ',' else ''}")
+            for place, field in enumerate(_split(written, layout.separator)):
+                if place in places and field not in MISSING and not number.fullmatch(field := field.strip()):
+                    found = f"column {layout.columns[place]!r} holds {quoted(field)}"
+                    raise DataError(f"{layout.file}:{line}: {found}, which is {_instead_of_number(field, layout)}")
+    raise DataError(
+        f"{layout.file}: the columns cannot be read as numbers; write them with digits and one decimal sign"
+    )
 
 
 def _instead_of_number(text: str, layout: Layout) -> str:

@@ -18,10 +18,9 @@ U = np.array([1.0, -1.0, 1.0, 1.0, -1.0])
 Y = np.array([0.0, 0.5, np.nan, 0.25, 0.125])
 
 
-def check(measurement):
-    assert np.array_equal(measurement.record.t, T)
-    assert np.array_equal(measurement.record.input.values, U)
-    assert np.array_equal(measurement.record.y, Y, equal_nan=True)
+@pytest.fixture
+def rig(tmp_path):
+    return tmp_path / "rig.mat"
 
 
 def opaque(variable, kind):
@@ -50,63 +49,53 @@ def save_v73(path, groups):
 
 # --- what is read ---------------------------------------------------------------------------------
 
-
-@pytest.mark.parametrize("version", ["4", "5"])
-@pytest.mark.parametrize("shape", ["row", "column"])
-def test_plain_vectors(tmp_path, version, shape):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"t": T, "u": U, "y": Y}, format=version, oned_as=shape)
-    check(read_measurement(path))
-
-
-def test_version_7_3(tmp_path):
-    path = tmp_path / "rig.mat"
-    columns = {name: (b"double", value[None, :]) for name, value in (("t", T), ("u", U), ("y", Y))}
-    save_v73(path, {**columns, "#refs#": (b"cell", None), "note": (b"char", np.array([[104], [105]], np.uint16))})
-    check(read_measurement(path))
-
-
-def test_fields_of_a_struct(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"z": {"t": T, "u": U, "y": Y, "name": "rig"}, "x": 3.0})
-    measurement = read_measurement(path)
-    check(measurement)
-    assert (measurement.time, measurement.input, measurement.output) == ("z.t", "z.u", "z.y")
+COLUMNS = {"t": T, "u": U, "y": Y}
+V73 = {name: (b"double", value[None, :]) for name, value in COLUMNS.items()}
+BESIDE = {"#refs#": (b"cell", None), "note": (b"char", np.array([[104], [105]], np.uint16))}
+SAVE = {
+    "version 4, rows": lambda path: scipy.io.savemat(path, COLUMNS, format="4", oned_as="row"),
+    "version 4, columns": lambda path: scipy.io.savemat(path, COLUMNS, format="4", oned_as="column"),
+    "version 5, rows": lambda path: scipy.io.savemat(path, COLUMNS, format="5", oned_as="row"),
+    "version 5, columns": lambda path: scipy.io.savemat(path, COLUMNS, format="5", oned_as="column"),
+    "version 7.3": lambda path: save_v73(path, {**V73, **BESIDE}),
+    "struct": lambda path: scipy.io.savemat(path, {"z": {**COLUMNS, "name": "rig"}, "x": 3.0}),
+    "struct, 7.3": lambda path: save_v73(path, {"z": (b"struct", None)} | {f"z/{k}": v for k, v in V73.items()}),
+    "interval": lambda path: scipy.io.savemat(path, {"Ts": 0.1, "u": U, "y": Y}),
+    "object beside": lambda path: save_beside_object(path, COLUMNS),
+}
 
 
-def test_fields_of_a_struct_in_version_7_3(tmp_path):
-    path = tmp_path / "rig.mat"
-    columns = {f"z/{name}": (b"double", value[None, :]) for name, value in (("t", T), ("u", U), ("y", Y))}
-    save_v73(path, {"z": (b"struct", None), **columns})
-    check(read_measurement(path))
+def save_beside_object(path, arrays):
+    scipy.io.savemat(path, arrays)
+    path.write_bytes(path.read_bytes() + opaque(b"z", b"iddata")[128:])
 
 
-def test_of_two_structs_one_must_be_chosen(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"est": {"t": T, "u": U, "y": Y}, "val": {"t": T, "u": -U, "y": Y}})
+@pytest.mark.parametrize("kind", SAVE)
+def test_one_record_in_many_ways(rig, kind):
+    SAVE[kind](rig)
+    found = read_measurement(rig)
+    assert np.array_equal(found.record.t, T)
+    assert np.array_equal(found.record.input.values, U)
+    assert np.array_equal(found.record.y, Y, equal_nan=True)
+    if kind.startswith("struct"):
+        assert (found.time, found.input, found.output) == ("z.t", "z.u", "z.y")
+    interval = "'Ts' is one number: it was taken as the sampling interval, 0.1 s, from 0 s on."
+    assert found.notes == ((interval,) if kind == "interval" else ())
+
+
+def test_of_two_structs_one_must_be_chosen(rig):
+    scipy.io.savemat(rig, {"est": {"t": T, "u": U, "y": Y}, "val": {"t": T, "u": -U, "y": Y}})
     with pytest.raises(DataError, match=r"'est\.t' and 'val\.t' may all be the time; say which one"):
-        read_measurement(path)
-    chosen = read_measurement(path, output="val.y", time="val.t")
+        read_measurement(rig)
+    chosen = read_measurement(rig, output="val.y", time="val.t")
     assert np.array_equal(chosen.record.input.values, -U)
 
 
-def test_numbers_of_other_types_are_converted_and_names_may_be_given(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"k": np.arange(5, dtype=np.int32), "valve": U.astype(np.float32), "level": Y})
-    measurement = read_measurement(path, time="k", input="valve", output="level", start=1, stop=3)
+def test_numbers_of_other_types_are_converted_and_names_may_be_given(rig):
+    scipy.io.savemat(rig, {"k": np.arange(5, dtype=np.int32), "valve": U.astype(np.float32), "level": Y})
+    measurement = read_measurement(rig, time="k", input="valve", output="level", start=1, stop=3)
     assert measurement.record.t.tolist() == [1.0, 2.0, 3.0]
     assert measurement.record.input.values.tolist() == [-1.0, 1.0, 1.0]
-
-
-def test_a_sampling_interval_stands_for_the_times(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"Ts": 0.1, "u": U, "y": Y})
-    measurement = read_measurement(path)
-    check(measurement)
-    assert measurement.notes == ("'Ts' is one number: it was taken as the sampling interval, 0.1 s, from 0 s on.",)
-    scipy.io.savemat(path, {"Ts": -0.1, "u": U, "y": Y})
-    with pytest.raises(DataError, match=r"'Ts' is -0\.1; a sampling interval must be a positive number"):
-        read_measurement(path)
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -131,32 +120,25 @@ def save_object(path, version):
 
 
 @pytest.mark.parametrize("version", ["old object", "opaque", "7.3"])
-def test_iddata_is_answered_with_the_line_that_exports_it(tmp_path, version):
-    path = tmp_path / "rig.mat"
-    save_object(path, version)
+def test_iddata_is_answered_with_the_line_that_exports_it(rig, version):
+    save_object(rig, version)
     with pytest.raises(DataError) as error:
-        read_measurement(path)
-    assert str(error.value).startswith(f"{path}: 'z' is a MATLAB iddata object, which only MATLAB can read")
+        read_measurement(rig)
+    assert str(error.value).startswith(f"{rig}: 'z' is a MATLAB iddata object, which only MATLAB can read")
     assert str(error.value).splitlines()[1].strip() == LINE
 
 
-def test_arrays_beside_an_object_are_read_and_the_line_is_given_where_they_do_not_suffice(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"t": T, "u": U, "y": Y})
-    path.write_bytes(path.read_bytes() + opaque(b"z", b"iddata")[128:])
-    check(read_measurement(path))
-    scipy.io.savemat(path, {"t": T})
-    path.write_bytes(path.read_bytes() + opaque(b"z", b"iddata")[128:])
+def test_the_line_is_given_where_the_arrays_beside_an_object_do_not_suffice(rig):
+    save_beside_object(rig, {"t": T})
     with pytest.raises(DataError, match="no variable is called 'u' or 'input'") as error:
-        read_measurement(path)
+        read_measurement(rig)
     assert LINE in str(error.value)
 
 
-def test_other_objects_are_named(tmp_path):
-    path = tmp_path / "rig.mat"
-    path.write_bytes(opaque(b"tt", b"timetable"))
+def test_other_objects_are_named(rig):
+    rig.write_bytes(opaque(b"tt", b"timetable"))
     with pytest.raises(DataError, match=r"'tt' is a MATLAB timetable object.*save\('rig\.mat', 't', 'u', 'y', '-v7'\)"):
-        read_measurement(path)
+        read_measurement(rig)
 
 
 @pytest.mark.parametrize(
@@ -172,36 +154,33 @@ def test_other_objects_are_named(tmp_path):
         ({"t": T[::-1], "u": U, "y": Y}, {}, "sample 2: time 't' goes back to 0.3 s after 0.4 s on sample 1"),
         ({"t": T, "u": U, "y": Y * np.nan}, {}, "sample 1: no sample of the output 'y' is a finite number"),
         ({"t": T, "valve": U, "y": Y}, {}, "no variable is called 'u' or 'input'; the file has 't', 'valve', 'y'"),
-        ({"t": T, "valve": U, "y": Y}, {"input": "valv"}, "there is no variable 'valv'; the file has"),
-        ({"t": T, "valve": U, "y": Y}, {"input": "valv"}, "Did you mean 'valve'?"),
+        ({"valve": U}, {"input": "valv"}, "there is no variable 'valv'; the file has 'valve'. Did you mean 'valve'?"),
+        ({"Ts": -0.1, "u": U, "y": Y}, {}, "'Ts' is -0.1; a sampling interval must be a positive number"),
         ({}, {}, "the file holds no arrays; in MATLAB, save plain vectors"),
     ],
 )
-def test_one_sentence(tmp_path, content, options, message):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, content)
+def test_one_sentence(rig, content, options, message):
+    scipy.io.savemat(rig, content)
     with pytest.raises(DataError) as error:
-        read_measurement(path, **options)
-    assert str(error.value).startswith(f"{path}:")
+        read_measurement(rig, **options)
+    assert str(error.value).startswith(f"{rig}:")
     assert message in str(error.value)
 
 
 @pytest.mark.parametrize("content", [b"", b"t,u,y\n0,1,2\n", b"\x89PNG\r\n" * 40, b"MATLAB 5.0 MAT-file".ljust(124)])
-def test_what_is_no_matlab_file(tmp_path, content):
-    path = tmp_path / "rig.mat"
-    path.write_bytes(content)
+def test_what_is_no_matlab_file(rig, content):
+    rig.write_bytes(content)
     with pytest.raises(DataError, match=r"rig\.mat: (this is not a MATLAB file|the file is empty|the file holds no)"):
-        read_measurement(path)
+        read_measurement(rig)
 
 
-def test_a_cut_file_is_refused_or_incomplete_but_never_a_traceback(tmp_path):
-    path = tmp_path / "rig.mat"
-    scipy.io.savemat(path, {"t": T, "u": U, "y": Y})
-    whole = path.read_bytes()
+def test_a_cut_file_is_refused_or_incomplete_but_never_a_traceback(rig):
+    scipy.io.savemat(rig, {"t": T, "u": U, "y": Y})
+    whole = rig.read_bytes()
     for length in range(100, len(whole) - 1, 16):
-        path.write_bytes(whole[:length])
+        rig.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"rig\.mat"):
-            read_measurement(path)
+            read_measurement(rig)
 
 
 def test_importing_signals_imports_neither_scipy_io_nor_h5py():

@@ -5,17 +5,6 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.signals.measurement import read_measurement
 
-
-@pytest.fixture
-def write(tmp_path):
-    def to_file(text, name="pump.csv"):
-        path = tmp_path / name
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return to_file
-
-
 # --- what is read ---------------------------------------------------------------------------------
 
 

@@ -107,26 +107,6 @@ def test_a_ratio_needs_an_output(noise):
         noise.variance_of()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: WhiteNoise(), "exactly one of snr_db .*, standard_deviation .*, variance .*; none was given"),
-        (lambda: WhiteNoise(snr_db=5.0, standard_deviation=1.0), "snr_db and standard_deviation were given"),
-        (lambda: WhiteNoise(variance=-0.1), r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
-        (lambda: WhiteNoise(snr_db=float("inf")), r"snr_db must be a finite number \[dB\], not inf"),
-        (lambda: WhiteNoise(snr_db=2000), "snr_db must be within plus or minus 1000 dB"),
-        (lambda: ArmaNoise(**PUBLISHED), "snr_db .*, variance .*, innovation_variance .*; none was given"),
-        (lambda: ArmaNoise((1.0,), (1.0, -1.0), 1.0), "denominator has a zero of magnitude 1: the noise would grow"),
-        (lambda: ArmaNoise((1.0,), (0.0, 1.0), 1.0), "the first coefficient of denominator is zero"),
-        (lambda: ArmaNoise((), (1.0,), 1.0), "numerator must hold at least one coefficient"),
-        (lambda: ArmaNoise((1.0, float("nan")), (1.0,), 1.0), "a coefficient of numerator must be a finite number"),
-    ],
-)
-def test_impossible_options_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_streams_are_those_of_the_spawn_keys_and_differ():
     # Stored results are repeatable only as long as these numbers stay what they are.
     assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}

@@ -29,9 +29,9 @@ def test_usual_names(tmp_path, header):
 
 def test_named_columns_and_units(tmp_path):
     file = write(tmp_path / "a.csv", (np.arange(50.0), Y, 2 * Y), "clock [ms],left,right (mV)")
-    with pytest.raises(DataError, match="--time"):
-        read_sampled_signal(file)
-    with pytest.raises(DataError, match="--signal"):
+    with pytest.raises(DataError, match=r"option time.*--interval"):
+        read_sampled_signal(file, signal="left")
+    with pytest.raises(DataError, match="option signal"):
         read_sampled_signal(file, time="clock")
     signal = read_sampled_signal(file, time="clock", signal="right")
     assert signal.samples == pytest.approx(2 * Y)
@@ -79,6 +79,19 @@ def test_time_stamps_are_refused_unless_a_clock_is_given(tmp_path):
     with pytest.raises(DataError, match=r"a.csv:2: .* a date or a time of day.*--interval SECONDS or --rate HERTZ"):
         read_sampled_signal(file)
     assert read_sampled_signal(file, interval=0.1).samples == pytest.approx(Y)
+
+
+def test_of_two_times_one_must_be_chosen_unless_a_clock_is_given(tmp_path):
+    file = write(tmp_path / "a.csv", (0.1 * np.arange(50), np.arange(50), Y), "t [s],t [ms],y")
+    with pytest.raises(DataError, match=r"a.csv:1: 't \[s\]' and 't \[ms\]' may all be the time; say which one"):
+        read_sampled_signal(file)
+    assert read_sampled_signal(file, interval=0.1).samples == pytest.approx(Y)
+
+
+def test_two_columns_without_usual_names_are_taken_by_position(tmp_path):
+    signal = read_sampled_signal(write(tmp_path / "a.csv", (0.1 * np.arange(50), Y), "when,level"))
+    assert (signal.time, signal.column, signal.samples.tolist()) == ("when", "level", Y.tolist())
+    assert signal.notes == ("Columns were taken by their position: 'when' as the time and 'level' as the signal.",)
 
 
 def test_most_lines_may_be_missing_from_a_regular_clock(tmp_path):

@@ -80,29 +80,6 @@ def test_instants_come_from_a_column_of_a_file(tmp_path):
         InstantsFile(str(file)).times(None)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: RegularSampling(0.0, 10), r"interval must be a positive number \[s\], not 0.0"),
-        (lambda: RegularSampling(0.1, 10.5), "samples must be an integer of at least 2, not 10.5"),
-        (lambda: RegularSampling(0.1, 10, "guessed"), "input_record must be 'sampled' or 'exact', not 'guessed'"),
-        (lambda: UniformIntervals(0.2, 0.1, 10), "low must not exceed high; they are 0.2 s and 0.1 s"),
-        (lambda: UniformIntervals(0.0, 0.1, 10), "low must be a positive number"),
-        (lambda: UniformIntervals(0.1, float("inf"), 10), "high must be a positive number"),
-        (lambda: UniformIntervals(0.1, 0.2, 1), "samples must be an integer of at least 2, not 1"),
-        (lambda: IrregularSampling(0.1, 9, spread=1.0), r"spread must be a number above 0 and below 1 \[-\], not 1.0"),
-        (lambda: JitteredSampling(0.1, 9, 0.05), r"largest_shift must be less than half the interval, 0\.05 s"),
-        (lambda: InstantsFile("a.csv", input_record=""), "input_record must be"),
-        (lambda: geometric_sizes(500, 500, 3), "the first size must be below the last; they are 500 and 500"),
-        (lambda: geometric_sizes(2, 5, 9), "no 9 different sizes from 2 to 5"),
-        (lambda: geometric_sizes(0, 5, 2), "the first size must be an integer of at least 1, not 0"),
-    ],
-)
-def test_impossible_options_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 @given(st.integers(50, 1000), st.floats(1.5, 300), st.integers(2, 30))
 def test_geometric_sizes(first, ratio, count):
     last = round(first * ratio)

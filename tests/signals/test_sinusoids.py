@@ -43,27 +43,6 @@ def test_true_frequencies_are_ascending():
     assert signal.highest_frequency == 4.0
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Tone(0.0), "frequency"),
-        (lambda: Tone(1.0, -1.0), "amplitude"),
-        (lambda: Tone((Piece(1.0, 2.0),)), "the last has none"),
-        (lambda: Tone((Piece(1.0), Piece(2.0))), "needs 'until'"),
-        (lambda: Tone((Piece(1.0, 3.0), Piece(2.0, 2.0), Piece(1.0))), "follow one another"),
-        (lambda: SumOfSinusoids(()), "tones"),
-        (lambda: SumOfSinusoids((Tone(1.0), Tone(1.0))), "same frequency from 0 s"),
-        (lambda: SumOfSinusoids((Tone(1.0), Tone((Piece(2.0, 4.0), Piece(1.0))))), "same frequency from 4 s"),
-        (lambda: SumOfSinusoids((Tone(1.0),), phase_at_steps="smooth"), "phase_at_steps"),
-        (lambda: UniformDisturbance(0.0), "half_width"),
-        (lambda: SineDisturbance(1.0, -1.0), "frequency"),
-    ],
-)
-def test_what_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_disturbances():
     signal, rng = np.sin(T), np.random.default_rng(0)
     added = disturb(signal, T, UniformDisturbance(0.2), rng) - signal
