@@ -37,8 +37,9 @@ from ctid_cli.reporting.layout import seconds
 from ctid_cli.text import count
 
 if TYPE_CHECKING:
-    from ctid_cli.running.engine import RunSummary, Workload
+    from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.plan import Plan
+    from ctid_cli.running.states import Workload
     from ctid_cli.storage.manifest import Shard
 
 

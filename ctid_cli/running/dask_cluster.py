@@ -24,7 +24,6 @@ from ctid_cli.running.plan import Plan, computing_parts
 from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
-from ctid_cli.storage.manifest import Key
 from ctid_cli.temporary import TemporaryFolder
 
 #: How long a worker is waited for where there is none [s], and how often that is looked at.
@@ -53,8 +52,6 @@ class DaskWorkers:
         # A task, because what is scattered to workers is lost with them.
         self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
-        #: What is in work, and since when [s].
-        self._at_work: dict[Job, float] = {}
         self.count, self.trouble = 1, ""
         self._looked, self._present = float("-inf"), time.monotonic()
         self._look()
@@ -84,26 +81,15 @@ class DaskWorkers:
 
     def _computed(self, jobs: Iterator[Job], function: Callable[..., Ending], at_once: Callable[[], int]) -> Results:
         def submit(job: Job, task: Task) -> Future[Ending]:
-            self._at_work[job] = time.monotonic()
             future: Future[Ending] = self._executor.submit(
                 on_worker, function, task, self._limits, self._expected, self._files
             )
             return future
 
-        try:
-            for over in in_parallel(jobs, submit, at_once, _died):
-                if over is None:
-                    self._look()
-                else:
-                    self._at_work.pop(over[0], None)
-                yield over
-        finally:
-            self._at_work.clear()
-
-    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
-        """Yield the jobs that a worker has had for longer than this, their estimates, and for how long [s]."""
-        times = [(job, job.keys, time.monotonic() - since) for job, since in self._at_work.items()]
-        yield from (one for one in times if one[2] > least)
+        for over in in_parallel(jobs, submit, at_once, _died):
+            if over is None:
+                self._look()
+            yield over
 
     def close(self) -> None:
         """Leave the scheduler, which forgets what was in work."""

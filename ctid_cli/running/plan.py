@@ -30,7 +30,7 @@ from ctid_cli.specification.sweeps import MAX_COMBINATIONS, Variant, replaced, v
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
-from ctid_cli.storage.identity import Origin, code_version, modules_of, origin_of
+from ctid_cli.storage.identity import Origin, origin_of
 from ctid_cli.storage.manifest import Key, Manifest, Shard
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
@@ -83,10 +83,6 @@ class Plan:
         """Number of estimates of every data set."""
         return len(self.keys(0, 0))
 
-    def with_replicates(self, replicates: Sequence[int]) -> Plan:
-        """Return the plan with other numbers of data sets."""
-        return dataclasses.replace(self, replicates=tuple(replicates))
-
     def part(self, shard: Shard) -> Plan:
         """Return the part of the plan that one shard computes."""
         section = self.spec.monte_carlo
@@ -114,11 +110,11 @@ class Plan:
             for start in starts_of(part.estimator.start_from, self.starts)
         ]
 
-    def job(self, cell: int, replicate: int) -> Job:
-        """Return a data set and the estimates wanted of it; two names of the same estimator share theirs."""
-        wanted = {one[0]: one for one in reversed(self.keys(cell, replicate))}
-        seed = self.monte_carlo.get("seed")
-        return Job(self.data_cells[cell], replicate, seed, tuple(reversed(wanted.values())), self.terms)
+    def job(self, cell: int, replicate: int, wanted: BoolArray | None = None) -> Job:
+        """Return a data set and those of its estimates that are wanted; by default all."""
+        keys = self.keys(cell, replicate)
+        asked = tuple(keys if wanted is None else itertools.compress(keys, wanted))
+        return Job(self.data_cells[cell], replicate, self.monte_carlo.get("seed"), asked, self.terms)
 
     @cached_property
     def terms(self) -> tuple[Term, ...] | None:
@@ -378,7 +374,7 @@ def current_origin(plan: Plan) -> Origin:
 
 def current_version(plan: Plan) -> str:
     """Return the code version of these estimates, on whichever processor."""
-    return code_version(set().union(*map(modules_of, computing_parts(plan))))
+    return current_origin(plan).code_version
 
 
 def computing_parts(plan: Plan) -> list[Any]:

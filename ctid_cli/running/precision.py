@@ -6,6 +6,7 @@ needs, of an earlier plan.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import count, takewhile
 from typing import Any
 
@@ -34,10 +35,10 @@ def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPreci
     return cell_precisions(manifest, {row.key: row.content for row in log.rows()})
 
 
-def as_needed(plan: Plan, log: JournalReader) -> Plan:
+def as_needed(plan: Plan, log: JournalReader | None) -> Plan:
     """The plan with as many data sets as are known to be needed."""
-    cells = stored_precisions(plan.manifest(), log)
-    return plan.with_replicates([cell.needed for cell in cells]) if cells else plan
+    cells = () if log is None else stored_precisions(plan.manifest(), log)
+    return replace(plan, replicates=tuple(cell.needed for cell in cells)) if cells else plan
 
 
 def _asked(manifest: Manifest) -> Mapping[str, Any] | None:

@@ -404,27 +404,16 @@ class LocalWorkers:
             time.sleep(TICK)
         self._at_work.clear()
 
-    def _seconds(self) -> Iterator[tuple[Path, float]]:
-        """Yield the record of each job in work, and for how long its estimate has been in work [s]."""
-        for record in list(self._at_work):
-            with suppress(OSError):
-                yield record, time.time() - record.stat().st_mtime
-
     def _watch(self) -> None:
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
-        if self._limits.wall_seconds is not None:
-            for record, seconds in self._seconds():
+        limit = self._limits.wall_seconds
+        for record in list(self._at_work) if limit is not None else ():
+            with suppress(OSError):
+                seconds = time.time() - record.stat().st_mtime
                 # What it imports before its first estimate counts for none.
-                if seconds > self._limits.wall_seconds * 1.5 + GRACE and _remains(record, "").begun:
+                if seconds > limit * 1.5 + GRACE and _remains(record, "").begun:
                     _late(record).write_bytes(b"killed")
                     _kill(record)
-
-    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
-        """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
-        for record, seconds in self._seconds():
-            if seconds > least:
-                job = self._at_work[record]
-                yield job, _remains(record, "").begun or job.keys, seconds
 
     def close(self) -> None:
         """Remove the records."""
