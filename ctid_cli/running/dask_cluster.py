@@ -15,6 +15,7 @@ from concurrent.futures import Future
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
@@ -24,7 +25,6 @@ from ctid_cli.running.plan import Plan, computing_parts
 from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
-from ctid_cli.temporary import TemporaryFolder
 
 #: How long a worker is waited for where there is none [s], and how often that is looked at.
 PATIENCE = 120.0
@@ -125,11 +125,11 @@ def on_worker(
     """Compute a job on a worker that is as the process of the run."""
     _require_same(expected)
     for sha256 in files.keys() - COPIES.keys():
-        copy = _kept().path / sha256
+        copy = Path(_kept().name) / sha256
         copy.write_bytes(files[sha256])
         COPIES[sha256] = str(copy)
-    with TemporaryFolder() as folder:
-        return function(task, limits, folder)
+    with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as folder:
+        return function(task, limits, Path(folder))
 
 
 def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
@@ -138,9 +138,9 @@ def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
 
 
 @cache
-def _kept() -> TemporaryFolder:
+def _kept() -> TemporaryDirectory[str]:
     """Return the folder of the files that were sent, for as long as this worker lives."""
-    return TemporaryFolder()
+    return TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
 
 
 @cache

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import BoolArray
+from ctid_cli.arrays import BoolArray, IndexArray
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan
@@ -78,11 +78,11 @@ class States:
         """Return the states of an estimate on all replicates."""
         return self._states[key.data_hash, key.estimator_hash, key.start]
 
-    def _table(self, plan: Plan, cell: int) -> BoolArray:
+    def _table(self, plan: Plan, cell: int) -> IndexArray:
         """Return the states of the estimates of a data cell, shape (estimates of a data set, replicates)."""
         own = plan.replicates[cell]
         rows = [bytes(self._of(key)[:own]).ljust(own, b"\0") for key, _, _ in plan.keys(cell, 0)]
-        return np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), own)
+        return np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), own).astype(int)
 
     def missing(self, plan: Plan) -> list[BoolArray]:
         """Return for every data cell which estimates are to be computed, shape (estimates, replicates)."""

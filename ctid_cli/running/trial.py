@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,7 +44,6 @@ from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.truth import found_of_rows
-from ctid_cli.temporary import TemporaryFolder
 
 #: Samples of the data sets that are made, and time after which no other is begun [s].
 MAX_TRIAL_SAMPLES = 20_000_000
@@ -113,7 +113,8 @@ def try_out(spec: Spec) -> Found:
     limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
     found = None
     # What ends its process, or cannot be sent to one, is left to the run.
-    with TemporaryFolder() as folder, suppress(Exception):
+    with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made, suppress(Exception):
+        folder = Path(made)
         found = call_alone(folder, _try_under_limits, limits, folder / "late", settings, candidates, success)[0]
     return found or Found()
 

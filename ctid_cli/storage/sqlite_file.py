@@ -6,11 +6,11 @@ import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NoReturn
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
 from ctid_cli.storage.announcement import reported
-from ctid_cli.temporary import TemporaryFolder
 
 #: The journal, and what is exported of it.
 FILE_NAME, EXPORT = "journal.sqlite", "runs.h5"
@@ -58,8 +58,8 @@ def readable(path: Path, *, live: bool) -> Iterator[str]:
     elif empty:
         yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     else:
-        with TemporaryFolder() as folder:
-            copy = folder / path.name
+        with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as folder:
+            copy = Path(folder) / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
             yield copy.as_uri()
