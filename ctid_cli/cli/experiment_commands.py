@@ -205,8 +205,7 @@ def _run_all(
     **how: Any,
 ) -> list[RunSummary]:
     """Run one experiment after the other, as long as none ends early."""
-    from ctid_cli.running.engine import run_experiment
-    from ctid_cli.running.stopping import StopRequest
+    from ctid_cli.running.engine import StopRequest, run_experiment
 
     summaries, ends = [], None if end.time_budget is None else time.monotonic() + end.time_budget
     how |= place.treatment | {"keep_readable": place.keep_readable}

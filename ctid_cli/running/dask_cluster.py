@@ -7,7 +7,6 @@ gives it up when these die too; such a job is a suspect, and is computed again i
 
 from __future__ import annotations
 
-import pickle
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
 from ctid_cli.running.job import Begun, Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan, computing_parts
-from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed
+from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed, unpacked
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
 
@@ -148,7 +147,7 @@ def _require_same(expected: bytes) -> None:
     """Refuse to compute with several threads, or where estimates would come from another origin."""
     from distributed import get_worker
 
-    ours, parts = pickle.loads(expected)[-2:]
+    ours, parts = unpacked(expected)
     worker = get_worker()
     who = f"worker {worker.address} on {platform.node()}"
     if worker.state.nthreads != 1:

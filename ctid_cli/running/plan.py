@@ -175,8 +175,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         section = section if runs is None else MonteCarloSection(runs=runs, seed=section.seed)
         spec = replaced(spec, ("monte_carlo",), section)
         count, first = section.most, section.first
-    # Of a measured record only those of its loop.
-    parts = {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
+    parts = data_parts(spec)
     cells = math.prod(map(len, parts.values()))
     for number, most, what in ((cells, MAX_COMBINATIONS, "data cells"), (cells * count, MAX_DATA_SETS, "data sets")):
         if number > most:
@@ -188,7 +187,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
         starts = (*starts, NO_START)
     spec_hash = content_hash(_without_circumstances(spec.canonical()))
-    return Plan(spec, tuple(_data_cells(spec, parts, names)), estimators, starts, (first,) * cells, spec_hash)
+    return Plan(spec, tuple(data_cells(spec, parts, names)), estimators, starts, (first,) * cells, spec_hash)
 
 
 def simulate_dataset(
@@ -266,8 +265,16 @@ def simulate_dataset(
     return source.dataset(replicate)
 
 
-def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> Iterator[DataCell]:
-    """Yield every combination of the variants of the sections that data are made from."""
+def data_parts(spec: Spec) -> dict[str, list[Variant]]:
+    """Return the variants of the sections that data are made from; of a measured record only those of its loop."""
+    return {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
+
+
+def data_cells(
+    spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str] | None = None
+) -> Iterator[DataCell]:
+    """Yield every combination of the variants of the sections; swept fields have the names of their columns."""
+    names = _column_names(parts) if names is None else names
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
     custom = tuple((name, variant.options) for name, variant in measures.items())

@@ -155,15 +155,15 @@ def main() -> None:
 
 def packed(*content: Any) -> bytes:
     """Return content for another process, after the custom code that it needs to read it and the files it was sent."""
-    return pickle.dumps((custom_code.served(), COPIES, *content))
+    return pickle.dumps((custom_code.served(), COPIES, pickle.dumps(content)))
 
 
 def unpacked(data: bytes) -> list[Any]:
     """Return content from another process."""
-    content: list[Any]
-    _, copies, *content = pickle.loads(data)
+    sources, copies, content = pickle.loads(data)
+    custom_code.serve(sources)
     COPIES.update(copies)
-    return content
+    return list(pickle.loads(content))
 
 
 def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple[Any, str, float]:

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, Valida
 from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import OptionError, Problem
+from ctid_cli.errors import OptionError
 from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
@@ -26,7 +26,7 @@ from ctid_cli.specification.sections import Options, Section, WithKey, section_f
 from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
 from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
-from ctid_cli.specification.yaml_source import KeyPath, YamlSource
+from ctid_cli.specification.yaml_source import YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 
 _EXPERIMENT = matching(
@@ -368,10 +368,6 @@ class Spec(Section):
     def warnings(self) -> tuple[str, ...]:
         """What is unwise but allowed, each with its place in the file."""
         return self._warnings
-
-    def problem(self, path: KeyPath, message: str) -> Problem:
-        """Return something wrong at a key path, with its place in the file."""
-        return self._source.problem(path, message)
 
     @property
     def text(self) -> str:

@@ -177,11 +177,12 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
             "platform": " | ".join(dict.fromkeys(origin.platform for origin in sorted(origins))),
         }
     )
-    # Swept fields are in the order of the specification. Attributes have a length limit; single texts no checksum.
-    for name, text in {"spec": canonical_json(manifest["spec"]), "manifest": json.dumps(manifest)}.items():
-        encoded = encoded_texts([text], len(text.encode())).reshape(())
-        dataset = file.create_dataset(name, data=encoded, track_times=False)
-        dataset.attrs["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    # Not sorted: swept fields are in the order of the specification. Attributes have a length limit.
+    text = json.dumps(manifest)
+    encoded = encoded_texts([text], len(text.encode())).reshape(())
+    dataset = file.create_dataset("manifest", data=encoded, track_times=False)
+    # Single texts have no checksum of HDF5.
+    dataset.attrs["sha256"] = hashlib.sha256(text.encode()).hexdigest()
 
 
 # --- reading --------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
 
-``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log) and ``runs.h5`` (the
-estimates that the latest plan asks for).
+``spec.yaml`` (the user's text), ``journal.sqlite`` (the live log) and ``runs.h5`` (the estimates that the latest plan
+asks for).
 """
 
 import fcntl
@@ -14,15 +14,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage.announcement import who_runs
 from ctid_cli.storage.identity import Origin, origin_differences
 from ctid_cli.storage.journal import JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
-from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, SPEC, who_runs
 from ctid_cli.written_files import TAKEN, is_leftover
-
-SPEC = "spec.yaml"
-CANONICAL = "spec.canonical.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
@@ -82,7 +78,7 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 def clear(folder: Path) -> None:
     """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
     for path in folder.glob(".*"):
-        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, EXPORT)):
+        if is_leftover(path.name) and path.name[1:].startswith((SPEC, EXPORT)):
             with suppress(OSError):
                 path.unlink()
 

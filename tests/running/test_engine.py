@@ -156,12 +156,11 @@ def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
 def test_the_spec_lies_beside_the_results_and_the_journal_says_where_they_come_from(tmp_path: Path) -> None:
     run(toy_plan(text="# as the user wrote it\n"), tmp_path)
     assert (tmp_path / "spec.yaml").read_text() == "# as the user wrote it\n"
-    assert '"experiment": "toys"' in (tmp_path / "spec.canonical.json").read_text()
     with read_journal(tmp_path / "journal.sqlite") as log:
         assert log is not None
         assert {"host", "argv", "packages", "limits"} <= set(log.sessions()[0].info)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"spec.yaml", "spec.canonical.json", "journal.sqlite", "runs.h5"}
+    assert names == {"spec.yaml", "journal.sqlite", "runs.h5"}
 
 
 # Misbehaving estimators
