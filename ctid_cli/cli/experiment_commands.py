@@ -205,7 +205,8 @@ def _run_all(
     **how: Any,
 ) -> list[RunSummary]:
     """Run one experiment after the other, as long as none ends early."""
-    from ctid_cli.running.engine import StopRequest, run_experiment
+    from ctid_cli.running.engine import run_experiment
+    from ctid_cli.running.limits import StopRequest
 
     summaries, ends = [], None if end.time_budget is None else time.monotonic() + end.time_budget
     how |= place.treatment | {"keep_readable": place.keep_readable}

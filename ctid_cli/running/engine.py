@@ -7,21 +7,18 @@ estimate is reported as done after the journal has it safely.
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
-from ctid_cli.running.limits import Limits, advice
+from ctid_cli.running.limits import MACHINE, TOO_MANY_FAILURES, Limits, StopRequest, advice
 from ctid_cli.running.plan import Plan, current_origin
 from ctid_cli.running.states import States, Workload, as_needed, data_sets, jobs_of, stored_precisions
 from ctid_cli.running.suspects import NAMED, Course
@@ -34,60 +31,6 @@ from ctid_cli.storage.journal import Journal, open_journal
 from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.storage.merge import keep_readable as keep_readable_of
 from ctid_cli.storage.sqlite_file import FILE_NAME, announce, retract
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-#: Reasons that are no signals.
-TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
-
-
-class StopRequest:
-    """Notices requests to stop; signals, while it is entered.
-
-    The first signal is only noted, so that what is in work can be finished and stored. The second ends the process at
-    once, as if nobody had listened; the workers end with it, and the journal is made for that.
-    """
-
-    def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
-        """Stop after failed estimates of this run, or after some time [s]."""
-        self.failures = failures
-        self._deadline = None if seconds is None else time.monotonic() + seconds
-        self._reason: str | None = None
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> Self:
-        # Python hands signals to the main thread only; elsewhere whoever owns the main thread decides.
-        if threading.current_thread() is threading.main_thread():
-            for number in _SIGNALS:
-                self._before[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.ask(signal.Signals(number).name)
-        for each in _SIGNALS:
-            signal.signal(each, signal.SIG_DFL)
-
-    def ask(self, reason: str) -> None:
-        """Ask for a stop; the first reason counts."""
-        self._reason = self._reason or reason
-
-    def __call__(self) -> bool:
-        """Return whether a stop was asked for."""
-        return self.reason is not None
-
-    @property
-    def reason(self) -> str | None:
-        """Name of the signal, another reason, or None."""
-        if self._deadline is not None and time.monotonic() > self._deadline:
-            self.ask(TIME_BUDGET)
-        return self._reason
-
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2

@@ -1,4 +1,4 @@
-"""Which estimates are stored: one table of states, from which follows what is still to be computed."""
+"""Which estimates are stored, how many are needed, and what is still to be computed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import itertools
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
-from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,6 +126,12 @@ def jobs_of(plan: Plan, missing: list[BoolArray]) -> Iterator[Job]:
                 yield plan.job(cell, replicate, lacking[:, replicate])
 
 
+# --- how many data sets are needed ------------------------------------------------------------------------------------
+#
+# What is decided follows from the stored estimates alone, from those of the data sets before the end of each block. So a
+# run that was interrupted, or that has other workers, decides the same; so does one that finds more estimates than it
+# needs, of an earlier plan.
+
 #: Stored results by estimate.
 Found = Mapping[Key, Mapping[str, Any]]
 
@@ -176,7 +181,7 @@ def _replications(
 ) -> Replications:
     """Return what an estimator gave, from the first data set to the last before one that is missing."""
     keys = (Key(data, replicate, part["hash"], start) for replicate in itertools.count())
-    results = [found[key] for key in takewhile(found.__contains__, keys)]
+    results = [found[key] for key in itertools.takewhile(found.__contains__, keys)]
     arrays = arrays_of_rows(results)
     values = found_under(tuple(truth), arrays, len(results)).values
     # Without a rule, or without true values to compare with, an estimate neither converges nor fails to.

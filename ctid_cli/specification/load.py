@@ -195,6 +195,8 @@ def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, any
     return content
 
 
+# --- which sections an experiment must have, and which it must not, whatever they hold -------------------------------
+
 _SAMPLING = "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
 _MISSING = "is missing; data are simulated with system, excitation (or loop) and sampling"
 _OF_SYSTEM = "belongs to a system, and there is none here; leave it out"

@@ -1,6 +1,6 @@
-"""Merging: what several folders hold of one experiment, as if one run had computed it.
+"""Rows of other journals: merging shards as if one run had computed them, and keeping what is left of damaged results.
 
-The folders that are merged are only read. Rows go over with their times, and the runs that computed them with all that
+The folders that are read are not changed. Rows go over with their times, and the runs that computed them with all that
 is known of these, in one transaction: where anything is in the way, nothing is written. The export comes from the rows
 alone, so that it has the bytes of a single run's.
 """
@@ -254,6 +254,9 @@ def shards_text(numbers: Iterable[int], of: int) -> str:
             runs.append([number])
     text = ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
+
+
+# --- what can be read of damaged results, copied from the folder that was moved aside --------------------------------
 
 
 @dataclass(frozen=True)

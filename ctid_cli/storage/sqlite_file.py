@@ -1,4 +1,4 @@
-"""Journals as SQLite files: their format, how they are opened, and what keeps one from being read or written."""
+"""Journals as files: their format, how they are opened, what keeps one from being used, and who is writing to it."""
 
 import json
 import os
@@ -118,6 +118,11 @@ def _identity_of(path: Path) -> tuple[int, int] | None:
     return None
 
 
+# --- who is writing ---------------------------------------------------------------------------------------------------
+
+#: Says who runs in a folder, for those who find it locked, and how many estimates were reported there. What a killed
+#: run leaves of it tells how many estimates the journal holds at least: SQLite drops the end of a damaged write-ahead
+#: log without a word.
 RUNNING = "running.json"
 
 

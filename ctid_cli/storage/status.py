@@ -1,4 +1,4 @@
-"""How much of an experiment is stored, and where one estimate is."""
+"""How much of an experiment is stored, where one estimate is, and whether all is as it was written."""
 
 from __future__ import annotations
 
@@ -199,6 +199,8 @@ def _in_export(folder: Path) -> Counted:
 
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
+# --- whether what is stored is what was written ----------------------------------------------------------------------
+
 #: What is wrong; all else is in order.
 WRONG = ("damaged", "missing")
 
