@@ -156,7 +156,7 @@ def run_experiment(
         with place.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
-        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), None if allow_mixed else origin)
         place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
@@ -313,7 +313,7 @@ def preview(
     if fresh or not folder.exists():
         return States().workload(plan)
     with place.lock(folder, shared=True):
-        place.check_free(folder, plan.manifest(), current_origin(plan), allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), None if allow_mixed else current_origin(plan))
         with place.reading_journal(folder) as log:
             states = States.read(log, retry, Limits.of(plan.spec.canonical()))
             return states.workload(as_needed(plan, log))

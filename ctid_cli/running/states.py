@@ -128,9 +128,9 @@ def jobs_of(plan: Plan, missing: list[BoolArray]) -> Iterator[Job]:
 
 # --- how many data sets are needed ------------------------------------------------------------------------------------
 #
-# What is decided follows from the stored estimates alone, from those of the data sets before the end of each block. So a
-# run that was interrupted, or that has other workers, decides the same; so does one that finds more estimates than it
-# needs, of an earlier plan.
+# What is decided follows from the stored estimates alone, from those of the data sets before the end of each block. So
+# a run that was interrupted, or that has other workers, decides the same; so does one that finds more estimates than
+# it needs, of an earlier plan.
 
 #: Stored results by estimate.
 Found = Mapping[Key, Mapping[str, Any]]

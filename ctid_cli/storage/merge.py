@@ -84,8 +84,8 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
     plan = _common_plan([(folder, plans[folder]) for folder in others])
     keys = dict.fromkeys(slot.key for slot in slots(plan))
     with _new_folder(target), place.lock(target):
+        place.check_free(target, plan, None, "merge into another folder (--out)")
         with place.saying_what_is_safe(target):
-            _require_same_experiment(target, plan)
             log = open_journal(target / FILE_NAME)
         with closing(log):
             taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
@@ -150,14 +150,6 @@ def _new_folder(target: Path) -> Iterator[None]:
         if made:
             shutil.rmtree(target, ignore_errors=True)
         raise
-
-
-def _require_same_experiment(target: Path, plan: Manifest) -> None:
-    with read_journal(target / FILE_NAME) as log:
-        if log is None and (target / EXPORT).exists():
-            raise RefusedError(f"{target} holds {EXPORT} without its {FILE_NAME}; merge into another folder (--out)")
-        if log is not None and log.experiment() != plan["experiment"]:
-            raise RefusedError(f"{target} holds the experiment {log.experiment()!r}; merge into another folder (--out)")
 
 
 class _Taken:
