@@ -27,7 +27,7 @@ from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
 from ctid_cli.specification.sweeps import MAX_COMBINATIONS, Variant, replaced, variants
-from ctid_cli.specification.system_sections import start_points
+from ctid_cli.specification.system_sections import start_points, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.identity import Origin, origin_of
@@ -290,7 +290,8 @@ def data_cells(
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            content["system"] = system_content(chosen["system"])
+            if is_custom(chosen["system"].options):
+                content["system"]["truth"] = truth_of(chosen["system"])
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
         if measures:
@@ -302,27 +303,24 @@ def data_cells(
         yield DataCell(content, content_hash(content), swept, source, custom)
 
 
-def system_content(system: Variant) -> dict[str, Any]:
-    """Return a system as plain data; in the truth of a custom one the name of an option stands for its value."""
-    content = _without_place(system.values)
-    if is_custom(system.options):
-        truth = content["truth"].items()
-        content["truth"] = {name: content[value] if isinstance(value, str) else value for name, value in truth}
-    return content
-
-
 def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
     """Return what makes the data sets of one combination of the options of the sections."""
     # Absolute, because worker processes may have been started in another working directory.
     folder = spec.folder.resolve()
+    # Any seed will do where nothing is random.
+    seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
     if spec.signal is not None:
-        seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
         given = options["signal"], options.get("disturbance"), options["sampling"]
         return SignalSource(*given, seed, _measuring(spec))
     if spec.data is not None:
         source: Source = dataclasses.replace(located(spec.data.options(), folder), loop=options.get("loop"))
         return source
-    return spec.simulated_source(options, folder)
+    sampling, loop = located(options["sampling"], folder), options.get("loop")
+    if loop is not None:
+        loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
+        loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
+    excitation, fresh = located(options.get("excitation"), folder), "fresh_fit" in (spec.measures or ())
+    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:

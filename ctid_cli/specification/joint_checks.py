@@ -25,7 +25,7 @@ from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
 from ctid_cli.specification.sweeps import Case, Cases
-from ctid_cli.specification.system_sections import RelativeStart, UniformStart
+from ctid_cli.specification.system_sections import RelativeStart, UniformStart, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
@@ -92,7 +92,7 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
         found["generator"] = {spec.generator[0]: _cases(spec, *spec.generator)}
     if spec.system is not None:
         systems = sweeps.variants(spec.system)
-        found["truth"] = {("system",): [(_truth(one), sweeps.swept_in({("system",): one})) for one in systems]}
+        found["truth"] = {("system",): [(truth_of(one), sweeps.swept_in({("system",): one})) for one in systems]}
     if spec.measured is not None and files_are_good:
         found["duration"] = {("data",): [(spec.measured.dataset(0).record.duration, {})]}
     for cases in found["sampling"].values():
@@ -139,14 +139,6 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
     # Random parameters all have the structure of the system.
     found["relative_start"] = dict(list(found.get("relative_start", {}).items())[:1])
     return found
-
-
-def _truth(system: Any) -> Mapping[str, float]:
-    """Return what is true of a variant of the system; the name of an option of a custom one stands for its value."""
-    if not is_custom(system.options):
-        return {"delay": system.options.delay, **system.options.parameters}
-    truth = system.values["truth"].items()
-    return {name: system.values[value] if isinstance(value, str) else value for name, value in truth}
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
-from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
+from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
@@ -345,19 +345,6 @@ class Spec(Section):
         if self.loop is not None and self.loop.reference is not None:
             return ("loop", "reference"), self.loop.reference
         return None
-
-    def simulated_source(self, options: Mapping[str, Any], folder: Path) -> SimulatedSource:
-        """Return what simulates the data sets of one combination of the options of the sections."""
-        sampling, loop = located(options["sampling"], folder), options.get("loop")
-        if loop is not None:
-            loop = replace(loop, reference=located(loop.reference, folder))
-            loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
-        excitation = located(options.get("excitation"), folder)
-        # Any seed will do where nothing is random.
-        seed = 0 if self.monte_carlo is None else self.monte_carlo.seed
-        fresh = "fresh_fit" in (self.measures or ())
-        noise = options.get("noise")
-        return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, fresh)
 
     @property
     def custom_measures(self) -> dict[str, CustomMeasureSection]:
