@@ -88,10 +88,6 @@ class Limits:
             return f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
         return f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
 
-    def too_much(self) -> str:
-        """Return what is said of an estimate that needs more memory than it may have."""
-        return f"needed more than {self.memory_mb:g} MB (limits.memory_mb)"
-
 
 def _data_bytes() -> int:
     """Return the private memory of this process, which RLIMIT_DATA counts; the code of libraries is not in it."""

@@ -162,13 +162,9 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamageError as error:
-        raise DamageError(f"{error}. {what_is_safe(folder)}") from error
-
-
-def what_is_safe(folder: Path) -> str:
-    """Return a sentence about what to do where a journal is damaged."""
-    start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
-    return f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
+        start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
+        cure = f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
+        raise DamageError(f"{error}. {cure}") from error
 
 
 def move_aside(folder: Path) -> Path | None:
