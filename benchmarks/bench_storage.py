@@ -90,7 +90,7 @@ def fill(folder: Path, spec: Path) -> None:
     manifest = plan.manifest()
     (folder / NAME).mkdir(parents=True)
     log = journal.open_journal(folder / NAME / sqlite_file.FILE_NAME)
-    session = log.begin(manifest, current_origin(plan), now(), {"limits": {}, "spec_folder": str(spec.parent)})
+    session = log.begin(manifest, current_origin(plan), now(), {"limits": {}})
     batch: list[Outcome] = []
     for outcome in outcomes(plan, manifest):
         batch.append(outcome)

@@ -168,27 +168,13 @@ class _Finder(MetaPathFinder):
         )
 
 
-@dataclass(frozen=True)
-class Served:
-    """What this process has served; reading it from a pickle serves it in another process too."""
-
-    sources: dict[str, Source]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _received, (self.sources,)
+def served() -> dict[str, Source]:
+    """Return what this process has served, which another one must serve before it reads the rest of a job."""
+    return dict(_SERVED)
 
 
-def served() -> Served:
-    """Return what a worker must be told before it reads the rest of a job."""
-    return Served(dict(_SERVED))
-
-
-def _received(sources: dict[str, Source]) -> Served:
-    _serve(sources)
-    return Served(sources)
-
-
-def _serve(sources: dict[str, Source]) -> None:
+def serve(sources: dict[str, Source]) -> None:
+    """Serve modules to imports by their names."""
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())
     for name, source in sources.items():
@@ -209,7 +195,7 @@ def _serve_file(path: Path, place: str) -> str:
     digest = hashlib.sha256(repr(contents).encode())
     # Named by content, so that a changed file is another module.
     main = f"custom_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
-    _serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
+    serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
     return main
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 #: What else lies in the folder of an experiment; experiments lie in folders too, and must not be called like this.
 TAKEN = (
     *("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm", "journal.sqlite-journal", "runs.h5", "spec.yaml"),
-    *("spec.canonical.json", "running.json", "figures", "report.html"),
+    *("running.json", "figures", "report.html"),
 )
 #: What the name of an experiment matches; parts of it are folders.
 EXPERIMENT = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*"

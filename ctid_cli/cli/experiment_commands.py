@@ -37,8 +37,9 @@ from ctid_cli.reporting.layout import seconds
 from ctid_cli.text import count
 
 if TYPE_CHECKING:
-    from ctid_cli.running.engine import RunSummary, Workload
+    from ctid_cli.running.engine import RunSummary
     from ctid_cli.running.plan import Plan
+    from ctid_cli.running.states import Workload
     from ctid_cli.storage.manifest import Shard
 
 
@@ -192,7 +193,7 @@ def _run_all(
 ) -> list[RunSummary]:
     """Run one experiment after the other, as long as none ends early."""
     from ctid_cli.running.engine import run_experiment
-    from ctid_cli.running.stopping import StopRequest
+    from ctid_cli.running.limits import StopRequest
 
     summaries, ends = [], None if end.time_budget is None else time.monotonic() + end.time_budget
     how |= place.treatment | {"keep_readable": place.keep_readable}

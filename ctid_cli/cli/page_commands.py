@@ -143,13 +143,12 @@ def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str
     from ctid_cli.reporting.pages.track_page import track_page
     from ctid_cli.reporting.records import Records
     from ctid_cli.storage.fit_file import FIT, read_fit
-    from ctid_cli.storage.result_file import kind_in
     from ctid_cli.storage.track_file import TRACK, read_track
 
     if path.suffix.lower() != ".json":
         pages = "pages are made of fit.json (ctid fit) and track.json (ctid track)"
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
-    if kind_in(str(path), FIT) != TRACK.kind:
+    if FIT.kind_in(str(path)) != TRACK.kind:
         fit = read_fit(path, records or None, validate)
         return fit_page(FitResult(fit.result, Records(fit.measurements, fit.validation)), fit.content)
     if validate:

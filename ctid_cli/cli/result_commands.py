@@ -23,7 +23,7 @@ def status(
     """
     from ctid_cli.reporting.results import experiments_in, read_results
     from ctid_cli.reporting.status_result import Overview, StatusResult
-    from ctid_cli.running.precision import cell_precisions
+    from ctid_cli.running.states import cell_precisions
     from ctid_cli.storage.status import experiment_status
 
     if experiment is None:

@@ -48,7 +48,7 @@ def verify(
     """
     from ctid_cli.reporting.results import experiments_in, stored_folder
     from ctid_cli.reporting.status_result import VerificationResult
-    from ctid_cli.storage.verify import verify as check
+    from ctid_cli.storage.status import verify as check
 
     found = [check(stored_folder(out, name)) for name in dict.fromkeys(names or experiments_in(out))]
     if not found:

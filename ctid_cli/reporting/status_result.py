@@ -21,7 +21,7 @@ from ctid_cli.text import count
 if TYPE_CHECKING:
     from ctid_cli.storage.estimates import Estimates
     from ctid_cli.storage.merge import Merged
-    from ctid_cli.storage.verify import Verification
+    from ctid_cli.storage.status import Verification
 
 #: Failed estimates, and data cells that are not precise enough, that texts list.
 LISTED, CELLS_LISTED = 10, 5

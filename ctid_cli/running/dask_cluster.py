@@ -7,7 +7,6 @@ gives it up when these die too; such a job is a suspect, and is computed again i
 
 from __future__ import annotations
 
-import pickle
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -15,17 +14,16 @@ from concurrent.futures import Future
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
 from ctid_cli.running.job import Begun, Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan, computing_parts
-from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed
+from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed, unpacked
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
-from ctid_cli.storage.manifest import Key
-from ctid_cli.temporary import TemporaryFolder
 
 #: How long a worker is waited for where there is none [s], and how often that is looked at.
 PATIENCE = 120.0
@@ -53,8 +51,6 @@ class DaskWorkers:
         # A task, because what is scattered to workers is lost with them.
         self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
-        #: What is in work, and since when [s].
-        self._at_work: dict[Job, float] = {}
         self.count, self.trouble = 1, ""
         self._looked, self._present = float("-inf"), time.monotonic()
         self._look()
@@ -84,26 +80,15 @@ class DaskWorkers:
 
     def _computed(self, jobs: Iterator[Job], function: Callable[..., Ending], at_once: Callable[[], int]) -> Results:
         def submit(job: Job, task: Task) -> Future[Ending]:
-            self._at_work[job] = time.monotonic()
             future: Future[Ending] = self._executor.submit(
                 on_worker, function, task, self._limits, self._expected, self._files
             )
             return future
 
-        try:
-            for over in in_parallel(jobs, submit, at_once, _died):
-                if over is None:
-                    self._look()
-                else:
-                    self._at_work.pop(over[0], None)
-                yield over
-        finally:
-            self._at_work.clear()
-
-    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
-        """Yield the jobs that a worker has had for longer than this, their estimates, and for how long [s]."""
-        times = [(job, job.keys, time.monotonic() - since) for job, since in self._at_work.items()]
-        yield from (one for one in times if one[2] > least)
+        for over in in_parallel(jobs, submit, at_once, _died):
+            if over is None:
+                self._look()
+            yield over
 
     def close(self) -> None:
         """Leave the scheduler, which forgets what was in work."""
@@ -139,11 +124,11 @@ def on_worker(
     """Compute a job on a worker that is as the process of the run."""
     _require_same(expected)
     for sha256 in files.keys() - COPIES.keys():
-        copy = _kept().path / sha256
+        copy = Path(_kept().name) / sha256
         copy.write_bytes(files[sha256])
         COPIES[sha256] = str(copy)
-    with TemporaryFolder() as folder:
-        return function(task, limits, folder)
+    with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as folder:
+        return function(task, limits, Path(folder))
 
 
 def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
@@ -152,9 +137,9 @@ def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
 
 
 @cache
-def _kept() -> TemporaryFolder:
+def _kept() -> TemporaryDirectory[str]:
     """Return the folder of the files that were sent, for as long as this worker lives."""
-    return TemporaryFolder()
+    return TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
 
 
 @cache
@@ -162,7 +147,7 @@ def _require_same(expected: bytes) -> None:
     """Refuse to compute with several threads, or where estimates would come from another origin."""
     from distributed import get_worker
 
-    ours, parts = pickle.loads(expected)[-2:]
+    ours, parts = unpacked(expected)
     worker = get_worker()
     who = f"worker {worker.address} on {platform.node()}"
     if worker.state.nthreads != 1:

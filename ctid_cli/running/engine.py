@@ -10,32 +10,27 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
-from ctid_cli.running.limits import Limits, advice
+from ctid_cli.running.limits import MACHINE, TOO_MANY_FAILURES, Limits, StopRequest, advice
 from ctid_cli.running.plan import Plan, current_origin
-from ctid_cli.running.precision import as_needed, stored_precisions
-from ctid_cli.running.states import States
-from ctid_cli.running.stopping import MACHINE, TOO_MANY_FAILURES, StopRequest
+from ctid_cli.running.states import States, Workload, as_needed, data_sets, jobs_of, stored_precisions
 from ctid_cli.running.suspects import NAMED, Course
 from ctid_cli.running.workers import LocalWorkers
-from ctid_cli.storage import announcement
 from ctid_cli.storage import folder as place
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.export import write_runs
-from ctid_cli.storage.identity import Origin, canonical_text, now, session_info
-from ctid_cli.storage.journal import Journal, JournalReader, open_journal
-from ctid_cli.storage.keeping import keep_readable as keep_readable_of
+from ctid_cli.storage.identity import Origin, now, session_info
+from ctid_cli.storage.journal import Journal, open_journal
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.storage.sqlite_file import FILE_NAME
-from ctid_cli.text import count
+from ctid_cli.storage.merge import keep_readable as keep_readable_of
+from ctid_cli.storage.sqlite_file import FILE_NAME, announce, retract
 
 #: Finished estimates are committed after this time [s], or when there are this many of them.
 COMMIT_SECONDS = 0.2
@@ -44,27 +39,6 @@ COMMIT_ESTIMATES = 200
 _EXIT_CODES = {"SIGINT": 130, "SIGTERM": 143, MACHINE: MachineError.exit_code}
 #: Exit code after any other stop.
 STOPPED = 5
-
-
-class Workload(NamedTuple):
-    """What a run has to do."""
-
-    data_sets: int
-    estimates: int
-    #: Stored ones that stay, failures among those to compute, and stored ones of other plans.
-    reused: int
-    again: int
-    left_aside: int
-    #: Most data sets of a data cell, where it gets as many as a precision needs.
-    at_most: int | None = None
-
-    def __str__(self) -> str:
-        text = f"{count(self.estimates, 'estimate')} of {count(self.data_sets, 'data set')} to compute"
-        text += f", {self.again} of them once more" if self.again else ""
-        text += f", {self.reused} already stored" if self.reused else ""
-        text += f", {self.left_aside} stored ones set aside" if self.left_aside else ""
-        more = f", then in blocks until they are enough, {self.at_most} data sets of a cell at most"
-        return text + more if self.at_most is not None and self.estimates else text
 
 
 class Progress(NamedTuple):
@@ -182,7 +156,7 @@ def run_experiment(
         with place.writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         stack.enter_context(place.lock(folder))
-        place.check_free(folder, plan.manifest(), origin, allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), None if allow_mixed else origin)
         place.clear(folder)
         with place.saying_what_is_safe(folder):
             log = open_journal(folder / FILE_NAME)
@@ -190,43 +164,50 @@ def run_experiment(
         kept = ""
         if moved is not None and keep_readable:
             kept = f"{keep_readable_of(moved, log, plan.manifest(), origin, allow_mixed=allow_mixed)}"
-        found = _found(plan, log, retry, limits)
-        if found.work.estimates:
+        states, plan = States.read(log, retry, limits), as_needed(plan, log)
+        work = states.workload(plan)
+        if work.estimates:
             # Until workers are at work, a signal ends the process as it ends any other.
             warm(plan)
         stack.enter_context(stopping)
-        run = _Run(found, folder, log, progress)
-        stack.callback(announcement.retract, folder)
+        run = _Run(plan, states, work, folder, log, progress)
+        stack.callback(retract, folder)
         run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
-        run.compute(workers, limits, stopping)
-        while not stopping() and run.needs_more():
+        more = True
+        while more:
             run.compute(workers, limits, stopping)
+            more = not stopping() and run.needs_more()
         return run.finish(stopping.reason, moved, begun)
 
 
 class _Run:
     """One run, from the first entry in the journal to ``runs.h5``."""
 
-    def __init__(self, found: _Found, folder: Path, log: Journal, progress: Callable[[Progress], object]) -> None:
-        self.plan, self.states, self.missing, self.work = found
+    def __init__(
+        self,
+        plan: Plan,
+        states: States,
+        work: Workload,
+        folder: Path,
+        log: Journal,
+        progress: Callable[[Progress], object],
+    ) -> None:
+        self.plan, self.states, self.work = plan, states, work
         self.folder, self.log, self.progress = folder, log, progress
         self.computed = self.done = self.failures = 0
-        self.total = self.work.data_sets
+        self.total = work.data_sets
         self.given_up: list[str] = []
         self.hindrance = ""
         self.precision: tuple[CellPrecision, ...] = ()
-        #: Latest time of an estimate by data cell and estimator [s], and estimates left of the data sets in work.
-        self.seconds: dict[tuple[str, str], float] = {}
+        #: Estimates left of the data sets in work.
         self.unfinished: dict[tuple[str, int], int] = {}
         self.started = now()
 
     def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
         """Note the beginning of the run, and say what it has to do."""
-        spec = self.plan.spec
         with place.writing(self.folder):
-            self.log.write_beside(place.SPEC, spec.text.encode())
-            self.log.write_beside(place.CANONICAL, canonical_text(spec.canonical()).encode())
-        info = session_info(spec.text, spec.folder) | circumstances
+            self.log.write_spec(self.plan.spec.text.encode())
+        info = session_info(self.plan.spec.text) | circumstances
         self.session = self.log.begin(self.plan.manifest(), origin, self.started, info)
         self._tell(message=str(self.work))
         if kept:
@@ -238,9 +219,8 @@ class _Run:
         needed = tuple(cell.needed for cell in self.precision)
         if needed in ((), self.plan.replicates):
             return False
-        self.plan = self.plan.with_replicates(needed)
-        self.missing = self.states.missing(self.plan)
-        self.total = self.done + sum(int(lacking.sum()) for lacking in self.missing)
+        self.plan = replace(self.plan, replicates=needed)
+        self.total = self.done + data_sets(self.states.missing(self.plan))
         self.log.replan(self.plan.manifest())
         self._tell(precision=self.precision)
         return True
@@ -275,7 +255,7 @@ class _Run:
             stopping.ask(MACHINE)
 
     def _jobs(self) -> Iterator[Job]:
-        for job in self.states.jobs(self.plan, self.missing, self.seconds):
+        for job in jobs_of(self.plan, self.states.missing(self.plan)):
             self.unfinished[job.cell.hash, job.replicate] = len(job.wanted)
             yield job
 
@@ -288,7 +268,6 @@ class _Run:
             key, status = outcome.key, outcome.result["status"]
             self.states.note(key, status)
             self.failures += status in FAILURES
-            self.seconds[key.data_hash, key.estimator_hash] = outcome.seconds or 0.0
             data_set = key.data_hash, key.replicate
             self.unfinished[data_set] -= 1
             if not self.unfinished[data_set]:
@@ -300,28 +279,27 @@ class _Run:
 
     def _tell(self, **what: Any) -> None:
         counts = self.done, self.total, self.states.stored
-        announcement.announce(self.folder, self.plan.experiment, self.started, *counts)
+        announce(self.folder, self.plan.experiment, self.started, *counts)
         self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
         """Write ``runs.h5``, and note how the run ended."""
         write_runs(self.folder, self.log)
-        counts = self.states.counts(self.plan)
-        missing = counts.planned - counts.reused
+        left = self.states.workload(self.plan)
         reason = reason or (MACHINE if self.given_up else None)
-        self.log.end(self.session, now(), "finished" if not missing else reason or "unfinished")
+        self.log.end(self.session, now(), "finished" if not left.estimates else reason or "unfinished")
         return RunSummary(
             experiment=self.plan.experiment,
             folder=self.folder,
-            planned=counts.planned,
-            reused=counts.reused - self.computed,
+            planned=left.reused + left.estimates,
+            reused=left.reused - self.computed,
             computed=self.computed,
-            failed=counts.failed,
+            failed=left.failed,
             left_aside=self.work.left_aside,
             mixed=len(self.log.origins()) > 1,
             moved_aside=moved,
             seconds=time.monotonic() - begun,
-            stopped_by=reason if missing else None,
+            stopped_by=reason if left.estimates else None,
             precision=self.precision,
             given_up=tuple(self.given_up),
             hindrance=self.hindrance,
@@ -332,36 +310,10 @@ def preview(
     plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
 ) -> Workload:
     """Return what a run would do, without doing or writing anything."""
-    limits = Limits.of(plan.spec.canonical())
     if fresh or not folder.exists():
-        return _found(plan, None, retry, limits).work
+        return States().workload(plan)
     with place.lock(folder, shared=True):
-        place.check_free(folder, plan.manifest(), current_origin(plan), allow_mixed=allow_mixed)
+        place.check_free(folder, plan.manifest(), None if allow_mixed else current_origin(plan))
         with place.reading_journal(folder) as log:
-            return _found(plan, log, retry, limits).work
-
-
-class _Found(NamedTuple):
-    """A plan as far as it is decided by what is stored, that, and what is to be computed."""
-
-    plan: Plan
-    states: States
-    #: Of each data cell which replicates are to be computed.
-    missing: list[BoolArray]
-    work: Workload
-
-
-def _found(plan: Plan, log: JournalReader | None, retry: Collection[str], limits: Limits) -> _Found:
-    """Return what of a plan is stored in a journal."""
-    states = States() if log is None else States.read(log, retry, limits)
-    plan = plan if log is None else as_needed(plan, log)
-    counts, missing = states.counts(plan), states.missing(plan)
-    work = Workload(
-        data_sets=sum(int(lacking.sum()) for lacking in missing),
-        estimates=counts.planned - counts.reused,
-        reused=counts.reused,
-        again=counts.again,
-        left_aside=states.stored - counts.reused - counts.again,
-        at_most=plan.monte_carlo.get("at_most"),
-    )
-    return _Found(plan, states, missing, work)
+            states = States.read(log, retry, Limits.of(plan.spec.canonical()))
+            return states.workload(as_needed(plan, log))

@@ -182,7 +182,7 @@ def ended(keys: Collection[Key], error: BaseException, limits: Limits) -> Iterat
     if lacking is None:
         result = failure(error)
     elif isinstance(lacking, MemoryError) and limits.memory_mb is not None:
-        result = failed(limits.too_much(), "MEMORY")
+        result = failed(f"needed more than {limits.memory_mb:g} MB (limits.memory_mb)", "MEMORY")
     else:
         said = _said(lacking)
         yield Short(tuple(keys), f"out of memory: {said}" if isinstance(lacking, MemoryError) else said)

@@ -1,4 +1,4 @@
-"""What one estimate may take of the machine, and what the machine may lack.
+"""What one estimate may take of the machine, what the machine may lack, and when a run is to stop.
 
 Limits are those of the operating system, which keeps them whatever the estimator does, in Python or in C: a timer of
 processor time, a watchdog that ends the process after some wall time, and a limit of memory that lets allocations fail.
@@ -13,10 +13,13 @@ import re
 import resource
 import signal
 import sys
+import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any, BinaryIO, Self
 
 from ctid_cli.errors import UsageError
@@ -85,10 +88,6 @@ class Limits:
             return f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
         return f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
 
-    def too_much(self) -> str:
-        """Return what is said of an estimate that needs more memory than it may have."""
-        return f"needed more than {self.memory_mb:g} MB (limits.memory_mb)"
-
 
 def _data_bytes() -> int:
     """Return the private memory of this process, which RLIMIT_DATA counts; the code of libraries is not in it."""
@@ -136,3 +135,59 @@ _ANY = f"look whether something ends processes here, {_FEWER}, or try another ma
 def advice(reason: str) -> str:
     """Return what helps against something that stood in the way of estimates."""
     return next((text for pattern, text in _ADVICE if re.search(pattern, reason)), _ANY)
+
+
+# --- when a run is to stop --------------------------------------------------------------------------------------------
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+#: Reasons that are no signals.
+TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
+
+
+class StopRequest:
+    """Notices requests to stop; signals, while it is entered.
+
+    The first signal is only noted, so that what is in work can be finished and stored. The second ends the process at
+    once, as if nobody had listened; the workers end with it, and the journal is made for that.
+    """
+
+    def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
+        """Stop after failed estimates of this run, or after some time [s]."""
+        self.failures = failures
+        self._deadline = None if seconds is None else time.monotonic() + seconds
+        self._reason: str | None = None
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        # Python hands signals to the main thread only; elsewhere whoever owns the main thread decides.
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.ask(signal.Signals(number).name)
+        for each in _SIGNALS:
+            signal.signal(each, signal.SIG_DFL)
+
+    def ask(self, reason: str) -> None:
+        """Ask for a stop; the first reason counts."""
+        self._reason = self._reason or reason
+
+    def __call__(self) -> bool:
+        """Return whether a stop was asked for."""
+        return self.reason is not None
+
+    @property
+    def reason(self) -> str | None:
+        """Name of the signal, another reason, or None."""
+        if self._deadline is not None and time.monotonic() > self._deadline:
+            self.ask(TIME_BUDGET)
+        return self._reason

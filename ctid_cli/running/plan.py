@@ -27,10 +27,10 @@ from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
 from ctid_cli.specification.sweeps import MAX_COMBINATIONS, Variant, replaced, variants
-from ctid_cli.specification.system_sections import start_points
+from ctid_cli.specification.system_sections import start_points, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import reserved_names
-from ctid_cli.storage.identity import Origin, code_version, modules_of, origin_of
+from ctid_cli.storage.identity import Origin, origin_of
 from ctid_cli.storage.manifest import Key, Manifest, Shard
 
 #: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
@@ -83,10 +83,6 @@ class Plan:
         """Number of estimates of every data set."""
         return len(self.keys(0, 0))
 
-    def with_replicates(self, replicates: Sequence[int]) -> Plan:
-        """Return the plan with other numbers of data sets."""
-        return dataclasses.replace(self, replicates=tuple(replicates))
-
     def part(self, shard: Shard) -> Plan:
         """Return the part of the plan that one shard computes."""
         section = self.spec.monte_carlo
@@ -114,11 +110,11 @@ class Plan:
             for start in starts_of(part.estimator.start_from, self.starts)
         ]
 
-    def job(self, cell: int, replicate: int) -> Job:
-        """Return a data set and the estimates wanted of it; two names of the same estimator share theirs."""
-        wanted = {one[0]: one for one in reversed(self.keys(cell, replicate))}
-        seed = self.monte_carlo.get("seed")
-        return Job(self.data_cells[cell], replicate, seed, tuple(reversed(wanted.values())), self.terms)
+    def job(self, cell: int, replicate: int, wanted: BoolArray | None = None) -> Job:
+        """Return a data set and those of its estimates that are wanted; by default all."""
+        keys = self.keys(cell, replicate)
+        asked = tuple(keys if wanted is None else itertools.compress(keys, wanted))
+        return Job(self.data_cells[cell], replicate, self.monte_carlo.get("seed"), asked, self.terms)
 
     @cached_property
     def terms(self) -> tuple[Term, ...] | None:
@@ -179,8 +175,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         section = section if runs is None else MonteCarloSection(runs=runs, seed=section.seed)
         spec = replaced(spec, ("monte_carlo",), section)
         count, first = section.most, section.first
-    # Of a measured record only those of its loop.
-    parts = {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
+    parts = data_parts(spec)
     cells = math.prod(map(len, parts.values()))
     for number, most, what in ((cells, MAX_COMBINATIONS, "data cells"), (cells * count, MAX_DATA_SETS, "data sets")):
         if number > most:
@@ -192,7 +187,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
         starts = (*starts, NO_START)
     spec_hash = content_hash(_without_circumstances(spec.canonical()))
-    return Plan(spec, tuple(_data_cells(spec, parts, names)), estimators, starts, (first,) * cells, spec_hash)
+    return Plan(spec, tuple(data_cells(spec, parts, names)), estimators, starts, (first,) * cells, spec_hash)
 
 
 def simulate_dataset(
@@ -270,8 +265,16 @@ def simulate_dataset(
     return source.dataset(replicate)
 
 
-def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str]) -> Iterator[DataCell]:
-    """Yield every combination of the variants of the sections that data are made from."""
+def data_parts(spec: Spec) -> dict[str, list[Variant]]:
+    """Return the variants of the sections that data are made from; of a measured record only those of its loop."""
+    return {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
+
+
+def data_cells(
+    spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str] | None = None
+) -> Iterator[DataCell]:
+    """Yield every combination of the variants of the sections; swept fields have the names of their columns."""
+    names = _column_names(parts) if names is None else names
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
     custom = tuple((name, variant.options) for name, variant in measures.items())
@@ -287,7 +290,8 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            content["system"] = system_content(chosen["system"])
+            if is_custom(chosen["system"].options):
+                content["system"]["truth"] = truth_of(chosen["system"])
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
         if measures:
@@ -299,27 +303,24 @@ def _data_cells(spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[K
         yield DataCell(content, content_hash(content), swept, source, custom)
 
 
-def system_content(system: Variant) -> dict[str, Any]:
-    """Return a system as plain data; in the truth of a custom one the name of an option stands for its value."""
-    content = _without_place(system.values)
-    if is_custom(system.options):
-        truth = content["truth"].items()
-        content["truth"] = {name: content[value] if isinstance(value, str) else value for name, value in truth}
-    return content
-
-
 def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
     """Return what makes the data sets of one combination of the options of the sections."""
     # Absolute, because worker processes may have been started in another working directory.
     folder = spec.folder.resolve()
+    # Any seed will do where nothing is random.
+    seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
     if spec.signal is not None:
-        seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
         given = options["signal"], options.get("disturbance"), options["sampling"]
         return SignalSource(*given, seed, _measuring(spec))
     if spec.data is not None:
         source: Source = dataclasses.replace(located(spec.data.options(), folder), loop=options.get("loop"))
         return source
-    return spec.simulated_source(options, folder)
+    sampling, loop = located(options["sampling"], folder), options.get("loop")
+    if loop is not None:
+        loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
+        loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
+    excitation, fresh = located(options.get("excitation"), folder), "fresh_fit" in (spec.measures or ())
+    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -378,7 +379,7 @@ def current_origin(plan: Plan) -> Origin:
 
 def current_version(plan: Plan) -> str:
     """Return the code version of these estimates, on whichever processor."""
-    return code_version(set().union(*map(modules_of, computing_parts(plan))))
+    return current_origin(plan).code_version
 
 
 def computing_parts(plan: Plan) -> list[Any]:

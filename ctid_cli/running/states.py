@@ -1,20 +1,25 @@
-"""Which estimates are stored: one table of states, from which follows what is still to be computed."""
+"""Which estimates are stored, how many are needed, and what is still to be computed."""
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import BoolArray, IndexArray
+from ctid_cli.inference.monte_carlo import CellPrecision, Replications, Until, decide
 from ctid_cli.running.job import Job
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.plan import Plan
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import Key
+from ctid_cli.storage.manifest import Key, Manifest, true_values
+from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
+from ctid_cli.text import count
 
 #: States of an estimate: not stored, stored, stored as a failure, and a failure that is to be computed once more.
 ABSENT, STORED, FAILED, AGAIN = range(4)
@@ -23,14 +28,26 @@ _TO_COMPUTE = (ABSENT, AGAIN)
 Place = tuple[str, str, str]
 
 
-class Counts(NamedTuple):
-    """Estimates of a plan."""
+class Workload(NamedTuple):
+    """What of a plan is stored, and what is to be computed."""
 
-    planned: int
-    #: Stored ones that stay as they are; failures among all stored ones, and those to be computed once more.
+    data_sets: int
+    estimates: int
+    #: Stored ones that stay, failures among all stored ones, failures to compute again, stored ones of other plans.
     reused: int
     failed: int
     again: int
+    left_aside: int
+    #: Most data sets of a data cell, where it gets as many as a precision needs.
+    at_most: int | None = None
+
+    def __str__(self) -> str:
+        text = f"{count(self.estimates, 'estimate')} of {count(self.data_sets, 'data set')} to compute"
+        text += f", {self.again} of them once more" if self.again else ""
+        text += f", {self.reused} already stored" if self.reused else ""
+        text += f", {self.left_aside} stored ones set aside" if self.left_aside else ""
+        more = f", then in blocks until they are enough, {self.at_most} data sets of a cell at most"
+        return text + more if self.at_most is not None and self.estimates else text
 
 
 class States:
@@ -42,76 +59,132 @@ class States:
         self.stored = 0
 
     @classmethod
-    def read(cls, log: JournalReader, retry: Collection[str], limits: Limits) -> States:
+    def read(cls, log: JournalReader | None, retry: Collection[str], limits: Limits) -> States:
         """Read what a journal holds; failures are unwanted of some statuses, and where a limit has risen since."""
-        states, before = cls(), {session.id: Limits.of(session.info) for session in log.sessions()}
+        states = cls()
+        if log is None:
+            return states
+        before = {session.id: Limits.of(session.info) for session in log.sessions()}
         for row in log.rows():
             states.note(row.key, row.status)
             if row.status in FAILURES and (row.status in retry or limits.rose_since(before[row.session], row.status)):
-                states._set(row.key, AGAIN)
+                states._of(row.key)[row.replicate] = AGAIN
         return states
 
     def note(self, key: Key, status: str) -> None:
         """Note that an estimate was stored."""
-        self.stored += self._set(key, FAILED if status in FAILURES else STORED) == ABSENT
+        known = self._of(key)
+        known.extend(bytes(max(0, key.replicate + 1 - len(known))))
+        self.stored += known[key.replicate] == ABSENT
+        known[key.replicate] = FAILED if status in FAILURES else STORED
 
-    def _set(self, key: Key, state: int) -> int:
-        """Set a state and return the one before."""
-        known = self._states[key.data_hash, key.estimator_hash, key.start]
-        if key.replicate >= len(known):
-            known.extend(bytes(key.replicate + 1 - len(known)))
-        before, known[key.replicate] = known[key.replicate], state
-        return before
+    def _of(self, key: Key) -> bytearray:
+        """Return the states of an estimate on all replicates."""
+        return self._states[key.data_hash, key.estimator_hash, key.start]
 
-    def _get(self, key: Key) -> int:
-        known = self._states.get((key.data_hash, key.estimator_hash, key.start), b"")
-        return known[key.replicate] if key.replicate < len(known) else ABSENT
-
-    def _of(self, key: Key, count: int) -> Array:
-        """Return the states of the first replicates of a place."""
-        known = self._states.get((key.data_hash, key.estimator_hash, key.start), bytearray())
-        return np.frombuffer(known[:count].ljust(count, b"\0"), dtype=np.uint8)
-
-    def counts(self, plan: Plan) -> Counts:
-        """Count the estimates of a plan; those that two names share, once."""
-        planned: dict[Place, BoolArray] = {}
-        states: dict[Place, Array] = {}
-        for cell in range(len(plan.data_cells)):
-            asked = plan.asked(cell)
-            for key in {key for key, _, _ in plan.keys(cell, 0)}:
-                place = key.data_hash, key.estimator_hash, key.start
-                planned[place] = asked | planned[place] if place in planned else asked
-                states[place] = self._of(key, len(asked))
-        found = np.zeros(4, dtype=int)
-        for place, asked in planned.items():
-            found += np.bincount(states[place][asked], minlength=4)
-        return Counts(int(found.sum()), int(found[STORED] + found[FAILED]), int(found[2:].sum()), int(found[AGAIN]))
+    def _table(self, plan: Plan, cell: int) -> IndexArray:
+        """Return the states of the estimates of a data cell, shape (estimates of a data set, replicates)."""
+        own = plan.replicates[cell]
+        rows = [bytes(self._of(key)[:own]).ljust(own, b"\0") for key, _, _ in plan.keys(cell, 0)]
+        return np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), own).astype(int)
 
     def missing(self, plan: Plan) -> list[BoolArray]:
-        """Return for every data cell which replicates lack an estimate; of cells that share theirs, for the first."""
-        found: list[BoolArray] = []
-        seen: set[str] = set()
+        """Return for every data cell which estimates are to be computed, shape (estimates, replicates)."""
+        cells = range(len(plan.data_cells))
+        return [np.isin(self._table(plan, cell), _TO_COMPUTE) & plan.asked(cell) for cell in cells]
+
+    def workload(self, plan: Plan) -> Workload:
+        """Return what of a plan is stored, and what is to be computed."""
+        found = np.zeros(4, dtype=int)
         for cell in range(len(plan.data_cells)):
-            asked = plan.asked(cell)
-            lacking = np.zeros(len(asked), dtype=bool)
-            for key in {key for key, _, _ in plan.keys(cell, 0) if key.data_hash not in seen}:
-                lacking |= np.isin(self._of(key, len(asked)), _TO_COMPUTE)
-            seen.add(plan.data_cells[cell].hash)
-            found.append(lacking & asked)
-        return found
+            found += np.bincount(self._table(plan, cell)[:, plan.asked(cell)].ravel(), minlength=4)
+        absent, stored, failed, again = found.tolist()
+        return Workload(
+            data_sets=data_sets(self.missing(plan)),
+            estimates=absent + again,
+            reused=stored + failed,
+            failed=failed + again,
+            again=again,
+            left_aside=self.stored - stored - failed - again,
+            at_most=plan.monte_carlo.get("at_most"),
+        )
 
-    def jobs(self, plan: Plan, missing: list[BoolArray], seconds: Mapping[tuple[str, str], float]) -> Iterator[Job]:
-        """Yield the jobs of a plan when they are asked for, replicate by replicate, the longest of each first.
 
-        Replicates stay in order: a run that is stopped has as many data sets of one cell as of another. What an
-        estimate takes is known from those of its data cell and estimator; unknown ones come first.
-        """
+def data_sets(missing: list[BoolArray]) -> int:
+    """Return the number of data sets that lack an estimate."""
+    return sum(int(lacking.any(axis=0).sum()) for lacking in missing)
 
-        def expected(job: Job) -> float:
-            return sum(seconds.get((key.data_hash, key.estimator_hash), float("inf")) for key in job.keys)
 
-        for replicate in range(plan.runs):
-            cells = [k for k, lacking in enumerate(missing) if replicate < len(lacking) and lacking[replicate]]
-            jobs = [plan.job(cell, replicate) for cell in cells]
-            wanted = [job.only([key for key in job.keys if self._get(key) in _TO_COMPUTE]) for job in jobs]
-            yield from sorted(wanted, key=expected, reverse=True)
+def jobs_of(plan: Plan, missing: list[BoolArray]) -> Iterator[Job]:
+    """Yield the jobs of a plan when they are asked for, replicate by replicate.
+
+    So a run that is stopped has as many data sets of one cell as of another.
+    """
+    for replicate in range(plan.runs):
+        for cell, lacking in enumerate(missing):
+            if replicate < lacking.shape[1] and lacking[:, replicate].any():
+                yield plan.job(cell, replicate, lacking[:, replicate])
+
+
+# --- how many data sets are needed ------------------------------------------------------------------------------------
+#
+# What is decided follows from the stored estimates alone, from those of the data sets before the end of each block. So
+# a run that was interrupted, or that has other workers, decides the same; so does one that finds more estimates than
+# it needs, of an earlier plan.
+
+#: Stored results by estimate.
+Found = Mapping[Key, Mapping[str, Any]]
+
+
+def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ...]:
+    """How well every data cell is known; nothing where the number of data sets is given."""
+    section = _asked(manifest)
+    return () if section is None else tuple(_cell(manifest, cell, section, found) for cell in manifest["data_cells"])
+
+
+def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPrecision, ...]:
+    """The same from what a journal holds."""
+    if _asked(manifest) is None:
+        return ()
+    return cell_precisions(manifest, {row.key: row.content for row in log.rows()})
+
+
+def as_needed(plan: Plan, log: JournalReader | None) -> Plan:
+    """The plan with as many data sets as are known to be needed."""
+    cells = () if log is None else stored_precisions(plan.manifest(), log)
+    return replace(plan, replicates=tuple(cell.needed for cell in cells)) if cells else plan
+
+
+def _asked(manifest: Manifest) -> Mapping[str, Any] | None:
+    """The section that asks for a precision."""
+    section: Mapping[str, Any] = manifest["spec"].get("monte_carlo") or {}
+    return section if section.get("until") else None
+
+
+def _cell(manifest: Manifest, cell: Mapping[str, Any], section: Mapping[str, Any], found: Found) -> CellPrecision:
+    truth = true_values(cell)
+    replications = [
+        _replications(found, cell["hash"], part, start, manifest["success"], truth)
+        for part in manifest["estimators"]
+        for start in part["starts"]
+    ]
+    return decide(Until(**section["until"]), replications, section["at_most"], cell["hash"], cell["swept"])
+
+
+def _replications(
+    found: Found,
+    data: str,
+    part: Mapping[str, Any],
+    start: str,
+    success: Mapping[str, Any] | None,
+    truth: Mapping[str, float],
+) -> Replications:
+    """Return what an estimator gave, from the first data set to the last before one that is missing."""
+    keys = (Key(data, replicate, part["hash"], start) for replicate in itertools.count())
+    results = [found[key] for key in itertools.takewhile(found.__contains__, keys)]
+    arrays = arrays_of_rows(results)
+    values = found_under(tuple(truth), arrays, len(results)).values
+    # Without a rule, or without true values to compare with, an estimate neither converges nor fails to.
+    hits = judged(success, truth, arrays, values, [row.get("measures") for row in results])
+    errors = values - np.array([*truth.values()], dtype=float)
+    return Replications(hits, errors, tuple(truth), part["name"], part["swept"], start)

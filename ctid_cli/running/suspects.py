@@ -20,7 +20,7 @@ from ctid_cli.running.job import Job, Short
 from ctid_cli.running.limits import Limits
 from ctid_cli.running.workers import Ending
 from ctid_cli.storage.columns import failed
-from ctid_cli.storage.manifest import Key, Outcome
+from ctid_cli.storage.manifest import Outcome
 from ctid_cli.text import count
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 #: to their number [s]. A round ends early when the machine was short of something this often.
 PATIENCE, PAUSE = 4, 0.3
 SHORTAGES = 8
-#: An estimate that takes so long is mentioned, and again after twice the time [s].
-SLOW = 600.0
 #: Share of a limit of wall time that a process must have had the processor for, to be guilty of it [-].
 AT_WORK = 0.5
 #: Estimates given up that are named.
@@ -68,7 +66,6 @@ class Course:
         self._short = self._vain = 0
         #: What the last process died of, or the machine was short of.
         self._reason = ""
-        self._mentioned: dict[Key, float] = {}
 
     def outcomes(self) -> Generator[list[Outcome]]:
         """Yield finished estimates; an empty list now and then."""
@@ -110,16 +107,7 @@ class Course:
     def _settled(self, results: Iterator[tuple[Job, Ending] | None], tries: int) -> Generator[list[Outcome]]:
         """Decide on jobs that ended, in the pool at first, then alone, then alone on the machine."""
         for result in results:
-            if result is None:
-                self._mention_slow()
             yield [] if result is None else self._settle(*result, tries)
-
-    def _mention_slow(self) -> None:
-        for job, keys, seconds in self._workers.slow(SLOW):
-            if seconds > self._mentioned.get(keys[0], SLOW):
-                self._mentioned[keys[0]] = 2 * seconds
-                took = f"{job.names(keys)[0]} has been in work for {seconds / 60:.0f} min"
-                self._tell(f"{took}; limits.wall_seconds would end what takes longer than it says")
 
     def _settle(self, job: Job, ending: Ending, tries: int) -> list[Outcome]:
         """Return what a job has finished, and decide on the rest of it."""

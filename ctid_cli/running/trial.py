@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,9 +27,9 @@ from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.job import measured
+from ctid_cli.running.job import DataCell, measured
 from ctid_cli.running.limits import Limits
-from ctid_cli.running.plan import estimation, source_of, starts_of, structure, system_content
+from ctid_cli.running.plan import data_cells, data_parts, estimation, starts_of, structure
 from ctid_cli.running.workers import call_alone
 from ctid_cli.simulation.components import ComponentError, is_custom
 from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource
@@ -36,14 +37,13 @@ from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.joint_checks import MAX_TRIALS
 from ctid_cli.specification.load import load_spec
 from ctid_cli.specification.messages import Complaint
-from ctid_cli.specification.spec import OF_DATA, Spec
+from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import Failure, Variant, grouped, swept_in, variants
 from ctid_cli.specification.system_sections import start_points
 from ctid_cli.specification.yaml_source import KeyPath
 from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.truth import found_of_rows
-from ctid_cli.temporary import TemporaryFolder
 
 #: Samples of the data sets that are made, and time after which no other is begun [s].
 MAX_TRIAL_SAMPLES = 20_000_000
@@ -70,14 +70,10 @@ def load_tried(
 
 
 class Setting(NamedTuple):
-    """One combination of what data sets are made from."""
+    """One combination of what data sets are made from, and the swept values that tell it from others."""
 
-    source: Any
+    cell: DataCell
     swept: Mapping[KeyPath, Any]
-    #: True values of the parameters by name.
-    truth: Mapping[str, float]
-    #: Custom measures with their names.
-    measures: Sequence[tuple[str, Any]]
 
 
 class Candidate(NamedTuple):
@@ -107,44 +103,41 @@ def try_out(spec: Spec) -> Found:
     """Try the settings and estimators of a specification; sections that have mistakes are not in it."""
     settings, candidates = _settings(spec), list(_candidates(spec))
     success = {} if spec.success is None else spec.success.model_dump()
-    custom_data = any(_custom_parts(setting.source) for setting in settings)
+    custom_data = any(_custom_parts(setting.cell.source) for setting in settings)
     if not (custom_data or spec.custom_measures or any(candidate.is_custom for candidate in candidates)):
         return _try_all(settings, candidates, success)
     limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
     found = None
     # What ends its process, or cannot be sent to one, is left to the run.
-    with TemporaryFolder() as folder, suppress(Exception):
+    with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made, suppress(Exception):
+        folder = Path(made)
         found = call_alone(folder, _try_under_limits, limits, folder / "late", settings, candidates, success)[0]
     return found or Found()
 
 
 def _settings(spec: Spec) -> list[Setting]:
-    """Return the distinct settings; levels of noise decide on nothing else and take turns."""
-    parts: dict[KeyPath, Sequence[Variant]]
-    parts = {(name,): variants(section) for name in OF_DATA if (section := getattr(spec, name)) is not None}
+    """Return the distinct settings, each with the first level of the noise: the others decide on nothing else."""
+    parts = data_parts(spec)
     if spec.signal is None and spec.data is None:
         if spec.loop is None and spec.excitation is None:
             return []
         # The other sections are tried although the system is wrong.
-        parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
+        parts.setdefault("system", [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
     if spec.data is None and spec.sampling is None:
         return []
-    turns = {at: parts.pop(at) for at in (("noise",),) if at in parts}
-    measures = [(name, variants(section)[0].options) for name, section in spec.custom_measures.items()]
+    parts |= {"noise": parts["noise"][:1]} if "noise" in parts else {}
     settings: list[Setting] = []
     samples = 0
-    for k, point in enumerate(itertools.islice(itertools.product(*parts.values()), MAX_TRIALS)):
-        case = dict(zip(parts, point, strict=True))
-        chosen = case | {at: found[k % len(found)] for at, found in turns.items()}
-        options = {str(at[0]): variant.options for at, variant in chosen.items()}
-        source = source_of(spec, options)
-        if not isinstance(source, MeasuredSource) and not is_custom(source.sampling):
-            samples += source.sampling.length
+    points = itertools.product(*parts.values())
+    for cell, point in itertools.islice(zip(data_cells(spec, parts), points, strict=True), MAX_TRIALS):
+        if not isinstance(cell.source, MeasuredSource) and not is_custom(cell.source.sampling):
+            samples += cell.source.sampling.length
         if samples > MAX_TRIAL_SAMPLES and settings:
             break
-        system = chosen.get(("system",))
-        truth = true_values({"content": {"system": system_content(system)}}) if system and system.values else {}
-        settings.append(Setting(source, swept_in(case), truth, measures))
+        case: dict[KeyPath, Variant] = {
+            (name,): variant for name, variant in zip(parts, point, strict=True) if name != "noise"
+        }
+        settings.append(Setting(cell, swept_in(case)))
     return settings
 
 
@@ -184,7 +177,7 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
             if tried and time.monotonic() > end:
                 break
             first = not tried
-            data, complaints = _first_data(setting.source)
+            data, complaints = _first_data(setting.cell.source)
             tried[_DATA].append(setting.swept)
             failures[_DATA] += [(path, text, setting.swept) for path, text in complaints]
             for candidate in candidates if data is not None else ():
@@ -193,7 +186,7 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
                     unusable = _unusable(candidate.estimator, data)
                     tried[name].append(swept)
                     failures[name] += [(("estimators", name), unusable, swept)] if unusable else []
-                if first and not unusable and (candidate.is_custom or setting.measures):
+                if first and not unusable and (candidate.is_custom or setting.cell.measures):
                     _fit(candidate, data, setting, [one.estimator for one in candidates], success, found)
     for subject, some in failures.items():
         found.wrong.extend(grouped(some, tried[subject]))
@@ -266,12 +259,12 @@ def _fit(
 ) -> None:
     """Fit an estimator to the first data set, with custom measures, as a run does."""
     path: KeyPath = ("estimators", candidate.name, "kind")
-    terms = structure(setting.source, estimators)
+    cell, terms = setting.cell, structure(setting.cell.source, estimators)
 
     def fit() -> tuple[dict[str, Any], dict[str, Any], dict[str, str]]:
-        start = candidate.start.draw(getattr(setting.source, "seed", 0), 0, data.true_model)
+        start = candidate.start.draw(getattr(cell.source, "seed", 0), 0, data.true_model)
         fitted = candidate.estimator.prepare(data.record).fit(start)
-        return plain(data.result_of(fitted, start, terms)), *measured(setting.measures, fitted, data, Limits())
+        return plain(data.result_of(fitted, start, terms)), *measured(cell.measures, fitted, data, Limits())
 
     try:
         (first, values, reasons), (second, others, _) = _twice(fit)
@@ -292,7 +285,9 @@ def _fit(
             text = f"fails on the first data set, with the estimator {candidate.name!r}: {why}"
             found.odd.append((("measures", name), f"{text}; such estimates are stored without it"))
         if first["status"] not in FAILURES and candidate.is_custom:
-            found.odd.extend((path, text) for text in _uncounted(first, setting.truth, success))
+            found.odd.extend(
+                (path, text) for text in _uncounted(first, true_values({"content": cell.content}), success)
+            )
 
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:

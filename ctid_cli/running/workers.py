@@ -24,6 +24,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ThreadPo
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from ctid_cli import custom_code
@@ -31,7 +32,6 @@ from ctid_cli.running.job import Begun, Entry, Job, ended, run_job
 from ctid_cli.running.limits import Limits
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.manifest import Key, Outcome
-from ctid_cli.temporary import TemporaryFolder
 
 #: How often the caller gets a chance to do something else while nothing is finished [s].
 TICK = 0.1
@@ -155,15 +155,15 @@ def main() -> None:
 
 def packed(*content: Any) -> bytes:
     """Return content for another process, after the custom code that it needs to read it and the files it was sent."""
-    return pickle.dumps((custom_code.served(), COPIES, *content))
+    return pickle.dumps((custom_code.served(), COPIES, pickle.dumps(content)))
 
 
 def unpacked(data: bytes) -> list[Any]:
     """Return content from another process."""
-    content: list[Any]
-    _, copies, *content = pickle.loads(data)
+    sources, copies, content = pickle.loads(data)
+    custom_code.serve(sources)
     COPIES.update(copies)
-    return content
+    return list(pickle.loads(content))
 
 
 def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple[Any, str, float]:
@@ -275,8 +275,9 @@ class LocalWorkers:
         self.count, self._limits = count, limits
         #: Why the last workers ended before all was done.
         self.trouble = ""
-        self._folder = TemporaryFolder()
-        self._stop, self._going = self._folder.path / _STOP, self._folder.path / _GOING
+        self._made = TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
+        self._folder = Path(self._made.name)
+        self._stop, self._going = self._folder / _STOP, self._folder / _GOING
         self._numbers = itertools.count()
         #: What is in work, by the place of its record, and whether nothing follows.
         self._at_work: dict[Path, Job] = {}
@@ -345,7 +346,7 @@ class LocalWorkers:
             if self.count == 1:
                 yield delayed(_wait)(self._going)
             for job in jobs:
-                record, task = self._folder.path / str(next(self._numbers)), task_of(job)
+                record, task = self._folder / str(next(self._numbers)), task_of(job)
                 self._at_work[record] = job
                 if isinstance(task, Ending):
                     news.put((record, task.entries))
@@ -377,7 +378,7 @@ class LocalWorkers:
         started: list[Future[Ending]] = []
 
         def submit(job: Job, task: Task) -> Future[Ending]:
-            folder = self._folder.path / f"alone-{next(self._numbers)}"
+            folder = self._folder / f"alone-{next(self._numbers)}"
             self._at_work[folder / "record"] = job
             started.append(threads.submit(compute_alone, task, self._limits, folder))
             return started[-1]
@@ -404,31 +405,22 @@ class LocalWorkers:
             time.sleep(TICK)
         self._at_work.clear()
 
-    def _seconds(self) -> Iterator[tuple[Path, float]]:
-        """Yield the record of each job in work, and for how long its estimate has been in work [s]."""
-        for record in list(self._at_work):
-            with suppress(OSError):
-                yield record, time.time() - record.stat().st_mtime
-
     def _watch(self) -> None:
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
-        if self._limits.wall_seconds is not None:
-            for record, seconds in self._seconds():
+        limit = self._limits.wall_seconds
+        if limit is None:
+            return
+        for record in list(self._at_work):
+            with suppress(OSError):
+                seconds = time.time() - record.stat().st_mtime
                 # What it imports before its first estimate counts for none.
-                if seconds > self._limits.wall_seconds * 1.5 + GRACE and _remains(record, "").begun:
+                if seconds > limit * 1.5 + GRACE and _remains(record, "").begun:
                     _late(record).write_bytes(b"killed")
                     _kill(record)
 
-    def slow(self, least: float) -> Iterator[tuple[Job, tuple[Key, ...], float]]:
-        """Yield the jobs whose estimates in work have been so for longer than this, these, and for how long [s]."""
-        for record, seconds in self._seconds():
-            if seconds > least:
-                job = self._at_work[record]
-                yield job, _remains(record, "").begun or job.keys, seconds
-
     def close(self) -> None:
         """Remove the records."""
-        self._folder.close()
+        self._made.cleanup()
 
 
 def _kill(record: Path) -> None:

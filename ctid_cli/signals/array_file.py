@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from ctid_cli.errors import DataError
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.hdf5 import hdf5_arrays, text_of
 from ctid_cli.signals.table import Columns, Table
-from ctid_cli.temporary import TemporaryFolder
 
 MATLAB, HDF5 = (".mat",), (".h5", ".hdf5")
 #: Seconds that reading may take, and bytes a second of the slowest disk.
@@ -51,7 +51,8 @@ def read_array_table(path: str | os.PathLike[str]) -> Table:
 
 def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return what ``_write_content`` has found; refuse a file that crashes it, or takes too long."""
-    with TemporaryFolder() as folder:
+    with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made:
+        folder = Path(made)
         with warnings.catch_warnings():
             # The process does nothing but this, so that threads of others do not matter.
             warnings.simplefilter("ignore", DeprecationWarning)

@@ -19,21 +19,13 @@ from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.dataset import located
 from ctid_cli.simulation.start_points import additive_form
+from ctid_cli.specification import sweeps
 from ctid_cli.specification.custom_sections import CustomMeasureSection
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import place_of
 from ctid_cli.specification.spec import OF_DATA, Spec
-from ctid_cli.specification.sweeps import (
-    MAX_COMBINATIONS,
-    Case,
-    Cases,
-    case_count,
-    checked,
-    replaced,
-    swept_in,
-    variants,
-)
-from ctid_cli.specification.system_sections import RelativeStart, UniformStart
+from ctid_cli.specification.sweeps import Case, Cases
+from ctid_cli.specification.system_sections import RelativeStart, UniformStart, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
 
 #: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
@@ -53,10 +45,10 @@ _RULES_OF_SIGNALS = ("band", "by", "window")
 
 def too_many_cases(spec: Spec) -> str:
     """Return why not even the combinations of a specification can be looked at; empty if they can."""
-    cells = math.prod(case_count(getattr(spec, name)) for name in OF_DATA)
-    estimators = sum(map(case_count, spec.estimators.values()))
-    if cells > MAX_COMBINATIONS:
-        return f"the lists combine to {cells} data cells, which are too many; at most {MAX_COMBINATIONS} are allowed"
+    cells = math.prod(sweeps.case_count(getattr(spec, name)) for name in OF_DATA)
+    estimators = sum(map(sweeps.case_count, spec.estimators.values()))
+    if cells > (most := sweeps.MAX_COMBINATIONS):
+        return f"the lists combine to {cells} data cells, which are too many; at most {most} are allowed"
     if cells * estimators > MAX_SETTINGS:
         product = f"{cells} data cells and {estimators} estimators with their settings combine to {cells * estimators}"
         return f"{product} cases, which are too many; at most {MAX_SETTINGS} are allowed"
@@ -69,9 +61,9 @@ def joint_complaints(
     """Return what the sections of a specification have against each other, and what a trial of them shows."""
     found = [*_of_names(spec), *_of_missing(spec, broken), *_of_worlds(spec, broken)]
     cases = cases_of(spec, files_are_good=files_are_good)
-    too_long = list(checked(cases, (_of_length,)))
+    too_long = list(sweeps.checked(cases, (_of_length,)))
     usable = {name: given for name, given in cases.items() if not too_long or name not in ("sampling", "duration")}
-    found += [*too_long, *checked(usable, CHECKS)]
+    found += [*too_long, *sweeps.checked(usable, CHECKS)]
     places = {path[0] for path, _ in found if path}
     of_data = {"data", *OF_DATA}
     # A wrong level of the noise, or a wrong estimator, leaves the rest to be tried.
@@ -79,8 +71,8 @@ def joint_complaints(
         faulty = {path[1] for path, _ in found if path[:1] == ("estimators",)}
         right = {name: section for name, section in spec.estimators.items() if name not in faulty}
         # Estimators would refuse a record for what is wrong with its sections.
-        rest = replaced(spec, ("estimators",), {} if (places | broken) & of_data else right)
-        found += trial(replaced(rest, ("noise",), None) if "noise" in places else rest)
+        rest = sweeps.replaced(spec, ("estimators",), {} if (places | broken) & of_data else right)
+        found += trial(sweeps.replaced(rest, ("noise",), None) if "noise" in places else rest)
     return found
 
 
@@ -99,8 +91,8 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
     if spec.generator is not None:
         found["generator"] = {spec.generator[0]: _cases(spec, *spec.generator)}
     if spec.system is not None:
-        truth: list[Case] = [(_truth(variant), swept_in({("system",): variant})) for variant in variants(spec.system)]
-        found["truth"] = {("system",): truth}
+        systems = sweeps.variants(spec.system)
+        found["truth"] = {("system",): [(truth_of(one), sweeps.swept_in({("system",): one})) for one in systems]}
     if spec.measured is not None and files_are_good:
         found["duration"] = {("data",): [(spec.measured.dataset(0).record.duration, {})]}
     for cases in found["sampling"].values():
@@ -122,7 +114,7 @@ def _cases(spec: Spec, place: KeyPath, section: Any, *, custom: bool = False) ->
     """Return the options of a section, and the values that they sweep by their places."""
     if section is None or (section.custom and not custom):
         return []
-    return [(located(one.options, spec.folder), swept_in({place: one})) for one in variants(section)]
+    return [(located(one.options, spec.folder), sweeps.swept_in({place: one})) for one in sweeps.variants(section)]
 
 
 def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
@@ -149,14 +141,6 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
     return found
 
 
-def _truth(system: Any) -> Mapping[str, float]:
-    """Return what is true of a variant of the system; the name of an option of a custom one stands for its value."""
-    if not is_custom(system.options):
-        return {"delay": system.options.delay, **system.options.parameters}
-    truth = system.values["truth"].items()
-    return {name: system.values[value] if isinstance(value, str) else value for name, value in truth}
-
-
 # --------------------------------------------------------------------------------------------------------------------
 # Names, and what is missing
 
@@ -176,7 +160,7 @@ def _of_names(spec: Spec) -> Iterator[Complaint]:
             yield ("measures", k), str(error)
     seen: dict[str, str] = {}
     for name, section in spec.estimators.items():
-        others = [seen.setdefault(canonical_json(variant.values), name) for variant in variants(section)]
+        others = [seen.setdefault(canonical_json(variant.values), name) for variant in sweeps.variants(section)]
         for other in [other for other in others if other != name][:1]:
             yield ("estimators", name), f"the same settings as {other!r}; its estimates would be the same too"
 

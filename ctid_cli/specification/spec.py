@@ -14,19 +14,19 @@ from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, Valida
 from pydantic_core import ErrorDetails
 
 from ctid_cli.canonical import canonical_json
-from ctid_cli.errors import OptionError, Problem
+from ctid_cli.errors import OptionError
 from ctid_cli.inference.monte_carlo import AT_LEAST, block_ends
 from ctid_cli.kinds import KINDS
 from ctid_cli.signals.sampling import InputRecord, InstantsFile, ListedInstants, RegularSampling
 from ctid_cli.signals.sinusoids import SumOfSinusoids
-from ctid_cli.simulation.dataset import MeasuredSource, SimulatedSource, located
+from ctid_cli.simulation.dataset import MeasuredSource, located
 from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
 from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
 from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
-from ctid_cli.specification.yaml_source import KeyPath, YamlSource
+from ctid_cli.specification.yaml_source import YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 
 _EXPERIMENT = matching(
@@ -346,19 +346,6 @@ class Spec(Section):
             return ("loop", "reference"), self.loop.reference
         return None
 
-    def simulated_source(self, options: Mapping[str, Any], folder: Path) -> SimulatedSource:
-        """Return what simulates the data sets of one combination of the options of the sections."""
-        sampling, loop = located(options["sampling"], folder), options.get("loop")
-        if loop is not None:
-            loop = replace(loop, reference=located(loop.reference, folder))
-            loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
-        excitation = located(options.get("excitation"), folder)
-        # Any seed will do where nothing is random.
-        seed = 0 if self.monte_carlo is None else self.monte_carlo.seed
-        fresh = "fresh_fit" in (self.measures or ())
-        noise = options.get("noise")
-        return SimulatedSource(options["system"], excitation, sampling, noise, seed, loop, fresh)
-
     @property
     def custom_measures(self) -> dict[str, CustomMeasureSection]:
         """Sections of the custom measures, by their names."""
@@ -368,10 +355,6 @@ class Spec(Section):
     def warnings(self) -> tuple[str, ...]:
         """What is unwise but allowed, each with its place in the file."""
         return self._warnings
-
-    def problem(self, path: KeyPath, message: str) -> Problem:
-        """Return something wrong at a key path, with its place in the file."""
-        return self._source.problem(path, message)
 
     @property
     def text(self) -> str:

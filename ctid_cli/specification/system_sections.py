@@ -14,12 +14,13 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
+from ctid_cli.simulation.components import is_custom
 from ctid_cli.simulation.dataset import LoopOptions
 from ctid_cli.simulation.start_points import StartPoint
 from ctid_cli.specification.custom_sections import Kinds, custom_form
 from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
-from ctid_cli.specification.sweeps import variants
+from ctid_cli.specification.sweeps import Variant, variants
 from ctid_cli.specification.values import ByShape, Coefficients, NotNegative, Number, OneOf, Swept, without_copies
 
 #: Highest order that the simulation handles to its stated accuracy.
@@ -144,6 +145,14 @@ class AdditiveSystemSection(AdditiveSection):
 
 _LinearSystem = Annotated[Any, WithKey("additive", AdditiveSystemSection, SystemSection)]
 AnySystemSection = Annotated[Any, WithKey("kind", custom_form("system"), _LinearSystem)]
+
+
+def truth_of(system: Variant) -> dict[str, float]:
+    """Return what is true of a variant of the system; the name of an option of a custom one stands for its value."""
+    if not is_custom(system.options):
+        return {"delay": system.options.delay, **system.options.parameters}
+    truth = system.values["truth"].items()
+    return {name: system.values[value] if isinstance(value, str) else value for name, value in truth}
 
 
 def _unstable(poles: ComplexArray) -> str:

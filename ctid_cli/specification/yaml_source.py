@@ -19,7 +19,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import yaml
 
@@ -62,22 +62,14 @@ class _Loader(yaml.SafeLoader):
     }
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where a key or value stands."""
+def problem_at(mark: Any, path: KeyPath, message: str) -> Problem:
+    """Return a problem at a mark of PyYAML, which knows its file."""
+    return Problem(mark.name, mark.line + 1, mark.column + 1, path_text(path), message)
 
-    file: str
-    line: int
-    column: int
 
-    @classmethod
-    def of(cls, mark: Any) -> Self:
-        """Return the place of a mark of PyYAML, which knows its file."""
-        return cls(mark.name, mark.line + 1, mark.column + 1)
-
-    def problem(self, path: KeyPath, message: str) -> Problem:
-        """Return a problem here."""
-        return Problem(self.file, self.line, self.column, path_text(path), message)
+def _mark(file: str, line: int = 0, column: int = 0) -> Any:
+    """Return the mark of a place, counted from 0."""
+    return yaml.Mark(file, 0, line, column, None, 0)
 
 
 @dataclass
@@ -92,29 +84,29 @@ class YamlSource:
     nodes: dict[KeyPath, tuple[Any, Any]] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
-    def place(self, path: KeyPath) -> Place:
+    def mark(self, path: KeyPath) -> Any:
         """Return where a problem with a key path is to be reported: of a mapping, and where a key is amiss, its key."""
         key = False
         while path and path not in self.nodes:
             path, key = path[:-1], True
         value, name = self.nodes.get(path, (None, None))
         node = name if name is not None and (key or isinstance(value, yaml.MappingNode)) else value
-        return Place(self.file, 1, 1) if node is None else Place.of(node.start_mark)
+        return _mark(self.file) if node is None else node.start_mark
 
     def problem(self, path: KeyPath, message: str) -> Problem:
         """Return a problem at a key path."""
-        return self.place(path).problem(path, message)
+        return problem_at(self.mark(path), path, message)
 
     def build(self, node: Any, path: KeyPath = (), name: Any = None, parents: tuple[Any, ...] = ()) -> Any:
         """Return the value of a node; what is wrong with it goes to the problems."""
         self.nodes[path] = node, name
-        place, fatal = Place.of(node.start_mark), ""
+        fatal = ""
         if len(self.nodes) > MAX_VALUES:
             fatal = f"more than {MAX_VALUES} values, those of aliases too"
         elif any(node is parent for parent in parents):
             fatal = "an alias refers to its own parent"
         if fatal:
-            raise SpecError([*self.problems, place.problem(path, fatal)])
+            raise SpecError([*self.problems, problem_at(node.start_mark, path, fatal)])
         if isinstance(node, yaml.ScalarNode):
             return self._scalar(node, path)
         if node.tag != _TAG + ("seq" if isinstance(node, yaml.SequenceNode) else "map"):
@@ -134,10 +126,10 @@ class YamlSource:
                 if name.value == "<<":
                     wrong = "merge keys (<<) are not supported; write the keys out, or use an alias for a whole value"
                 elif name.value in mapping:
-                    first = self.place((*here, KEY)).line
+                    first = self.mark((*here, KEY)).line + 1
                     wrong = f"the key {path_text((name.value,))!r} is given twice, first on line {first}; keep one"
             if wrong:
-                self.problems.append(Place.of(name.start_mark).problem(here, wrong))
+                self.problems.append(problem_at(name.start_mark, here, wrong))
             else:
                 mapping[name.value] = self.build(value, here, name, parents)
         return mapping
@@ -161,7 +153,7 @@ class YamlSource:
 
     def _refuse_tag(self, node: Any, path: KeyPath, instead: str) -> None:
         message = f"the tag {node.tag.replace(_TAG, '!!')} cannot be used here; write {instead}"
-        self.problems.append(Place.of(node.start_mark).problem(path, message))
+        self.problems.append(problem_at(node.start_mark, path, message))
 
 
 def path_text(path: KeyPath) -> str:
@@ -178,7 +170,7 @@ def read_yaml(path: Path, overrides: Iterable[str] = ()) -> YamlSource:
     if path.is_dir():
         raise UsageError(f"{path}: this is a folder; name the YAML file in it")
     if path.is_file() and path.stat().st_size == 0:
-        raise SpecError([Place(str(path), 1, 1).problem((), "the file is empty")])
+        raise SpecError([problem_at(_mark(str(path)), (), "the file is empty")])
     try:
         require_file(path)
         with path.open("rb") as file:
@@ -191,8 +183,8 @@ def read_yaml(path: Path, overrides: Iterable[str] = ()) -> YamlSource:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = data[: error.start]
-        place = Place(str(path), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
-        raise SpecError([place.problem((), "the file is not UTF-8 text; save it as UTF-8")]) from None
+        mark = _mark(str(path), before.count(b"\n"), error.start - before.rfind(b"\n") - 1)
+        raise SpecError([problem_at(mark, (), "the file is not UTF-8 text; save it as UTF-8")]) from None
     return parse_yaml(text, str(path), overrides)
 
 
@@ -230,24 +222,24 @@ def _composed(text: str, file: str) -> Any:
         mark = error.problem_mark or error.context_mark
         if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
             mark = error.context_mark  # what was never closed is of more use than the end of the file
-        raise SpecError([Place.of(mark).problem((), _syntax_message(error))]) from None
+        raise SpecError([problem_at(mark, (), _syntax_message(error))]) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
-        place = Place(file, before.count("\n") + 1, error.position - before.rfind("\n"))
+        mark = _mark(file, before.count("\n"), error.position - before.rfind("\n") - 1)
         code = ord(error.character) if isinstance(error.character, str) else error.character
-        raise SpecError([place.problem((), f"the character U+{code:04X} is not allowed in YAML")]) from None
+        raise SpecError([problem_at(mark, (), f"the character U+{code:04X} is not allowed in YAML")]) from None
     except RecursionError:
-        raise SpecError([Place(file, 1, 1).problem((), "lists or mappings are nested too deeply")]) from None
+        raise SpecError([problem_at(_mark(file), (), "lists or mappings are nested too deeply")]) from None
 
 
 def _overridden(root: Any, override: str, number: int) -> Any:
     """Return the tree of nodes in which a value is set as ``--set a.b=value`` asks; its places are in that option."""
     key, equals, text = override.partition("=")
     path = tuple(part.strip() for part in key.split("."))
-    here = yaml.Mark(OVERRIDE_FILE, 0, number - 1, 0, None, 0)
+    here = _mark(OVERRIDE_FILE, number - 1)
 
     def refuse(message: str) -> SpecError:
-        problem = Place.of(here).problem((), f"{message} (in --set {override!r})")
+        problem = problem_at(here, (), f"{message} (in --set {override!r})")
         return SpecError([replace(problem, key=key.strip())])
 
     if not equals or not all(path):

@@ -18,19 +18,12 @@ from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import StorageError, UsageError
 from ctid_cli.storage import columns
 from ctid_cli.storage import folder as place
+from ctid_cli.storage import manifest as plans
 from ctid_cli.storage.column_arrays import ROWS, AnyArray, names_of
 from ctid_cli.storage.export import Export, export_in_memory, open_export, sha256_of
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import JournalReader
-from ctid_cli.storage.manifest import (
-    Key,
-    Manifest,
-    Slot,
-    is_of_signal,
-    row_columns,
-    swept_names,
-    true_values,
-)
+from ctid_cli.storage.manifest import Key, Manifest, Slot
 from ctid_cli.storage.sqlite_file import EXPORT
 from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under, judged
 
@@ -233,7 +226,7 @@ class Estimates:
         if self._all is not None:
             return self._all._truths
         try:
-            return {cell["hash"]: true_values(cell) for cell in self.manifest["data_cells"]}
+            return {cell["hash"]: plans.true_values(cell) for cell in self.manifest["data_cells"]}
         # Somebody else may have written the plan.
         except (TypeError, ValueError, KeyError, AttributeError) as error:
             raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
@@ -276,9 +269,9 @@ class Estimates:
     @property
     def names(self) -> list[str]:
         """Return names of what a row has."""
-        own = [column.name for column in row_columns(self.manifest)]
+        own = [column.name for column in plans.row_columns(self.manifest)]
         compared = [column.name for column in columns.COLUMNS if column.source == "truth"]
-        return [*own, *swept_names(self.manifest), *compared]
+        return [*own, *plans.swept_names(self.manifest), *compared]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         return self.rows()
@@ -316,7 +309,7 @@ class Estimates:
         import pandas as pd
 
         # Where there is no system, the columns of one would be empty.
-        left_out = "systems" if is_of_signal(self.manifest) else ""
+        left_out = "systems" if plans.is_of_signal(self.manifest) else ""
         known = {c.name: c for c in columns.COLUMNS}
         shown = [n for n in names or self.names if n not in known or known[n].of != left_out]
         dtypes = {name: known[name].dtype if name in known else (types or {}).get(name) for name in shown}

@@ -22,30 +22,13 @@ from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import CtidError, DataError, StorageError
 from ctid_cli.signals.files import require_file
 from ctid_cli.signals.hdf5 import require_plain_tree
-from ctid_cli.storage import columns
-from ctid_cli.storage.column_arrays import (
-    MISSING,
-    ROWS,
-    AnyArray,
-    ColumnWriter,
-    decoded,
-    decoded_texts,
-    encoded_texts,
-    names_of,
-    require_column,
-)
+from ctid_cli.storage import column_arrays, columns
+from ctid_cli.storage import manifest as plans
+from ctid_cli.storage.column_arrays import AnyArray
 from ctid_cli.storage.columns import Column
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import Journal, JournalReader
-from ctid_cli.storage.manifest import (
-    Manifest,
-    Slot,
-    planned_count,
-    read_json,
-    require_manifest,
-    row_columns,
-    swept_names,
-)
+from ctid_cli.storage.manifest import Manifest, Slot
 from ctid_cli.storage.sqlite_file import EXPORT, require_format
 from ctid_cli.written_files import write_file
 
@@ -107,7 +90,7 @@ def write_export(
 ) -> int:
     """Write the file of some estimates; returns their number."""
     stored = _stored_columns(manifest)
-    writers, count = [ColumnWriter(column) for column in stored], 0
+    writers, count = [column_arrays.ColumnWriter(column) for column in stored], 0
     measured = [writer for writer in writers if not writer.is_fixed]
     for rows in _rows(results(), manifest, stored, 100):
         count += len(rows)
@@ -118,19 +101,19 @@ def write_export(
         group = file.create_group("estimates")
         for writer in writers:
             writer.create(group, count)
-        for number, rows in enumerate(_rows(results(), manifest, stored, ROWS)):
+        for number, rows in enumerate(_rows(results(), manifest, stored, column_arrays.ROWS)):
             for writer in writers:
-                writer.write(number * ROWS, rows)
+                writer.write(number * column_arrays.ROWS, rows)
     return count
 
 
 def _stored_columns(manifest: Manifest) -> list[Column]:
     """Return the columns of the file: those of a plan's rows, and its swept fields."""
     # The name of the experiment is an attribute; times are not results.
-    of_rows = [c for c in row_columns(manifest) if c.name != "experiment" and c.source != "clock"]
+    of_rows = [c for c in plans.row_columns(manifest) if c.name != "experiment" and c.source != "clock"]
     parts = [*manifest["data_cells"], *manifest["estimators"]]
     swept = []
-    for name in swept_names(manifest):
+    for name in plans.swept_names(manifest):
         numbers = all(type(part["swept"].get(name)) in (int, float, type(None)) for part in parts)
         swept.append(Column(f"swept/{name}", "float64" if numbers else "str", ""))
     return [_ESTIMATOR_HASH, *of_rows, *swept]
@@ -171,17 +154,18 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
             "spec_hash": manifest["spec_hash"],
             "seed": "none" if manifest["seed"] is None else manifest["seed"],
             "runs": manifest["runs"],
-            "estimates_planned": planned_count(manifest),
+            "estimates_planned": plans.planned_count(manifest),
             "origins": json.dumps([origin._asdict() for origin in sorted(origins)], sort_keys=True),
             "code_version": " ".join(dict.fromkeys(origin.code_version for origin in sorted(origins))),
             "platform": " | ".join(dict.fromkeys(origin.platform for origin in sorted(origins))),
         }
     )
-    # Swept fields are in the order of the specification. Attributes have a length limit; single texts no checksum.
-    for name, text in {"spec": canonical_json(manifest["spec"]), "manifest": json.dumps(manifest)}.items():
-        encoded = encoded_texts([text], len(text.encode())).reshape(())
-        dataset = file.create_dataset(name, data=encoded, track_times=False)
-        dataset.attrs["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    # Not sorted: swept fields are in the order of the specification. Attributes have a length limit.
+    text = json.dumps(manifest)
+    encoded = column_arrays.encoded_texts([text], len(text.encode())).reshape(())
+    dataset = file.create_dataset("manifest", data=encoded, track_times=False)
+    # Single texts have no checksum of HDF5.
+    dataset.attrs["sha256"] = hashlib.sha256(text.encode()).hexdigest()
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
@@ -200,13 +184,13 @@ class Export:
             plan = bytes(file["manifest"][()])
             if hashlib.sha256(plan).hexdigest() != file["manifest"].attrs["sha256"]:
                 raise ValueError("its plan is not what was written")
-            self.manifest = require_manifest(read_json(plan.decode("utf-8")))
-            self.origins = tuple(Origin.of(**entry) for entry in read_json(str(file.attrs["origins"])))
+            self.manifest = plans.require_manifest(plans.read_json(plan.decode("utf-8")))
+            self.origins = tuple(Origin.of(**entry) for entry in plans.read_json(str(file.attrs["origins"])))
             self._group = file["estimates"]
             self.count = int(self._group["replicate"].shape[0])
             for column in (_ESTIMATOR_HASH, *columns.COLUMNS):
                 if column.name in self._group:
-                    require_column(column, self._group, self.count)
+                    column_arrays.require_column(column, self._group, self.count)
                 elif column.name in REQUIRED:
                     raise ValueError(f"there is no column {column.name}")
 
@@ -217,7 +201,7 @@ class Export:
     def parts(self, name: str) -> list[str]:
         """Return names of the columns of an array that has several."""
         with saying_where(self.path):
-            return decoded_texts(self._group[names_of(name)][()])
+            return column_arrays.decoded_texts(self._group[column_arrays.names_of(name)][()])
 
     def read(self, name: str, start: int = 0, stop: int | None = None) -> AnyArray:
         """Return some rows of an array."""
@@ -231,10 +215,10 @@ class Export:
             return [None] * (stop - start)
         names = self.parts(name) if column.type == "by name" else ()
         with saying_where(self.path):
-            values = decoded(column, lambda ending: self._group[name + ending][start:stop], names)
+            values = column_arrays.decoded(column, lambda ending: self._group[name + ending][start:stop], names)
         if name == "standard_errors":
             # An estimate with a model has a table of errors, if an empty one.
-            models = (self.read("denominator_length", start, stop) != MISSING).tolist()
+            models = (self.read("denominator_length", start, stop) != column_arrays.MISSING).tolist()
             return [one or ({} if there else None) for one, there in zip(values, models, strict=True)]
         return values
 
@@ -243,8 +227,8 @@ class Export:
         for item in self._group.values():
             for dataset in item.values() if isinstance(item, h5py.Group) else [item]:
                 with saying_where(self.path):
-                    for start in range(0, self.count if dataset.shape[:1] == (self.count,) else 1, ROWS):
-                        _ = dataset[start : start + ROWS]
+                    for start in range(0, self.count if dataset.shape[:1] == (self.count,) else 1, column_arrays.ROWS):
+                        _ = dataset[start : start + column_arrays.ROWS]
 
 
 def open_export(path: Path) -> Export:

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ctid_cli.errors import DataError, UsageError
+from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification, laid_out_validation
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.models.controller import DiscreteController
@@ -22,18 +22,7 @@ from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.table import ROLES
-from ctid_cli.storage.result_file import (
-    ResultKind,
-    Source,
-    content_of,
-    decoded,
-    encoded,
-    path_and_sum,
-    refuse,
-    require,
-    result_text,
-    texts,
-)
+from ctid_cli.storage.result_file import ResultKind, Source, decoded, encoded, path_and_sum, require, texts
 
 #: Format 2 has the formula of the standard errors and the bounds of the admissible models.
 FIT = ResultKind("ctid fit", 2, "fit", "ctid fit", "fit again", oldest=2)
@@ -60,7 +49,7 @@ def fit_text(
     if validation is not None:
         whole["validation"] = {**content["validation"], **_source(validation, folder)}
     whole["result"] = encoded(result)
-    return result_text(FIT, whole, command)
+    return FIT.text(whole, command)
 
 
 def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
@@ -201,25 +190,17 @@ def read_fit(
 ) -> StoredFit:
     """Return the file with everything in it; :func:`load_fit` says the rest."""
     file = os.fspath(path)
-    content = content_of(file, FIT)
+    content = FIT.content(file)
     moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)
-    try:
+    with FIT.refusing(file):
         result = decoded(content["result"], Identification)
-        listed = content["records"]
+        listed, judged = content["records"], content["validation"]
         _require_sources(content)
         if moved and len(moved) != len(listed):
             raise UsageError(f"{file} is of {len(listed)} records; --record names {len(moved)}")
-        places: list[str | None] = [os.fspath(each) for each in moved]
-        places = places or [None] * len(listed)
-        sources = tuple(
-            RecordSource(FIT, file, str(each["file"]), each, place) for each, place in zip(listed, places, strict=True)
-        )
-        judged = content["validation"]
-        other = judged and RecordSource(
-            FIT, file, str(judged["file"]), judged, None if validation is None else os.fspath(validation)
-        )
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
-        refuse(file, FIT, f"is damaged ({str(error)[:200]})")
+        places = [os.fspath(each) for each in moved] if moved else [None] * len(listed)
+        sources = tuple(RecordSource(FIT, file, each, place) for each, place in zip(listed, places, strict=True))
+        other = judged and RecordSource(FIT, file, judged, None if validation is None else os.fspath(validation))
     if validation is not None and other is None:
         raise UsageError(f"{file} has no validation record; leave --validate out")
     for source in (*sources, *([other] if other else [])):
@@ -240,6 +221,7 @@ def _require_sources(content: Mapping[str, Any]) -> None:
     require("units", list(content["units"]) == ["time", "input", "output"] and texts(content["units"].values()))
     require("command", content["command"] is None or isinstance(content["command"], str))
     for each in (*content["records"], *([content["validation"]] if content["validation"] else [])):
+        require("file", "file" in each)
         if each["path"] is not None:
             require("path", texts([each["path"], each["sha256"]]))
             require("columns", texts(each["columns"][role] for role in ROLES))

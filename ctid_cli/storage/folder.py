@@ -1,7 +1,7 @@
 """The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
 
-``spec.yaml`` (the user's text), ``spec.canonical.json``, ``journal.sqlite`` (the live log) and ``runs.h5`` (the
-estimates that the latest plan asks for).
+``spec.yaml`` (the user's text), ``journal.sqlite`` (the live log) and ``runs.h5`` (the estimates that the latest plan
+asks for).
 """
 
 import fcntl
@@ -14,20 +14,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage.announcement import who_runs
 from ctid_cli.storage.identity import Origin, origin_differences
 from ctid_cli.storage.journal import JournalReader, read_journal
 from ctid_cli.storage.manifest import Manifest
-from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, SPEC, who_runs
 from ctid_cli.written_files import TAKEN, is_leftover
-
-SPEC = "spec.yaml"
-CANONICAL = "spec.canonical.json"
 
 #: How long to wait for a command that only reads to let go of the folder [s].
 PATIENCE = 2.0
 _ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
-_ELSEWHERE = "choose another results folder (--out), or --fresh to move the old results aside"
+ELSEWHERE = (
+    "choose another results folder (--out), or --fresh to move the old results aside, with --keep-readable to take "
+    "over what can be read"
+)
 
 
 class InUseError(RefusedError):
@@ -82,7 +81,7 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 def clear(folder: Path) -> None:
     """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
     for path in folder.glob(".*"):
-        if is_leftover(path.name) and path.name[1:].startswith((SPEC, CANONICAL, EXPORT)):
+        if is_leftover(path.name) and path.name[1:].startswith((SPEC, EXPORT)):
             with suppress(OSError):
                 path.unlink()
 
@@ -96,31 +95,24 @@ def _wait(folder: Path, deadline: float) -> None:
     time.sleep(0.05)
 
 
-def check_free(folder: Path, manifest: Manifest, origin: Origin, *, allow_mixed: bool) -> None:
-    """Refuse a folder, whose lock this process holds, if this run must not add to its results."""
-    experiment = manifest["experiment"]
+def check_free(folder: Path, manifest: Manifest, origin: Origin | None, advice: str = ELSEWHERE) -> None:
+    """Refuse a folder, whose lock this process holds, that must not be added to; without an origin any may be there."""
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
             if (folder / EXPORT).exists():
                 why = f"{EXPORT} without the {FILE_NAME} it was made from, so nothing can be added to it"
-                raise RefusedError(
-                    f"{folder} holds {why}; {_ELSEWHERE}, and --keep-readable to take its estimates over"
-                )
+                raise RefusedError(f"{folder} holds {why}; {advice}")
             return
-        log.check()
-        if log.experiment() != experiment:
-            other = f"the experiment {log.experiment()!r}, not {experiment!r}"
-            raise RefusedError(f"{folder} holds {other}; {_ELSEWHERE}")
+        if log.experiment() != manifest["experiment"]:
+            other = f"the experiment {log.experiment()!r}, not {manifest['experiment']!r}"
+            raise RefusedError(f"{folder} holds {other}; {advice}")
         cells = {cell["hash"] for cell in manifest["data_cells"]}
         for data, made in sorted(log.made()):
-            if data in cells and made != origin and not allow_mixed:
-                raise RefusedError(_other_origin(folder, made, origin))
-
-
-def _other_origin(folder: Path, other: Origin, origin: Origin) -> str:
-    differences = origin_differences(other, origin, "then", "now")
-    ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is recorded"
-    return f"{folder} holds results of other code or arithmetic ({differences}); {ways}"
+            if origin is not None and data in cells and made != origin:
+                differences = origin_differences(made, origin, "then", "now")
+                ways = "use --fresh to move them aside and compute all anew, or --allow-mixed to add to them, which is "
+                what = f"{folder} holds results of other code or arithmetic ({differences})"
+                raise RefusedError(f"{what}; {ways}recorded")
 
 
 @contextmanager
@@ -170,13 +162,9 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamageError as error:
-        raise DamageError(f"{error}. {what_is_safe(folder)}") from error
-
-
-def what_is_safe(folder: Path) -> str:
-    """Return a sentence about what to do where a journal is damaged."""
-    start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
-    return f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
+        start = "'ctid verify' says what is damaged; 'ctid run --fresh --keep-readable' with the same specification"
+        cure = f"{start} moves {folder} aside, keeps the estimates that can be read and computes the rest"
+        raise DamageError(f"{error}. {cure}") from error
 
 
 def move_aside(folder: Path) -> Path | None:

@@ -15,7 +15,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache, lru_cache
@@ -203,7 +203,7 @@ def as_text(moment: datetime) -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def session_info(spec_text: str, spec_folder: Path) -> dict[str, Any]:
+def session_info(spec_text: str) -> dict[str, Any]:
     """Describe the run that is about to start."""
     return {
         "argv": sys.argv,
@@ -211,17 +211,10 @@ def session_info(spec_text: str, spec_folder: Path) -> dict[str, Any]:
         "host": platform.node(),
         "system": platform.platform(),
         "processors": os.cpu_count(),
-        "numeric_platform": numeric_platform(),
         "packages": {"python": platform.python_version(), **package_versions()},
         "git_commit": git_commit(Path(__file__).resolve().parents[2]),
-        "spec_folder": str(spec_folder.resolve()),
         "spec": spec_text,
     }
-
-
-def canonical_text(spec: Mapping[str, Any]) -> str:
-    """Return a canonical specification as its file holds it."""
-    return json.dumps(spec, sort_keys=True, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def git_commit(root: Path) -> str | None:

@@ -23,21 +23,9 @@ from typing import Any, NamedTuple
 
 from ctid_cli.canonical import canonical_json
 from ctid_cli.errors import DamageError
-from ctid_cli.storage.announcement import reported
+from ctid_cli.storage import sqlite_file
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_parts, read_json, require_manifest
-from ctid_cli.storage.sqlite_file import (
-    APPLICATION,
-    ERRORS,
-    FORMAT,
-    places_of,
-    readable,
-    refuse,
-    require_journal,
-    require_places,
-    require_whole,
-    set_up,
-)
 from ctid_cli.written_files import write_file
 
 #: How long a reader waits for a moment at which the file can be read [s].
@@ -55,8 +43,8 @@ _SCHEMA = (
         data_hash TEXT, estimator_hash TEXT, replicate INTEGER, start TEXT,
         status TEXT, seconds REAL, cpu_seconds REAL, session TEXT, checksum TEXT, result TEXT,
         PRIMARY KEY ({_KEY})) WITHOUT ROWID""",
-    f"PRAGMA application_id={APPLICATION}",
-    f"PRAGMA user_version={FORMAT}",
+    f"PRAGMA application_id={sqlite_file.APPLICATION}",
+    f"PRAGMA user_version={sqlite_file.FORMAT}",
 )
 #: What is noted: the plan of the latest run, and the SHA-256 of runs.h5 as long as it holds what that asks for.
 #: And how many estimates there are, so that none goes unnoticed.
@@ -189,7 +177,7 @@ class JournalReader:
         """Return how many estimates are stored; fewer than were written, or than a killed run reported, are refused."""
         written, there = int(self._meta(_COUNT) or 0), self.count()
         # What a run reports while this is read can be more than there was when reading began.
-        written = written if self.live else max(written, reported(self.path.parent))
+        written = written if self.live else max(written, sqlite_file.reported(self.path.parent))
         if written != there:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
         return there
@@ -260,8 +248,8 @@ class JournalReader:
     def _guard(self, *, writing: bool = False) -> Iterator[None]:
         try:
             yield
-        except ERRORS as error:
-            refuse(self.path, error, writing=writing)
+        except sqlite_file.ERRORS as error:
+            sqlite_file.refuse(self.path, error, writing=writing)
 
 
 class Journal(JournalReader):
@@ -272,9 +260,9 @@ class Journal(JournalReader):
         #: Its folder and files as they were when it was opened; empty until its tables are there.
         self.places: dict[Path, tuple[int, int] | None] = {}
 
-    def write_beside(self, name: str, data: bytes) -> None:
-        """Write a file beside the journal, if it is not there already."""
-        path = self.path.parent / name
+    def write_spec(self, data: bytes) -> None:
+        """Write the specification beside the journal, if it is not there already."""
+        path = self.path.with_name(sqlite_file.SPEC)
         if not path.exists() or path.read_bytes() != data:
             write_file(path, data)
 
@@ -329,7 +317,7 @@ class Journal(JournalReader):
 
     def require_in_place(self) -> None:
         """Refuse to go on in a file that its path does not lead to any more."""
-        require_places(self.places)
+        sqlite_file.require_places(self.places)
 
     def close(self) -> None:
         """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
@@ -353,24 +341,24 @@ class Journal(JournalReader):
 
 def open_journal(path: Path) -> Journal:
     """Open a journal for writing, and make it if there is none."""
-    require_whole(path)
+    sqlite_file.require_whole(path)
     with ExitStack() as stack:
         try:
             connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
             stack.callback(connection.close)
-            set_up(connection)
+            sqlite_file.set_up(connection)
             log = Journal(connection, path)
             if connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone():
-                require_journal(connection, path)
+                sqlite_file.require_journal(connection, path)
                 log.check()
             else:
-                require_whole(path, planned=False)
+                sqlite_file.require_whole(path, planned=False)
                 with log.transaction():
                     for statement in _SCHEMA:
                         connection.execute(statement)
-            log.places = places_of(path)
-        except (OSError, *ERRORS) as error:
-            refuse(path, error, writing=True)
+            log.places = sqlite_file.places_of(path)
+        except (OSError, *sqlite_file.ERRORS) as error:
+            sqlite_file.refuse(path, error, writing=True)
         stack.pop_all()
         return log
 
@@ -381,24 +369,24 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
     if not path.exists():
         yield None
         return
-    require_whole(path)
+    sqlite_file.require_whole(path)
     with ExitStack() as stack:
         try:
-            address = stack.enter_context(readable(path, live=live))
+            address = stack.enter_context(sqlite_file.readable(path, live=live))
             connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=_PATIENCE)
             stack.callback(connection.close)
             # All that is read from here on is of one moment.
             connection.execute("BEGIN")
             planned = connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
             if planned:
-                require_journal(connection, path)
+                sqlite_file.require_journal(connection, path)
                 planned = connection.execute("SELECT 1 FROM meta WHERE name = ?", (_MANIFEST,)).fetchone()
                 if not planned and connection.execute("SELECT 1 FROM sessions").fetchone():
                     raise DamageError(f"{path} is damaged: it holds no plan")
             log = JournalReader(connection, path, live=live)
-        except (OSError, *ERRORS) as error:
-            refuse(path, error)
-        require_whole(path, planned=bool(planned), live=live)
+        except (OSError, *sqlite_file.ERRORS) as error:
+            sqlite_file.refuse(path, error)
+        sqlite_file.require_whole(path, planned=bool(planned), live=live)
         yield log if planned else None
 
 

@@ -219,12 +219,7 @@ def whole(manifest: Manifest) -> Manifest:
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:
     """Return the columns of a row as it is computed, before it is compared with the truth."""
-    return _row_columns(of_signal=is_of_signal(manifest))
-
-
-@cache
-def _row_columns(*, of_signal: bool) -> list[columns.Column]:
-    here = {"all", "systems", "signals" if of_signal else ""}
+    here = {"all", "systems", "signals" if is_of_signal(manifest) else ""}
     return [column for column in columns.COLUMNS if column.of in here and column.source != "truth"]
 
 

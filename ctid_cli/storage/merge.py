@@ -1,6 +1,6 @@
-"""Merging: what several folders hold of one experiment, as if one run had computed it.
+"""Rows of other journals: merging shards as if one run had computed them, and keeping what is left of damaged results.
 
-The folders that are merged are only read. Rows go over with their times, and the runs that computed them with all that
+The folders that are read are not changed. Rows go over with their times, and the runs that computed them with all that
 is known of these, in one transaction: where anything is in the way, nothing is written. The export comes from the rows
 alone, so that it has the bytes of a single run's.
 """
@@ -9,18 +9,19 @@ import re
 import shutil
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
-from ctid_cli.errors import RefusedError, UsageError
+from ctid_cli.errors import CtidError, RefusedError, UsageError
 from ctid_cli.storage import folder as place
-from ctid_cli.storage.export import write_runs
-from ctid_cli.storage.identity import Origin, origin_differences
-from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, open_journal, read_journal
-from ctid_cli.storage.manifest import Key, Manifest, Shard, owner, shard_of, slots, whole
-from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME
+from ctid_cli.storage.estimates import Estimates
+from ctid_cli.storage.export import open_export, write_runs
+from ctid_cli.storage.identity import Origin, now, origin_differences
+from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, new_id, open_journal, read_journal
+from ctid_cli.storage.manifest import Key, Manifest, Outcome, Shard, owner, shard_of, slots, whole
+from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, SPEC
 
 #: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
 LIMITED = ("TIMEOUT", "MEMORY")
@@ -83,8 +84,8 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
     plan = _common_plan([(folder, plans[folder]) for folder in others])
     keys = dict.fromkeys(slot.key for slot in slots(plan))
     with _new_folder(target), place.lock(target):
+        place.check_free(target, plan, None, "merge into another folder (--out)")
         with place.saying_what_is_safe(target):
-            _require_same_experiment(target, plan)
             log = open_journal(target / FILE_NAME)
         with closing(log):
             taken = _Taken(target, log, plan, keys, allow_mixed=allow_mixed)
@@ -101,8 +102,7 @@ def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, p
                     raise RefusedError(f"{plan['experiment']}: {missing}. --partial merges what there is")
                 log.note_plan(plan)
             with place.writing(target):
-                for name in (place.SPEC, place.CANONICAL):
-                    log.write_beside(name, (others[0] / name).read_bytes())
+                log.write_spec((others[0] / SPEC).read_bytes())
             count, checksum = write_runs(target, log)
             mixed = len(log.origins()) > 1
     new = len(taken.changed)
@@ -150,14 +150,6 @@ def _new_folder(target: Path) -> Iterator[None]:
         if made:
             shutil.rmtree(target, ignore_errors=True)
         raise
-
-
-def _require_same_experiment(target: Path, plan: Manifest) -> None:
-    with read_journal(target / FILE_NAME) as log:
-        if log is None and (target / EXPORT).exists():
-            raise RefusedError(f"{target} holds {EXPORT} without its {FILE_NAME}; merge into another folder (--out)")
-        if log is not None and log.experiment() != plan["experiment"]:
-            raise RefusedError(f"{target} holds the experiment {log.experiment()!r}; merge into another folder (--out)")
 
 
 class _Taken:
@@ -254,3 +246,68 @@ def shards_text(numbers: Iterable[int], of: int) -> str:
             runs.append([number])
     text = ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
+
+
+# --- what can be read of damaged results, copied from the folder that was moved aside --------------------------------
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What was kept of a folder that was moved aside."""
+
+    planned: int
+    #: Estimates out of its journal, and out of ``runs.h5``.
+    from_journal: int
+    from_export: int
+
+    def __str__(self) -> str:
+        text = f"{self.from_journal + self.from_export} of {self.planned} estimates could be read and are kept"
+        return f"{text}, {self.from_export} of them from {EXPORT}" if self.from_export else text
+
+
+def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, allow_mixed: bool = False) -> Kept:
+    """Copy what can be read of a folder that was moved aside into a new journal.
+
+    Row by row: what SQLite still reads of the old journal and agrees with its checksum; where a row is lost, that of
+    ``runs.h5`` if this is whole. Results of other code or arithmetic are left out unless they may be mixed.
+    """
+    keys = dict.fromkeys(slot.key for slot in slots(plan))
+    kept, noted = set[Key](), set[str]()
+
+    def chosen(found: Iterator[tuple[Row, Session]]) -> Iterator[Row]:
+        for row, session in found:
+            if row.key in keys and row.key not in kept and (allow_mixed or session.origin == origin):
+                if session.id not in noted:
+                    noted.add(log.note_session(session))
+                kept.add(row.key)
+                yield row
+
+    with log.transaction():
+        log.note_plan(plan)
+        log.add_rows(chosen(_readable(aside, keys)))
+        from_journal = len(kept)
+        if from_journal < len(keys):
+            log.add_rows(chosen(_exported(aside)))
+    return Kept(len(keys), from_journal, len(kept) - from_journal)
+
+
+def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
+    """Yield the rows of a journal that can be read, each with its run."""
+    with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
+        for key in keys if old is not None else ():
+            # Whatever a damaged page hides, the other rows are worth reading.
+            with suppress(CtidError, ValueError):
+                assert old is not None
+                if (row := old.row(key)) is not None:
+                    yield row, old.session(row.session)
+
+
+def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
+    """Yield the estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
+    with suppress(CtidError):
+        export = open_export(aside / EXPORT)
+        export.verify()
+        if len(export.origins) == 1:
+            session = Session(new_id(), export.origins[0], now(), None, None, {"kept_from": str(aside / EXPORT)})
+            for key, result in Estimates(export).by_key():
+                yield Row.of(Outcome(key, result, None), session.id), session

@@ -9,7 +9,8 @@ import json
 import math
 import os
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -44,12 +45,63 @@ class ResultKind(NamedTuple):
     #: The oldest format that is read.
     oldest: int = 1
 
+    def text(self, content: Mapping[str, Any], command: str | None) -> str:
+        """Return the text of a file, with what every reader compares."""
+        whole = {"kind": self.kind, "format": self.format, "ctid": ctid_cli.__version__, "command": command, **content}
+        text = json.dumps(whole, allow_nan=False)
+        return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
 
-def result_text(kind: ResultKind, content: Mapping[str, Any], command: str | None) -> str:
-    """Return the file's text, with what every reader compares."""
-    whole = {"kind": kind.kind, "format": kind.format, "ctid": ctid_cli.__version__, "command": command, **content}
-    text = json.dumps(whole, allow_nan=False)
-    return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
+    def content(self, file: str) -> dict[str, Any]:
+        """Return what a file says, if it is one of this kind as it was written."""
+        content = self._json(file)
+        if not isinstance(content, dict) or content.get("kind") != self.kind:
+            self.refuse(file, self._what_else(content))
+        if not isinstance(content.get("format"), int) or content["format"] > self.format:
+            written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
+            self.refuse(file, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {self.format}")
+        if content["format"] < self.oldest:
+            self.refuse(file, f"was written by an older ctid and cannot be read back; {self.again}")
+        if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
+            self.refuse(file, "is damaged, or was changed after it was written: its checksum is that of other content")
+        return content
+
+    def kind_in(self, file: str) -> str | None:
+        """Return which kind of result a file says that it is; refuse one that cannot be read as of a kind."""
+        content = self._json(file)
+        return content["kind"] if isinstance(content, dict) and isinstance(content.get("kind"), str) else None
+
+    @contextmanager
+    def refusing(self, file: str) -> Iterator[None]:
+        """Refuse a file of which a part is not what it should be."""
+        try:
+            yield
+        except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
+            self.refuse(file, f"is damaged ({str(error)[:200]})")
+
+    def refuse(self, file: str, what: str) -> NoReturn:
+        """Say what is wrong with a file, and what writes such files."""
+        raise DataError(f"{file} {what}; {self.command} writes such a file")
+
+    def _json(self, file: str) -> Any:
+        require_file(file)
+        if (size := os.stat(file).st_size) > MAX_BYTES:
+            raise DataError(f"{file}: {size} bytes are too many for a {self.noun}; at most {MAX_BYTES} are read")
+        try:
+            return read_json(Path(file).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise DataError(f"{file}: the file cannot be read: {error.strerror or error}") from None
+        except (ValueError, RecursionError) as error:
+            self.refuse(file, f"is no JSON, or damaged ({str(error)[:200]})")
+
+    def _what_else(self, content: Any) -> str:
+        """Return what a file is that is of another kind."""
+        if not isinstance(content, dict):
+            return f"is no {self.noun}"
+        if isinstance(content.get("kind"), str):
+            return f"is no {self.noun} but of kind {content['kind'][:40]!r}"
+        if "parameters" in content and "residual_tests" in content:
+            return "is a fit of an older ctid, which cannot be read back"
+        return f"is another kind of result than a {self.noun}"
 
 
 def path_and_sum(path: str | os.PathLike[str], folder: Path) -> dict[str, Any]:
@@ -65,12 +117,16 @@ class Source:
     """A record as the file of a result names it."""
 
     kind: ResultKind
-    #: The file that names it, and the record's own as it was called then.
+    #: The file that names it.
     owner: str
-    name: str
     content: Mapping[str, Any]
     #: Where it is now, if it moved.
     moved: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Return how the record was called."""
+        return str(self.content["file"])
 
     @property
     def place(self) -> str:
@@ -87,39 +143,6 @@ class Source:
             raise DataError(f"{self.owner}: {what}; name that one with --record FILE, or {self.kind.again}")
 
 
-def content_of(file: str, kind: ResultKind) -> dict[str, Any]:
-    """Return what a file says, if it is one of this kind as it was written."""
-    content = _json_of(file, kind)
-    if not isinstance(content, dict) or content.get("kind") != kind.kind:
-        refuse(file, kind, _what_else(content, kind))
-    if not isinstance(content.get("format"), int) or content["format"] > kind.format:
-        written = f"was written by a newer ctid ({str(content.get('ctid'))[:20]}): its format is "
-        refuse(file, kind, f"{written}{str(content.get('format'))[:20]}, and this one reads up to {kind.format}")
-    if content["format"] < kind.oldest:
-        refuse(file, kind, f"was written by an older ctid and cannot be read back; {kind.again}")
-    if content.get("checksum") != content_hash({key: item for key, item in content.items() if key != "checksum"}):
-        refuse(file, kind, "is damaged, or was changed after it was written: its checksum is that of other content")
-    return content
-
-
-def kind_in(file: str, kind: ResultKind) -> str | None:
-    """Return which kind of result a file says that it is; refuse one that cannot be read as of a kind."""
-    content = _json_of(file, kind)
-    return content["kind"] if isinstance(content, dict) and isinstance(content.get("kind"), str) else None
-
-
-def _json_of(file: str, kind: ResultKind) -> Any:
-    require_file(file)
-    if (size := os.stat(file).st_size) > MAX_BYTES:
-        raise DataError(f"{file}: {size} bytes are too many for a {kind.noun}; at most {MAX_BYTES} are read")
-    try:
-        return read_json(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{file}: the file cannot be read: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:
-        refuse(file, kind, f"is no JSON, or damaged ({str(error)[:200]})")
-
-
 def texts(values: Iterable[Any]) -> bool:
     """Return whether all values are texts."""
     return all(isinstance(value, str) for value in values)
@@ -129,22 +152,6 @@ def require(what: str, right: bool) -> None:
     """Refuse a file of which a part is not what it should be."""
     if not right:
         raise DataError(f"its {what}")
-
-
-def refuse(file: str, kind: ResultKind, what: str) -> NoReturn:
-    """Say what is wrong with a file, and what writes such files."""
-    raise DataError(f"{file} {what}; {kind.command} writes such a file")
-
-
-def _what_else(content: Any, kind: ResultKind) -> str:
-    """Return what a file is that is of another kind."""
-    if not isinstance(content, dict):
-        return f"is no {kind.noun}"
-    if isinstance(content.get("kind"), str):
-        return f"is no {kind.noun} but of kind {content['kind'][:40]!r}"
-    if "parameters" in content and "residual_tests" in content:
-        return "is a fit of an older ctid, which cannot be read back"
-    return f"is another kind of result than a {kind.noun}"
 
 
 # --- results as plain data ------------------------------------------------------------------------------------------

@@ -1,19 +1,20 @@
-"""Journals as SQLite files: their format, how they are opened, and what keeps one from being read or written."""
+"""Journals as files: their format, how they are opened, what keeps one from being used, and who is writing to it."""
 
+import json
 import os
+import platform
 import shutil
 import sqlite3
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NoReturn
+from tempfile import TemporaryDirectory
+from typing import Any, NoReturn
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
-from ctid_cli.storage.announcement import reported
-from ctid_cli.temporary import TemporaryFolder
 
-#: The journal, and what is exported of it.
-FILE_NAME, EXPORT = "journal.sqlite", "runs.h5"
+#: The journal, what is exported of it, and the specification of the latest run.
+FILE_NAME, EXPORT, SPEC = "journal.sqlite", "runs.h5", "spec.yaml"
 #: Another one for every change after which another ctid could misread the file.
 FORMAT = 5
 #: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
@@ -58,8 +59,8 @@ def readable(path: Path, *, live: bool) -> Iterator[str]:
     elif empty:
         yield f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     else:
-        with TemporaryFolder() as folder:
-            copy = folder / path.name
+        with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as folder:
+            copy = Path(folder) / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(log, copy.with_name(log.name))
             yield copy.as_uri()
@@ -115,3 +116,45 @@ def _identity_of(path: Path) -> tuple[int, int] | None:
         found = os.stat(path)
         return found.st_dev, found.st_ino
     return None
+
+
+# --- who is writing ---------------------------------------------------------------------------------------------------
+
+#: Says who runs in a folder, for those who find it locked, and how many estimates were reported there. What a killed
+#: run leaves of it tells how many estimates the journal holds at least: SQLite drops the end of a damaged write-ahead
+#: log without a word.
+RUNNING = "running.json"
+
+
+def announce(folder: Path, experiment: str, started: str, done: int, total: int, stored: int = 0) -> None:
+    """Say who runs, how many data sets of how many are done, and how many estimates the journal holds."""
+    running = {"experiment": experiment, "pid": os.getpid(), "host": platform.node()}
+    running |= {"started": started, "done": done, "total": total, "stored": stored}
+    # A courtesy to readers, written over and over: neither worth a synchronisation nor worth failing for.
+    with suppress(OSError):
+        temporary = folder / f"{RUNNING}.tmp"
+        temporary.write_text(json.dumps(running), encoding="utf-8")
+        temporary.replace(folder / RUNNING)
+
+
+def retract(folder: Path) -> None:
+    """Take back what was announced, unless another process announced it."""
+    running = who_runs(folder)
+    if running is not None and (running["pid"], running["host"]) == (os.getpid(), platform.node()):
+        with suppress(OSError):
+            (folder / RUNNING).unlink(missing_ok=True)
+
+
+def who_runs(folder: Path) -> dict[str, Any] | None:
+    """Return what the run that writes to a folder says about itself."""
+    try:
+        running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
+        return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
+    except (OSError, ValueError):
+        return None
+
+
+def reported(folder: Path) -> int:
+    """Return how many estimates were reported as stored by a run that has not ended; 0 where nothing says so."""
+    stored = (who_runs(folder) or {}).get("stored")
+    return stored if isinstance(stored, int) else 0

@@ -10,20 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ctid_cli.errors import DataError
 from ctid_cli.signals.sampled_signal import SampledSignal, read_sampled_signal
-from ctid_cli.storage.result_file import (
-    ResultKind,
-    Source,
-    content_of,
-    decoded,
-    encoded,
-    path_and_sum,
-    refuse,
-    require,
-    result_text,
-    texts,
-)
+from ctid_cli.storage.result_file import ResultKind, Source, decoded, encoded, path_and_sum, require, texts
 from ctid_cli.tones.track import Track
 
 TRACK = ResultKind("ctid track", 2, "track", "ctid track", "track again")
@@ -56,7 +44,7 @@ def track_file_text(
         "from": reading.start,
         "to": reading.stop,
     }
-    return result_text(TRACK, {**content, "record": source, "result": encoded(track)}, command)
+    return TRACK.text({**content, "record": source, "result": encoded(track)}, command)
 
 
 class SignalSource(Source):
@@ -90,14 +78,12 @@ class StoredTrack:
 def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | None = None) -> StoredTrack:
     """Return the file with everything in it; its record may have moved."""
     file = os.fspath(path)
-    content = content_of(file, TRACK)
-    try:
+    content = TRACK.content(file)
+    with TRACK.refusing(file):
         track = decoded(content["result"], Track)
         _require_said(content)
-        moved = None if record is None else os.fspath(record)
-        source = SignalSource(TRACK, file, str(content["file"]), content["record"], moved)
-    except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
-        refuse(file, TRACK, f"is damaged ({str(error)[:200]})")
+    said = {"file": content["file"], **content["record"]}
+    source = SignalSource(TRACK, file, said, None if record is None else os.fspath(record))
     return StoredTrack(Path(file), content, track, source)
 
 

@@ -11,7 +11,7 @@ from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
 from ctid_cli.reporting.pages.question import formula_of, polynomial
-from ctid_cli.storage.folder import SPEC
+from ctid_cli.storage.sqlite_file import SPEC
 from tests.reporting.parsed_page import Page
 
 HOSTILE = "<script>alert(1)</script> & \"quotes\" 'too' --> {{ 7 * 7 }} {% include 'x' %}"

@@ -15,8 +15,7 @@ from ctid_cli.reporting.status_result import (
     precision_lines,
 )
 from ctid_cli.storage.merge import Merged
-from ctid_cli.storage.status import ExperimentStatus, GroupStatus
-from ctid_cli.storage.verify import Finding, Verification
+from ctid_cli.storage.status import ExperimentStatus, Finding, GroupStatus, Verification
 
 RMSE = Widest("search", {"order": 2}, "3", "rmse", "delay", 0.0812, 0.05)
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 import random
@@ -21,7 +20,7 @@ from ctid_cli.errors import RefusedError, StorageError
 from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, preview
 from ctid_cli.running.plan import Plan, current_origin
-from ctid_cli.running.states import States
+from ctid_cli.running.states import jobs_of
 from ctid_cli.storage import folder
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.identity import Origin
@@ -97,26 +96,15 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_exported_bytes_do_not_depend_on_jobs_or_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(toy_plan(), tmp_path / "one", jobs=1)
     run(toy_plan(), tmp_path / "two", jobs=2)
-    in_order = States.jobs
 
     def shuffled(*given: Any) -> Any:
-        found = list(in_order(*given))
+        found = list(jobs_of(*given))
         random.Random(3).shuffle(found)
         return iter(found)
 
-    monkeypatch.setattr(States, "jobs", shuffled)
+    monkeypatch.setattr("ctid_cli.running.engine.jobs_of", shuffled)
     run(toy_plan(), tmp_path / "shuffled", jobs=2)
     assert exported(tmp_path / "one") == exported(tmp_path / "two") == exported(tmp_path / "shuffled")
-
-
-def test_the_longest_of_a_replicate_comes_first() -> None:
-    plan: Any = toy_plan(runs=3, levels=(1, 2, 3))
-    states, seconds = States(), dict[tuple[str, str], float]()
-    taken: list[tuple[int, float]] = []
-    for job in states.jobs(plan, states.missing(plan), seconds):
-        taken.append((job.replicate, job.cell.content["level"]))
-        seconds |= {(key.data_hash, key.estimator_hash): {1: 1.0, 2: 3.0, 3: 2.0}[taken[-1][1]] for key in job.keys}
-    assert taken == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (1, 1), (2, 2), (2, 3), (2, 1)]
 
 
 def test_every_estimate_of_the_plan_is_stored_once_in_its_order_and_then_reported(tmp_path: Path) -> None:
@@ -165,25 +153,14 @@ def test_only_what_is_new_is_computed(tmp_path: Path) -> None:
     assert exported(tmp_path) == exported(tmp_path / "alone")
 
 
-def test_two_names_of_one_estimator_share_its_estimates(tmp_path: Path) -> None:
-    plan = toy_plan(Toy(), runs=2)
-    twins = tuple(dataclasses.replace(plan.estimators[0], name=name) for name in ("left", "right"))
-    plan = dataclasses.replace(plan, estimators=twins)
-    summary = run(plan, tmp_path)
-    frame = read_estimates(tmp_path)
-    assert summary.planned == summary.computed == 8
-    assert frame["estimator"].value_counts().to_dict() == {"left": 8, "right": 8}
-
-
 def test_the_spec_lies_beside_the_results_and_the_journal_says_where_they_come_from(tmp_path: Path) -> None:
     run(toy_plan(text="# as the user wrote it\n"), tmp_path)
     assert (tmp_path / "spec.yaml").read_text() == "# as the user wrote it\n"
-    assert '"experiment": "toys"' in (tmp_path / "spec.canonical.json").read_text()
     with read_journal(tmp_path / "journal.sqlite") as log:
         assert log is not None
         assert {"host", "argv", "packages", "limits"} <= set(log.sessions()[0].info)
     names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"spec.yaml", "spec.canonical.json", "journal.sqlite", "runs.h5"}
+    assert names == {"spec.yaml", "journal.sqlite", "runs.h5"}
 
 
 # Misbehaving estimators

@@ -12,7 +12,7 @@ import pytest
 from ctid_cli.errors import MachineError
 from ctid_cli.running import workers
 from ctid_cli.running.engine import Progress, preview
-from ctid_cli.running.stopping import StopRequest
+from ctid_cli.running.limits import StopRequest
 from ctid_cli.storage.estimates import read_estimates
 from tests.running.fakes import Toy, exported, run, toy_plan
 

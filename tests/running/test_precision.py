@@ -12,9 +12,9 @@ from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import wilson_interval
 from ctid_cli.running import engine
 from ctid_cli.running.engine import Progress, RunSummary, preview
+from ctid_cli.running.limits import StopRequest
 from ctid_cli.running.plan import Plan
-from ctid_cli.running.precision import cell_precisions
-from ctid_cli.running.stopping import StopRequest
+from ctid_cli.running.states import cell_precisions
 from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import exported, run, toy_plan
 

@@ -57,8 +57,7 @@ def run_folder(manifest, place, outcomes=None, origin=ORIGIN, **info):
     """A folder as a run leaves it that has computed some estimates, or all that its plan asks for."""
     place.mkdir(parents=True)
     log = open_journal(place / "journal.sqlite")
-    for name in ("spec.yaml", "spec.canonical.json"):
-        log.write_beside(name, b"# toys\n")
+    log.write_spec(b"# toys\n")
     session = log.begin(manifest, origin, f"began {place.name}", info)
     log.add(outcomes_of(manifest) if outcomes is None else outcomes, session)
     write_runs(place, log)

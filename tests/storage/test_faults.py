@@ -13,14 +13,14 @@ from typer.testing import CliRunner
 
 from ctid_cli.cli.main import app
 from ctid_cli.errors import DamageError
-from ctid_cli.storage.announcement import announce
 from ctid_cli.storage.estimates import read_estimates
 from ctid_cli.storage.export import write_runs
 from ctid_cli.storage.folder import reading_journal
 from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.journal import open_journal
-from ctid_cli.storage.keeping import keep_readable
-from ctid_cli.storage.verify import verify
+from ctid_cli.storage.merge import keep_readable
+from ctid_cli.storage.sqlite_file import announce
+from ctid_cli.storage.status import verify
 from tests.storage.made_results import ORIGIN, SPEC, outcomes_of, plan_of, run_folder
 
 #: Large enough for several pages of the journal.

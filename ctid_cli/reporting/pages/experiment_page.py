@@ -20,7 +20,7 @@ from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.status_result import first_line
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import experiment_table, measure_table, notes_of, success_sentence
-from ctid_cli.storage.folder import SPEC
+from ctid_cli.storage.sqlite_file import SPEC
 from ctid_cli.storage.status import public_sessions
 from ctid_cli.text import count
 
