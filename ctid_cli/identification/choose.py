@@ -33,6 +33,8 @@ LATEST, LATER = 0.1, 0.5
 REACH, FURTHER = 1.5, 3
 #: A delay beyond this share of the range is at its end.
 AT_END = 0.9
+#: A range this much narrower is worth another grid.
+MUCH_NARROWER = 0.5
 #: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
 TIE = 1e-3
 
@@ -86,6 +88,7 @@ class _Choosing:
         ranking = self._grid(setting, delays)
         # Small models may miss so much that a state makes up for it, or that their delay is far too long.
         span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
+        narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
         confirmed = self._setting(span, narrower, ranking.best.fit.model)
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
