@@ -14,7 +14,7 @@ from ctid_cli.identification.criterion import Candidate, Ranking, ranked
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
@@ -154,7 +154,7 @@ class SmallModels:
         """Rank the structures in some settings, which all use the same samples."""
         found = [each for setting in settings for each in self._fitted(setting)]
         if not found:
-            raise DataError(f"{self.records[0].name}: too few usable samples for a model's parameters")
+            raise DataError(f"{named(self.records[0])}too few usable samples for a model's parameters")
         return ranked(found)
 
     def _fitted(self, setting: Setting) -> Iterator[Candidate]:
@@ -197,7 +197,7 @@ def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[
                 break
             families = [family for family in families if _promising(family, ranking)]
     if not found:
-        raise DataError(f"{records[0].name}: too few usable samples for a model's parameters; take a longer record")
+        raise DataError(f"{named(records[0])}too few usable samples for a model's parameters; take a longer record")
     return ranked(found)
 
 
