@@ -17,8 +17,14 @@ from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.initial_states import (
+    State,
+    beginning_is_likely,
+    excited_after,
+    states_of,
+    without_beginning,
+)
 from ctid_cli.identification.parts import FEW, MANY, parts_of
-from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import input_moves
