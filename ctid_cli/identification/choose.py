@@ -129,7 +129,7 @@ class _Choosing:
         length = min(record.duration for record in self.few)
         hints = [analyse_response(record).delay for record in self.few]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        latest = min(max(LATEST * length, seen), LATER * length)
+        latest = _rounded(min(max(LATEST * length, seen), LATER * length))
         # An estimated state does no harm to the delay; rest may.
         settings = self._settings(latest)[-1:]
         models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
