@@ -1,25 +1,28 @@
 """Fits of many structures to the same records, each found from the smaller ones that it contains."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import best_of_orders
+from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.delay_profile import DelayProfile, fitted
 from ctid_cli.identification.criterion import Candidate, Ranking, ranked
 from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
 MOST_POLES = 12
 #: The grid ends at so many poles more than the best structure has, and not before the second number.
 BEYOND, FEWEST_TRIED = 2, 4
+#: From then on a number of integrators whose best structure is so far behind is left out.
+BEHIND = 30.0
 #: All poles and zeros of the structures that settings of records are compared with.
 SMALL = ((1, 0), (2, 1), (3, 2))
 #: Samples for each parameter of a structure at least.
@@ -83,6 +86,8 @@ class Structures:
     options: DelayProfile
     measured: MeasuredRecords
     search: StructureSearch
+    #: Models of another setting, from which all searches start.
+    near: Callable[[int, int], TransferFunction] | None = None
     found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
@@ -92,9 +97,9 @@ class Structures:
         setting: Setting,
         integrators: int,
         delays: tuple[float, float],
-        near: "Structures | None" = None,
+        near: Callable[[int, int], TransferFunction] | None = None,
     ) -> "Structures":
-        """Lay records out; searches start from what another setting near this one has led to, if any."""
+        """Lay records out."""
         hold, state, before, offset = setting
         least = int(not integrators)
         options = DelayProfile(
@@ -104,41 +109,52 @@ class Structures:
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
         box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
-        pilot = None if near is None else near.search
-        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK, pilot=pilot))
+        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK), near)
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
-        if (poles, zeros) in self.found:
-            return self.found[poles, zeros]
-        options, measured, free = (
-            replace(self.options, poles=poles, zeros=zeros),
-            self.measured,
-            self.search.box.delay_free,
-        )
-        structure = Structure(options.order, zeros, delay=free)
-        size = structure.size - options.integrators + measured.layout_of(options.order, free).own * len(self.records)
-        if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
-            return None
-        found = fitted(measured.with_structure(structure), best_of_orders(self.search, poles, zeros), None, None)
-        self.found[poles, zeros] = Candidate(options, self.hold, found, size)
+        if (poles, zeros) not in self.found:
+            options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
+            structure = Structure(options.order, zeros, delay=self.search.box.delay_free)
+            own = measured.layout_of(options.order, structure.delay).own * len(self.records)
+            size = structure.size - options.integrators + own
+            if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
+                return None
+            found = fitted(measured.with_structure(structure), self._least(poles, zeros), None, None)
+            self.found[poles, zeros] = Candidate(options, self.hold, found, size)
         return self.found[poles, zeros]
+
+    def model(self, poles: int, zeros: int) -> TransferFunction:
+        """Return a model that has been fitted."""
+        return self.found[poles, zeros].fit.model
+
+    def _least(self, poles: int, zeros: int) -> Optimum:
+        if self.near is None:
+            return best_of_orders(self.search, poles, zeros)
+        start = self.near(poles, zeros)
+        alone = start.denominator[: start.denominator.size - self.options.integrators]
+        return best_near(self.search, zeros, alone, start.delay)
 
 
 class SmallModels:
     """A few structures in several settings of the same records."""
 
     def __init__(
-        self, records: Sequence[Record], span: Span, delays: tuple[float, float], most: int = len(SMALL)
+        self,
+        records: Sequence[Record],
+        span: Span,
+        delays: tuple[float, float],
+        most: int = len(SMALL),
+        near: TransferFunction | None = None,
     ) -> None:
-        self.records, self.span, self.delays, self.most = records, span, delays, most
+        self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
         """Rank the structures in some settings, which all use the same samples."""
         found = [each for setting in settings for each in self._fitted(setting)]
         if not found:
-            raise DataError(f"{self.records[0].name}: too few usable samples for a model's parameters")
+            raise DataError(f"{named(self.records[0])}too few usable samples for a model's parameters")
         return ranked(found)
 
     def _fitted(self, setting: Setting) -> Iterator[Candidate]:
@@ -155,7 +171,9 @@ class SmallModels:
         if key not in self._structures:
             pairs = ((one, number) for one, number in self._structures if one.state == setting.state)
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
-            self._structures[key] = Structures.of(self.records, *key, self.delays, alike)
+            model = self.near
+            near = (lambda *_: model) if model is not None else None if alike is None else alike.model
+            self._structures[key] = Structures.of(self.records, *key, self.delays, near)
         return self._structures[key]
 
 
@@ -173,8 +191,17 @@ def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[
         found += [each for each in tried if each is not None]
         if tried and not any(tried):
             break
-        if order >= FEWEST_TRIED and found and order - ranked(found).best.options.order >= BEYOND:
-            break
+        if order >= FEWEST_TRIED and found:
+            ranking = ranked(found)
+            if order - ranking.best.options.order >= BEYOND:
+                break
+            families = [family for family in families if _promising(family, ranking)]
     if not found:
-        raise DataError(f"{records[0].name}: too few usable samples for a model's parameters; take a longer record")
+        raise DataError(f"{named(records[0])}too few usable samples for a model's parameters; take a longer record")
     return ranked(found)
+
+
+def _promising(family: Structures, ranking: Ranking) -> bool:
+    """Whether structures with a number of integrators may still become the best."""
+    own = ranking.of(integrators=family.options.integrators)
+    return own is None or own.best.criterion - ranking.best.criterion < BEHIND

@@ -17,11 +17,18 @@ from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.initial_states import (
+    State,
+    beginning_is_likely,
+    excited_after,
+    states_of,
+    without_beginning,
+)
 from ctid_cli.identification.parts import FEW, MANY, parts_of
-from ctid_cli.identification.treatment import State, beginning_is_likely, excited_after, states_of, without_beginning
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import input_moves
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
 
@@ -32,6 +39,8 @@ LATEST, LATER = 0.1, 0.5
 REACH, FURTHER = 1.5, 3
 #: A delay beyond this share of the range is at its end.
 AT_END = 0.9
+#: A range this much narrower is worth another grid.
+MUCH_NARROWER = 0.5
 #: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
 TIE = 1e-3
 
@@ -84,10 +93,11 @@ class _Choosing:
         setting = self._setting(self.span, delays)
         ranking = self._grid(setting, delays)
         # Small models may miss so much that a state makes up for it, or that their delay is far too long.
-        span = Span.only(ranking.best.options)
-        again = self._range_of(ranking, delays), self._setting(span, self._range_of(ranking, delays))
-        if again != (delays, setting):
-            delays, setting = again
+        span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
+        narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
+        confirmed = self._setting(span, narrower, ranking.best.fit.model)
+        if (narrower, confirmed) != (delays, setting):
+            delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
         while self.given.delay_bounds is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
@@ -119,8 +129,9 @@ class _Choosing:
         length = min(record.duration for record in self.few)
         hints = [analyse_response(record).delay for record in self.few]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
-        latest = min(max(LATEST * length, seen), LATER * length)
-        settings = self._settings(latest)
+        latest = _rounded(min(max(LATEST * length, seen), LATER * length))
+        # An estimated state does no harm to the delay; rest may.
+        settings = self._settings(latest)[-1:]
         models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
         return self._range_of(models, (0.0, latest)), latest
 
@@ -134,16 +145,16 @@ class _Choosing:
 
     # --- state, offset and hold ------------------------------------------------------------------------
 
-    def _setting(self, span: Span, delays: tuple[float, float]) -> Setting:
-        """Return state, offset and hold, as structures of a span show them."""
+    def _setting(self, span: Span, delays: tuple[float, float], near: TransferFunction | None = None) -> Setting:
+        """Return state, offset and hold, as structures of a span show them; their minima may be near a known model."""
         self.said = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # The level before the record is told by all samples, the first ones above all.
-            level = SmallModels(self.few, span, delays).compared(rests).best.options.input_before
+            level = SmallModels(self.few, span, delays, near=near).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
-        models = SmallModels(self._common(settings, delays[1]), span, delays)
+        models = SmallModels(self._common(settings, delays[1]), span, delays, near=near)
         if self.given.offset is None:
             settings += [each._replace(offset="none") for each in settings]
         best = self._treated(models.compared(settings), delays[1])

@@ -9,7 +9,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import noise_of, penalised
-from ctid_cli.identification.treatment import states_of
+from ctid_cli.identification.initial_states import states_of
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Offset

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array
-from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.inference.residual_tests import all_white, orthonormal
+from ctid_cli.inference.noise_model import NoiseModel
+from ctid_cli.inference.residual_tests import orthonormal
 
 
 def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
@@ -121,11 +121,6 @@ RANK = 1e-9
 BLOCKS = 10
 #: A block that gives a larger share of what is known of a direction has it for itself.
 OWN = 0.9
-
-
-def shared_noise(residuals: Sequence[Array]) -> NoiseModel:
-    """Noise behind the residuals of the closest fit: white, unless they are seen not to be."""
-    return fit_noise_model(residuals, max_order=0 if all_white(residuals) else None)
 
 
 def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise: NoiseModel) -> float:

@@ -57,7 +57,8 @@ def test_state_and_offset_are_those_that_were_made(made, state, offset):
 def test_an_early_step_is_a_step_from_rest(lead):
     choice = choose(record_of(SECOND, u=step(lead), offset=1.0))
     assert choice.options.initial_state == "rest"
-    assert choice.ranking.best.fit.model.numerator[-1] / 4.0 == pytest.approx(0.5, abs=0.03)
+    model = choice.ranking.best.fit.model
+    assert model.numerator[-1] / model.denominator[-1] == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_record_that_begins_with_its_step_needs_the_level_before():

@@ -165,6 +165,13 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     return _least(search, poles, zeros, True)
 
 
+def best_near(search: StructureSearch, zeros: int, denominator: Array, delay: float) -> Optimum:
+    """Return the least squared error in the basin of a denominator, without integrators, and a delay."""
+    poles = denominator.size - 1
+    search.refine(poles, zeros, [point_of(np.roots(denominator).astype(complex), delay, search.box)])
+    return _least(search, poles, zeros, False)
+
+
 def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
     """Return the least squared error that a search knows of a structure."""
     # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
