@@ -80,13 +80,13 @@ INDEPENDENT = 0.8
 LEVEL = 5e-4
 #: Tail of the test of changes under noise, chance = 3.6 c exp(-c/2): measured on windows of 64 to 1000 samples.
 CHANGE_TAIL = 3.6
-#: Lines that join together with the strongest one: how many, bins between them, the share of its ordinate that they
-#: exceed, and how far above the height that noise exceeds with a chance. They save time only.
+#: Lines that join together with the strongest one: how many, bins between them, and the share of its energy that they
+#: exceed. They save time only.
 FURTHER = 4
 LOBES = 8
 SIDE_LOBE = 0.1
-SURELY = 1.5
-LEAST_CHANCE = 1e-7
+#: A change of a tone of energy E explains lines of less than E as far as so many bins away, and E (bins/d)^2 d bins away.
+CHANGED_BINS = 4.0
 
 # --- fit ------------------------------------------------------------------------------------------------------------
 
@@ -112,8 +112,11 @@ BLOCK_SAMPLES = 2**17
 
 # --- what is left ---------------------------------------------------------------------------------------------------
 
-#: Energy that is left by a change or a line d bins away, in units of the noise, disturbs a tone if it exceeds d^2.
-NEAR = 1.0
+#: A line of energy E, in units of the noise, d bins from a tone moves its frequency by at most so many sqrt(E)/d standard
+#: errors: slope of the phase that it makes in the window, 3 b/(pi d a), over sqrt(6/N) sigma/a, E = N (b/sigma)^2/4.
+LEAKAGE = 0.78
+#: Where E/d^2 exceeds this, the error is larger than that of a window half as long, by 2^1.5.
+MOST_LEAKED = 7.0 / (LEAKAGE / 3.0) ** 2
 #: A window that takes no more lines and leaves one of more than this share of a tone's energy says nothing of it.
 COMPARABLE = 0.1
 #: Lines of one window closer than so many bins may be one tone that changes. Measured.

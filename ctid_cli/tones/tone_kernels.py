@@ -297,6 +297,8 @@ def fit_windows(
                             for k in range(n):
                                 for j in range(PARAMETERS):
                                     tones[k, j] = trial[k, j]
+                            # At a bound of a parameter the gain that is foreseen is never had.
+                            done = cost - lower <= SMALL_GAIN * cost / count
                             constant, cost, taken = level, lower, taken + 1
                             gram, trial_gram = trial_gram, gram
                             right, trial_right = trial_right, right
