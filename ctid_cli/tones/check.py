@@ -95,10 +95,9 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
     bent = curved > c.BENT
     omega = np.where(bent, omega - share * bend, omega)
     error = np.where(bent, np.hypot(error, share * of(tones.bend_error)), error)
-    error = error * np.sqrt(1.0 + (c.LEAKAGE / c.COVERED) ** 2 * of(_leaked(tones, length)))
+    error = error * of(_raised(tones, length))
     hidden = np.minimum(c.KINK * np.abs(rate) * length, c.HIDDEN_KINK * omega_error) / c.COVERED
     error = np.where(np.abs(rate) > c.MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
-    error = np.where(of(tones.change_chance) < c.DOUBTFUL, c.DOUBT * error, error)
     blended = (np.abs(growth) > c.GROWS * of(tones.growth_error)) & (np.abs(growth) * half < c.BLENDED_GROWTH)
     return omega, np.where(blended, np.hypot(error, np.abs(growth) / c.COVERED), error)
 
@@ -116,7 +115,7 @@ def _leaked(tones: WindowTones, length: int) -> Array:
     bins = length / (2.0 * np.pi)
     away = np.abs(tones.omega - tones.line[:, None]) * bins
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    leaked = np.where((line > 0.0) & (away < c.APART), np.inf, line / away**2)
+    leaked = np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2)
     changed = np.where(tones.change_chance < c.LEVEL, tones.change_energy, 0.0)
     for j in np.flatnonzero(changed.any(axis=0)):
         away = np.maximum(np.abs(tones.omega - tones.omega[:, j, None]) * bins, c.SMALLEST_FLOOR)
@@ -125,13 +124,26 @@ def _leaked(tones: WindowTones, length: int) -> Array:
     return np.asarray(leaked)
 
 
+def _raised(tones: WindowTones, length: int) -> Array:
+    """Return the factor by which what is left of windows raises the errors of their frequencies, shape (R, n)."""
+    own = c.STEP**2 * np.where(tones.change_chance < c.DOUBTFUL, tones.change_energy, 0.0)
+    changed = tones.change_chance < c.LEVEL
+    own[changed] = c.KINKED**2 * tones.change_energy[changed]
+    own[changed & (tones.change_energy > c.SMALL_CHANGE * _energy(tones))] = np.inf
+    return np.asarray(np.sqrt(1.0 + (own + c.LEAKAGE**2 * _leaked(tones, length)) / c.COVERED**2))
+
+
+def _energy(tones: WindowTones) -> Array:
+    """Return the energy of tones in units of the noise, shape (R, n)."""
+    return 0.5 * (tones.amplitude / tones.amplitude_error) ** 2
+
+
 def _sound(tones: WindowTones, length: int) -> BoolArray:
     """Return which tones nothing that is left of their window disturbs, shape (R, n)."""
-    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~(tones.change_chance < c.LEVEL)
-    sound &= _leaked(tones, length) <= c.MOST_LEAKED
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & (_raised(tones, length) < c.MOST_RAISED)
     full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    return np.asarray(sound & ~(full & (line > c.COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2)))
+    return np.asarray(sound & ~(full & (line > c.COMPARABLE * _energy(tones))))
 
 
 def explained(tones: WindowTones, length: int) -> bool:
