@@ -102,7 +102,7 @@ SURE = 6.0
 #: Most steps of a stage of a fit. A record of few tones that hold throughout is fitted at once, in few rounds of few
 #: steps: that takes a tenth of the time of windows of all lengths. Lines of what is left are looked for in windows that
 #: are shorter by the last factor each.
-MOST_STEPS = 30
+MOST_STEPS = 60
 STEADY_LINES = 8
 STEADY_ROUNDS = 2
 STEADY_STEPS = 8
