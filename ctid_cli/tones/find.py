@@ -154,10 +154,10 @@ def strongest_lines(left: Left, spectrum: Spectrum) -> Lines:
 
 
 def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Array:
-    """Return lines that are no part of the tones a window has, the strongest first [rad/sample], NaN where none, (R, K).
+    """Return lines that are no part of the tones of windows, the strongest first [rad/sample], shape (R, K).
 
-    ``tones`` are those it has [rad/sample], and ``change`` the energy that a change of each would explain, (R, n). What
-    is left less than 1.5 bins from a tone, or explained better by its change, is none.
+    NaN where there is none. ``tones`` are those a window has [rad/sample], and ``change`` the energy that a change of
+    each would explain, (R, n). What is left within the width of a tone, or explained better by its change, is no line.
     """
     bin_ = 2.0 * np.pi / spectrum.length
     ratio = spectrum.ratio.copy()

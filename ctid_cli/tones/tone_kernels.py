@@ -370,7 +370,14 @@ def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArr
 
 @njit(cache=True, nogil=True)
 def keep_readings(
-    omega: Array, error: Array, window: IndexArray, bounds: IndexArray, reach: float, errors: float, agree: float, closed: BoolArray
+    omega: Array,
+    error: Array,
+    window: IndexArray,
+    bounds: IndexArray,
+    reach: float,
+    errors: float,
+    agree: float,
+    closed: BoolArray,
 ) -> NDArray[np.bool_]:
     """Return which readings of each instant are kept, those of the longest, nearest window first.
 
