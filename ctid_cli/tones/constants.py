@@ -116,7 +116,7 @@ BLOCK_SAMPLES = 2**17
 #: standard errors: slope of the phase that it makes, 3 b/(pi d a), over sqrt(6/N) sigma/a, E = N (b/sigma)^2/4.
 LEAKAGE = 0.78
 #: Readings whose errors are larger than so many times those of the fit are not used.
-MOST_RAISED = 100.0
+MOST_RAISED = 20.0
 #: A window that takes no more lines and leaves one of more than this share of a tone's energy says nothing of it.
 COMPARABLE = 0.1
 #: Lines of one window closer than so many bins may be one tone that changes. Measured.

@@ -35,7 +35,7 @@ def readings_at(
     found = found.at(np.argsort(found.row, kind="stable"))
     bounds = np.searchsorted(found.row, np.arange(places.size + 1))
     kept = keep_readings(
-        found.omega, found.error, found.window, bounds, c.SAME_BINS, c.SAME_ERRORS, c.COVERED, moving(found, bounds)
+        found.omega, found.error, found.window, bounds, c.SAME_BINS, c.SAME_ERRORS, moving(found, bounds)
     )
     found = found.at(np.flatnonzero(kept))
     return found.at(np.lexsort((found.omega, found.row)))

@@ -370,33 +370,19 @@ def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArr
 
 @njit(cache=True, nogil=True)
 def keep_readings(
-    omega: Array,
-    error: Array,
-    window: IndexArray,
-    bounds: IndexArray,
-    reach: float,
-    errors: float,
-    agree: float,
-    closed: BoolArray,
+    omega: Array, error: Array, window: IndexArray, bounds: IndexArray, reach: float, errors: float, closed: BoolArray
 ) -> NDArray[np.bool_]:
-    """Return which readings of each instant are kept, those of the longest, nearest window first.
-
-    All that are near to one of them are of its tone; of those that agree with it, the one with the least error is kept.
-    """
+    """Return which readings of each instant are kept: none that is near to one of a longer, or nearer, window."""
     kept = np.zeros(omega.size, np.bool_)
     for row in range(bounds.size - 1):
-        for first in range(bounds[row], bounds[row + 1]):
-            if closed[first]:
+        for best in range(bounds[row], bounds[row + 1]):
+            if closed[best]:
                 continue
-            best = first
-            for k in range(first, bounds[row + 1]):
-                sure = math.hypot(error[k], error[first])
-                off = abs(omega[k] - omega[first])
-                if not closed[k] and off < max(reach * 2.0 * math.pi / window[k], errors * sure):
-                    closed[k] = True
-                    if off <= agree * sure and error[k] < 0.5 * error[first] and error[k] < error[best]:
-                        best = k
             kept[best] = True
+            for k in range(best, bounds[row + 1]):
+                sure = errors * math.hypot(error[k], error[best])
+                near = abs(omega[k] - omega[best]) < max(reach * 2.0 * math.pi / window[k], sure)
+                closed[k] |= near and not math.isnan(sure)
     return kept
 
 
