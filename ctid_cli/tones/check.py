@@ -95,9 +95,9 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
     bent = curved > c.BENT
     omega = np.where(bent, omega - share * bend, omega)
     error = np.where(bent, np.hypot(error, share * of(tones.bend_error)), error)
+    error = error * of(_raised(tones, length))
     hidden = np.minimum(c.KINK * np.abs(rate) * length, c.HIDDEN_KINK * omega_error) / c.COVERED
     error = np.where(np.abs(rate) > c.MOVES * of(tones.rate_error), np.hypot(error, hidden), error)
-    error = np.where(of(tones.change_chance) < c.DOUBTFUL, c.DOUBT * error, error)
     blended = (np.abs(growth) > c.GROWS * of(tones.growth_error)) & (np.abs(growth) * half < c.BLENDED_GROWTH)
     return omega, np.where(blended, np.hypot(error, np.abs(growth) / c.COVERED), error)
 
@@ -107,21 +107,43 @@ def _error_at(x: Array, error: Array, covariance: Array, slope_error: Array) -> 
     return np.asarray(np.sqrt(np.maximum(error**2 + 2.0 * covariance * x + (slope_error * x) ** 2, 0.0)))
 
 
+def _leaked(tones: WindowTones, length: int) -> Array:
+    """Return the energy that what is left of windows has at each of their tones, in units of the noise, shape (R, n).
+
+    That is infinite for a line within the tone's own width.
+    """
+    bins = length / (2.0 * np.pi)
+    away = np.abs(tones.omega - tones.line[:, None]) * bins
+    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
+    leaked = np.where((line > 0.0) & (away < c.APART), np.inf, line / np.maximum(away, c.APART) ** 2)
+    changed = np.where(tones.change_chance < c.LEVEL, tones.change_energy, 0.0)
+    for j in np.flatnonzero(changed.any(axis=0)):
+        away = np.maximum(np.abs(tones.omega - tones.omega[:, j, None]) * bins, c.SMALLEST_FLOOR)
+        away[:, j] = np.inf
+        leaked = np.fmax(leaked, changed[:, j, None] / away**2)
+    return np.asarray(leaked)
+
+
+def _raised(tones: WindowTones, length: int) -> Array:
+    """Return the factor by which what is left of windows raises the errors of their frequencies, shape (R, n)."""
+    own = c.STEP**2 * np.where(tones.change_chance < c.DOUBTFUL, tones.change_energy, 0.0)
+    changed = tones.change_chance < c.LEVEL
+    own[changed] = c.KINKED**2 * tones.change_energy[changed]
+    own[changed & (tones.change_energy > c.SMALL_CHANGE * _energy(tones))] = np.inf
+    return np.asarray(np.sqrt(1.0 + (own + c.LEAKAGE**2 * _leaked(tones, length)) / c.COVERED**2))
+
+
+def _energy(tones: WindowTones) -> Array:
+    """Return the energy of tones in units of the noise, shape (R, n)."""
+    return 0.5 * (tones.amplitude / tones.amplitude_error) ** 2
+
+
 def _sound(tones: WindowTones, length: int) -> BoolArray:
     """Return which tones nothing that is left of their window disturbs, shape (R, n)."""
-    bins = length / (2.0 * np.pi)
-    changed = tones.change_chance < c.LEVEL
-    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & ~changed
-    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
-    sound &= line <= c.NEAR * ((tones.omega - tones.line[:, None]) * bins) ** 2
+    sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & (_raised(tones, length) < c.MOST_RAISED)
     full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
-    sound &= ~(full & (line > c.COMPARABLE * 0.5 * (tones.amplitude / tones.amplitude_error) ** 2))
-    for j in range(changed.shape[1]):
-        energy = np.where(changed[:, j], tones.change_energy[:, j], 0.0)[:, None]
-        disturbed = energy > c.NEAR * ((tones.omega - tones.omega[:, j, None]) * bins) ** 2
-        disturbed[:, j] = False
-        sound &= ~disturbed
-    return np.asarray(sound)
+    line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
+    return np.asarray(sound & ~(full & (line > c.COMPARABLE * _energy(tones))))
 
 
 def explained(tones: WindowTones, length: int) -> bool:

@@ -80,13 +80,13 @@ INDEPENDENT = 0.8
 LEVEL = 5e-4
 #: Tail of the test of changes under noise, chance = 3.6 c exp(-c/2): measured on windows of 64 to 1000 samples.
 CHANGE_TAIL = 3.6
-#: Lines that join together with the strongest one: how many, bins between them, the share of its ordinate that they
-#: exceed, and how far above the height that noise exceeds with a chance. They save time only.
+#: Lines that join together with the strongest one: how many, bins between them, and the share of its energy that they
+#: exceed. They save time only.
 FURTHER = 4
 LOBES = 8
 SIDE_LOBE = 0.1
-SURELY = 1.5
-LEAST_CHANCE = 1e-7
+#: A change of a tone of energy E explains lines of less than E up to so many bins away, and E (bins/d)^2 d bins away.
+CHANGED_BINS = 2.0
 
 # --- fit ------------------------------------------------------------------------------------------------------------
 
@@ -102,7 +102,7 @@ SURE = 6.0
 #: Most steps of a stage of a fit. A record of few tones that hold throughout is fitted at once, in few rounds of few
 #: steps: that takes a tenth of the time of windows of all lengths. Lines of what is left are looked for in windows that
 #: are shorter by the last factor each.
-MOST_STEPS = 30
+MOST_STEPS = 60
 STEADY_LINES = 8
 STEADY_ROUNDS = 2
 STEADY_STEPS = 8
@@ -112,8 +112,11 @@ BLOCK_SAMPLES = 2**17
 
 # --- what is left ---------------------------------------------------------------------------------------------------
 
-#: Energy that is left by a change or a line d bins away, in units of the noise, disturbs a tone if it exceeds d^2.
-NEAR = 1.0
+#: A line of energy E, in units of the noise, d bins from a tone moves its frequency by at most so many sqrt(E)/d
+#: standard errors: slope of the phase that it makes, 3 b/(pi d a), over sqrt(6/N) sigma/a, E = N (b/sigma)^2/4.
+LEAKAGE = 0.78
+#: Readings whose errors are larger than so many times those of the fit are not used.
+MOST_RAISED = 20.0
 #: A window that takes no more lines and leaves one of more than this share of a tone's energy says nothing of it.
 COMPARABLE = 0.1
 #: Lines of one window closer than so many bins may be one tone that changes. Measured.
@@ -130,9 +133,14 @@ BENT = 4.0
 MOVES = 2.5
 KINK = 0.27
 HIDDEN_KINK = 18.0
-#: A change that noise shows no more often may be there, and is worth so many errors. Measured.
+#: A change of energy E moves the frequency by at most so many sqrt(E) standard errors: the largest ratios for a step of
+#: phase anywhere in the window, and for one of frequency in its middle, computed without noise. A change that noise
+#: shows no more often than this may be there, and is a step of phase at most. What is larger than the last share of the
+#: tone's energy may be of any kind.
+STEP = 2.8
+KINKED = 18.1
 DOUBTFUL = 0.1
-DOUBT = 2.3
+SMALL_CHANGE = 0.005
 #: Two tones in one line, which no test tells from one that grows by so many errors but less than this over half a
 #: window, pull its frequency by no more than its growth [rad/sample].
 GROWS = 2.0

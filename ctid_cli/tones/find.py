@@ -30,7 +30,7 @@ class Left(NamedTuple):
 
 
 class Lines(NamedTuple):
-    """The strongest line that is left of each window, and further ones."""
+    """The strongest line that is left of each window."""
 
     #: Chance of noise to show one as strong, shape (R,).
     chance: Array
@@ -39,9 +39,6 @@ class Lines(NamedTuple):
     omega: Array
     height: Array
     energy: Array
-    #: Further lines, no side lobes of stronger ones [rad], NaN where none is, and their energies, shape (R, K).
-    further: Array
-    further_energy: Array
 
 
 def whiten(residuals: Array, fitted: IndexArray) -> Left:
@@ -114,42 +111,80 @@ def prediction_errors(covariances: Array) -> Array:
     return np.concatenate((np.ones((r.shape[0], 1)), solved), axis=1)
 
 
-def strongest_lines(left: Left) -> Lines:
-    """Find the strongest lines of each row, in the ratio of the periodogram to its running median."""
-    rows, length = left.white.shape
-    ordinates = periodogram(left.white)
-    turn = np.pi / (ordinates.shape[1] - 1)
+class Spectrum(NamedTuple):
+    """Ordinates of what is left of windows, whitened."""
+
+    #: Squares of the padded transform, and their ratio to the floor, shape (R, K).
+    ordinates: Array
+    ratio: Array
+    #: Samples of the window, how well the floor is known, and the phase per sample from one ordinate to the next [rad].
+    length: int
+    known: float
+    turn: float
+
+    def chance(self, height: Array) -> Array:
+        """Return the chance of noise to show a ratio as high anywhere; the floor is uncertain too."""
+        one = (1.0 + height / self.known) ** -self.known
+        return np.asarray(-np.expm1(c.INDEPENDENT * self.length * np.log1p(-np.minimum(one, 1.0 - 1e-16))))
+
+
+def spectrum_of(white: Array) -> Spectrum:
+    """Return the ordinates of whitened rows."""
+    length = white.shape[1]
+    ordinates = periodogram(white)
     ratio = ordinates / np.maximum(running_floor(ordinates, length), c.SMALLEST_FLOOR)
     ratio[:, : c.PADDING] = 0.0
-    # The floor is uncertain: the ratio is one of exponential variables.
-    known = c.MEDIAN_EFFICIENCY * floor_bins(length)
-    least = c.SURELY * known * (c.LEAST_CHANCE ** (-1.0 / known) - 1.0)
-    each, top = np.arange(rows), ordinates.max(axis=1)
-    place = ratio.argmax(axis=1)
-    height = ratio[each, place]
-    further = np.full((rows, c.FURTHER), np.nan)
-    energies = np.zeros((rows, c.FURTHER))
-    more, last = np.flatnonzero(height > least), place
-    lobe = np.arange(-c.LOBES * c.PADDING + 1, c.LOBES * c.PADDING)
-    for k in range(c.FURTHER):
-        around = last[more, None] + lobe
-        ratio[more[:, None], np.clip(around, 0, ratio.shape[1] - 1)] = 0.0
-        last = last.copy()
-        last[more] = ratio[more].argmax(axis=1)
-        found = (ratio[more, last[more]] > least) & (ordinates[more, last[more]] > c.SIDE_LOBE * top[more])
-        more = more[found]
-        if not more.size:
-            break
-        further[more, k], energies[more, k] = last[more] * turn, ordinates[more, last[more]] / length
-    one = (1.0 + height / known) ** -known
-    chance = -np.expm1(c.INDEPENDENT * length * np.log1p(-np.minimum(one, 1.0 - 1e-16)))
+    return Spectrum(
+        ordinates, ratio, length, c.MEDIAN_EFFICIENCY * floor_bins(length), np.pi / (ordinates.shape[1] - 1)
+    )
+
+
+def strongest_lines(left: Left, spectrum: Spectrum) -> Lines:
+    """Find the strongest lines of each row, in the ratio of the periodogram to its running median."""
+    place = spectrum.ratio.argmax(axis=1)
+    height = spectrum.ratio[np.arange(place.size), place]
     # The models of the noise have taken the skirts of a very strong line for its colour.
     plain = left.peak_height > c.LINE_HEIGHT
     return Lines(
-        np.where(plain, 0.0, chance),
-        np.where(plain, left.peak, place * turn),
+        np.where(plain, 0.0, spectrum.chance(height)),
+        np.where(plain, left.peak, place * spectrum.turn),
         np.where(plain, left.peak_height, height),
-        np.where(plain, left.peak_height, top / length),
-        further,
-        energies,
+        np.where(plain, left.peak_height, spectrum.ordinates.max(axis=1) / spectrum.length),
     )
+
+
+def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Array:
+    """Return lines that are no part of the tones of windows, the strongest first [rad/sample], shape (R, K).
+
+    NaN where there is none. ``tones`` are those a window has [rad/sample], and ``change`` the energy that a change of
+    each would explain, (R, n). What is left within the width of a tone, or explained better by its change, is no line.
+    """
+    bin_ = 2.0 * np.pi / spectrum.length
+    ratio = spectrum.ratio.copy()
+    plain = left.peak_height > c.LINE_HEIGHT
+    ratio[plain, np.round(left.peak[plain] / spectrum.turn).astype(int)] = np.inf
+    _clear(ratio, tones / spectrum.turn, int(c.APART * bin_ / spectrum.turn))
+    found = np.full((ratio.shape[0], 1 + c.FURTHER), np.nan)
+    rows, top = np.arange(ratio.shape[0]), np.zeros(ratio.shape[0])
+    for k in range(found.shape[1]):
+        place = ratio[rows].argmax(axis=1)
+        height = ratio[rows, place]
+        energy = np.where(np.isinf(height), left.peak_height[rows], spectrum.ordinates[rows, place] / spectrum.length)
+        line = (spectrum.chance(height) < c.LEVEL) & (energy > c.SIDE_LOBE * top[rows])
+        rows, place, energy = rows[line], place[line], energy[line]
+        if not rows.size:
+            break
+        top[rows] = np.maximum(top[rows], energy)
+        away = np.maximum(np.abs(place[:, None] * spectrum.turn - tones[rows]) / bin_ / c.CHANGED_BINS, 1.0)
+        own = ~(np.nan_to_num(change[rows]) > energy[:, None] * away**2).any(axis=1)
+        found[rows[own], k] = place[own] * spectrum.turn
+        near = place[:, None] + np.arange(-c.LOBES * c.PADDING + 1, c.LOBES * c.PADDING)
+        ratio[rows[:, None], np.clip(near, 0, ratio.shape[1] - 1)] = 0.0
+    return found
+
+
+def _clear(ratio: Array, places: Array, reach: int) -> None:
+    """Set ordinates around some places to zero, shape (R, n); NaN where there is none."""
+    row, column = np.nonzero(np.isfinite(places))
+    near = np.round(places[row, column]).astype(int)[:, None] + np.arange(-reach, reach + 1)
+    ratio[row[:, None], np.clip(near, 0, ratio.shape[1] - 1)] = 0.0

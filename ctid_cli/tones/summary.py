@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.tones.track import Track
 
 
 @dataclass(frozen=True)
 class ToneSummary:
-    """One tone over its valid rows; NaN where nothing is known."""
+    """One tone over its valid rows, or over those that are only not accurate enough where none is; NaN if none is."""
 
     tone: int
     #: Median [Hz].
@@ -39,18 +40,19 @@ def summarise(track: Track) -> list[ToneSummary]:
 
 def _tone(track: Track, k: int) -> ToneSummary:
     valid, there = track.valid[:, k], track.there[:, k]
-    omega, seen = track.omega[valid, k], track.t[there & np.isfinite(track.omega[:, k])]
-    amplitudes = track.amplitudes[valid & np.isfinite(track.amplitudes[:, k]), k]
+    used = valid if valid.any() else track.flags[:, k] == int(Flag.INACCURATE)
+    omega, seen = track.omega[used, k], track.t[there & np.isfinite(track.omega[:, k])]
+    amplitudes = track.amplitudes[used & np.isfinite(track.amplitudes[:, k]), k]
     low, high = np.percentile(omega, [16.0, 84.0]) if omega.size else (math.nan, math.nan)
     turn = 2.0 * math.pi
     return ToneSummary(
         tone=k + 1,
         frequency_hz=_median(omega) / turn,
-        standard_error_hz=_error_of_mean(track, track.error, k) / turn,
+        standard_error_hz=_error_of_mean(track, used, track.error[:, k], k) / turn,
         spread_hz=float(high / turn - low / turn) / 2.0,
         omega=_median(omega),
         amplitude=_median(amplitudes),
-        amplitude_error=_error_of_mean(track, track.amplitude_error, k),
+        amplitude_error=_error_of_mean(track, used, track.amplitude_error[:, k], k),
         begins=float(seen[0]) if seen.size else math.nan,
         ends=float(seen[-1]) if seen.size else math.nan,
         valid_percent=100.0 * float(valid.sum() / there.sum()) if there.any() else 0.0,
@@ -61,15 +63,15 @@ def _median(values: Array) -> float:
     return float(np.median(values)) if values.size else math.nan
 
 
-def _error_of_mean(track: Track, errors: Array, k: int) -> float:
-    """Return the standard error of the mean of a tone's valid rows; those with common samples share their errors.
+def _error_of_mean(track: Track, used: BoolArray, errors: Array, k: int) -> float:
+    """Return the standard error of the mean of some rows of a tone; those with common samples share their errors.
 
     Rows that are read from stretches of length L, every D seconds, have the errors of D/L as many rows without common
     samples: the mean of N rows has the variance ``sum_i s_i^2 min(L_i/D, N)/N^2``.
     """
-    known = track.valid[:, k] & np.isfinite(errors[:, k]) & np.isfinite(track.window[:, k])
+    known = used & np.isfinite(errors) & np.isfinite(track.window[:, k])
     n = int(known.sum())
     if n == 0:
         return math.nan
     common = np.clip(track.window[known, k] / track.every, 1.0, n)
-    return float(np.sqrt(np.sum(errors[known, k] ** 2 * common))) / n
+    return float(np.sqrt(np.sum(errors[known] ** 2 * common))) / n

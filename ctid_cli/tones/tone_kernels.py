@@ -17,7 +17,7 @@ SEPARATE_BINS = 8.0
 #: Samples that are taken together, few enough for the nearest cache: the loops over them have no dependence.
 CHUNK = 128
 #: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
-STAGES = ((2, 1), (4, 4), (PARAMETERS, 30))
+STAGES = ((2, 1), (4, 4), (PARAMETERS, 60))
 #: Largest logarithmic growth over half a window, and phase that is bent over half a window [rad].
 MOST_GROWTH = 4.0
 MOST_BEND = 1e4
@@ -156,19 +156,18 @@ def _equations(
 
 
 @njit(cache=True, nogil=True)
-def _factorise(gram: Array, free: int, ridge: float, factor: Array, scales: Array) -> bool:
+def _factorise(gram: Array, free: BoolArray, ridge: float, factor: Array, scales: Array) -> bool:
     """Compute the Cholesky factor of the equations of the free parameters, scaled to a unit diagonal."""
     n = scales.size
     for i in range(n):
         scales[i] = 1.0
-        if i == n - 1 or i % PARAMETERS < free:
+        if free[i]:
             scales[i] = math.sqrt(gram[i, i])
             if not (math.isfinite(scales[i]) and scales[i] > 0.0):
                 return False
     for i in range(n):
-        fixed = i < n - 1 and i % PARAMETERS >= free
         for j in range(i + 1):
-            if fixed or (j < n - 1 and j % PARAMETERS >= free):
+            if not (free[i] and free[j]):
                 factor[i, j] = 1.0 if i == j else 0.0
                 continue
             total = gram[i, j] / (scales[i] * scales[j]) + (ridge if i == j else 0.0)
@@ -185,11 +184,11 @@ def _factorise(gram: Array, free: int, ridge: float, factor: Array, scales: Arra
 
 
 @njit(cache=True, nogil=True)
-def _solve(factor: Array, scales: Array, right: Array, free: int, step: Array) -> None:
+def _solve(factor: Array, scales: Array, right: Array, free: BoolArray, step: Array) -> None:
     """Solve the scaled equations; the step of a parameter that is not free is zero."""
     n = scales.size
     for i in range(n):
-        total = right[i] / scales[i] if i == n - 1 or i % PARAMETERS < free else 0.0
+        total = right[i] / scales[i] if free[i] else 0.0
         for k in range(i):
             total -= factor[i, k] * step[k]
         step[i] = total / factor[i, i]
@@ -205,7 +204,7 @@ def _solve(factor: Array, scales: Array, right: Array, free: int, step: Array) -
 def _covariances(gram: Array, factor: Array, scales: Array, covariances: Array) -> None:
     """Compute the blocks of the inverse of the equations that belong to one tone each, shape (n, 5, 5)."""
     size = scales.size
-    if not _factorise(gram, PARAMETERS, RIDGE, factor, scales):
+    if not _factorise(gram, np.ones(size, np.bool_), RIDGE, factor, scales):
         covariances[:] = np.nan
         return
     # Columns of the inverse of the factor; they are zero above the diagonal.
@@ -224,6 +223,17 @@ def _covariances(gram: Array, factor: Array, scales: Array, covariances: Array) 
                     total += columns[a, i] * columns[b, i]
                 total /= scales[begin + a] * scales[begin + b]
                 covariances[k, a, b] = covariances[k, b, a] = total
+
+
+@njit(cache=True, nogil=True)
+def _set_free(tones: Array, right: Array, stage: int, free: BoolArray) -> None:
+    """Mark the parameters of a stage, the constant among them, without those that a step would move out of bounds."""
+    for k in range(tones.shape[0]):
+        for j in range(PARAMETERS):
+            i = PARAMETERS * k + j
+            bound = MOST_GROWTH if j == 2 else MOST_BEND if j == 4 else math.inf
+            free[i] = j < stage and (abs(tones[k, j]) < bound or tones[k, j] * right[i] < 0.0)
+    free[PARAMETERS * tones.shape[0]] = True
 
 
 @njit(cache=True, nogil=True)
@@ -248,7 +258,7 @@ def fit_windows(
     gram, trial_gram = np.zeros((2, most, most))
     right, trial_right, step = np.zeros((3, most))
     left, trial_left, y, there = np.empty((4, length))
-    factor, scales = np.zeros((most, most)), np.ones(most)
+    factor, scales, free = np.zeros((most, most)), np.ones(most), np.ones(most, np.bool_)
     work = np.zeros((most + 4 * parameters.shape[1] + 2, min(CHUNK, length)))
     for row in chosen:
         n = used[row]
@@ -268,9 +278,10 @@ def fit_windows(
         constant /= count
         cost = _equations(y, there, tones, constant, gram, right, left, work)
         trial = np.empty_like(tones)
-        for free, steps in STAGES:
+        for stage, steps in STAGES:
             damping, taken, done = DAMPING, 0, False
             while taken < min(steps, most_steps) and not done:
+                _set_free(tones, right, stage, free)
                 if damping > MOST_DAMPING:
                     done = True
                 elif _factorise(gram, free, damping, factor, scales[:size]):

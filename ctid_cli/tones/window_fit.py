@@ -7,7 +7,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.processors import in_threads
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.find import Left, Lines, strongest_lines, whiten
+from ctid_cli.tones.find import Left, Lines, new_lines, spectrum_of, strongest_lines, whiten
 from ctid_cli.tones.tone_kernels import PARAMETERS, find_changes, fit_windows
 
 
@@ -74,6 +74,8 @@ class _Tests(NamedTuple):
     #: Energy that a change would explain, and P3 in the phase that is left, shape (R, n).
     change: Array
     cube: Array
+    #: Lines that may join [rad/sample], the strongest first, NaN where there is none, shape (R, K).
+    joining: Array
 
 
 def fit_tones(
@@ -107,7 +109,7 @@ def fit_steady(samples: Array) -> WindowTones | None:
         for begin in range(0, len(parts), together):
             some = parts[begin : begin + together]
             left = whiten(some, np.zeros(len(some), np.int64))
-            if (strongest_lines(left).chance < c.LEVEL / len(parts)).any():
+            if (strongest_lines(left, spectrum_of(left.white)).chance < c.LEVEL / len(parts)).any():
                 return None
         shorter //= c.STEADY_STEP
     return _tones(fits, tests, length)
@@ -138,18 +140,13 @@ def _fitted(
         tests = new if tests is None else _replaced(tests, todo, new)
         if round_ == limits.rounds:
             break
-        # What a change explains better is no line.
-        changed = np.nan_to_num(new.change).max(axis=1)
-        further = np.where(new.lines.further_energy >= changed[:, None], new.lines.further, np.nan)
-        turns = np.column_stack((new.lines.omega, further)) * 0.5 * (length - 1)
-        lined = (new.lines.chance < c.LEVEL) & (changed <= new.lines.energy)
-        todo, turns = todo[lined], turns[lined]
-        joined = _join(fits, todo, turns[:, 0])
-        todo, turns = todo[joined], turns[joined]
+        turns = new.joining * 0.5 * (length - 1)
+        joined = np.zeros(todo.size, np.bool_)
+        for each in turns.T:
+            joined |= _join(fits, todo, each)
+        todo = todo[joined]
         if not todo.size:
             break
-        for each in turns.T[1:]:
-            _join(fits, todo, each)
     assert tests is not None
     return fits, tests, residuals
 
@@ -176,11 +173,8 @@ def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
 
 
 def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
-    """Add a line to some windows, and return where: where it is one, there is room, and no tone is near."""
-    most = fits.parameters.shape[1]
-    apart = np.abs(fits.parameters[rows, :, 3] - turns[:, None])
-    apart[np.arange(most) >= fits.used[rows, None]] = np.inf
-    fits_in: BoolArray = (apart.min(axis=1) > c.APART * np.pi) & (fits.used[rows] < most)
+    """Add a line to some windows, and return where: where it is one, and there is room."""
+    fits_in: BoolArray = np.isfinite(turns) & (fits.used[rows] < fits.parameters.shape[1])
     rows, turns = rows[fits_in], turns[fits_in]
     fits.parameters[rows, fits.used[rows]] = 0.0
     fits.parameters[rows, fits.used[rows], 3] = turns
@@ -192,12 +186,16 @@ def _tested(residuals: Array, fits: _Fits, rows: IndexArray) -> _Tests:
     left = whiten(residuals, PARAMETERS * fits.used[rows] + 1)
     change, cube = np.full((2, rows.size, fits.parameters.shape[1]), np.nan)
     find_changes(left.white, left.filters, fits.parameters[rows], fits.used[rows], change, cube)
-    return _Tests(left._replace(white=np.empty((rows.size, 0))), strongest_lines(left), change, cube)
+    spectrum = spectrum_of(left.white)
+    half = 0.5 * (residuals.shape[1] - 1)
+    empty = np.arange(change.shape[1]) >= fits.used[rows, None]
+    joining = new_lines(left, spectrum, np.where(empty, np.nan, fits.parameters[rows, :, 3] / half), change)
+    return _Tests(left._replace(white=np.empty((rows.size, 0))), strongest_lines(left, spectrum), change, cube, joining)
 
 
 def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
     """Return tests with those of some windows replaced."""
-    for fields, values in zip((old.left, old.lines, (old.change, old.cube)), (*new[:2], new[2:]), strict=True):
+    for fields, values in zip((*old[:2], old[2:]), (*new[:2], new[2:]), strict=True):
         for field, value in zip(fields, values, strict=True):
             field[rows] = value
     return old
