@@ -35,7 +35,8 @@ from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodel
 from .estimation.common import Fixed as Fixed
 from .estimators.order_search import FittedOrder as FittedOrder, OrderSearch as OrderSearch
 from .estimators.order_search import search_orders as search_orders
-from .estimators.identification import Identification as Identification, identify as identify
+from .estimators.identification import Identification as Identification
+from .identification.identify import identify as identify
 
 # Results
 from .inference.fit import Fit as Fit, Status as Status

@@ -154,7 +154,7 @@ def _records(
 
 def _identified(options: Options, records: Records, bootstrap: int | None) -> Identification:
     """Fit, with a bar of progress where it takes long."""
-    from ctid_cli.estimators.identification import identify
+    from ctid_cli.identification.identify import identify
 
     validation = None if records.validation is None else records.validation.record
     with FitProgress(sum(record.n_samples for record in records.data)) as progress:

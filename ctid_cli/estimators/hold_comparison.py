@@ -76,10 +76,5 @@ def _least(measured: MeasuredRecords, fit: MeasuredFit, records: Sequence[Record
     return found.squared_error, found.point.delay.seconds
 
 
-def otherwise_held(record: Record) -> Record:
-    """The record with the other of two holds of its input."""
-    return _held(record, "foh" if record.input.hold == "zoh" else "zoh")
-
-
 def _held(record: Record, hold: Hold) -> Record:
     return Record(record.t, record.y, HeldSignal(record.input.t, record.input.values, hold), name=record.name)

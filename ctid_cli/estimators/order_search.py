@@ -361,7 +361,7 @@ class _Search:
                 residuals, whole, fit.theta[free], fit.covariance[np.ix_(free, free)]
             ),
             cross_validated_percent=fit_percent(total, total - np.concatenate(left)),
-            tests=tests_of(each.options, fit, self.records, self.answer),
+            tests=tests_of(each.options, fit, self.records),
             validation_percent=other,
         )
 

@@ -32,8 +32,8 @@ class Optimum:
     numerator: Array
     denominator: Array
     delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and constant and
-    #: slope of the trend; zeros without them.
+    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, and constant
+    #: and slope of the trend; zeros without them.
     free_responses: Array
     trends: Array
     squared_error: float

@@ -1,8 +1,8 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples, ``Z = Q R``: whatever is asked of linear maps
-of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would square the
-condition; this costs little more, so that one route serves the search and its end.
+With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples, ``Z = Q R``: whatever is asked of
+linear maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would
+square the condition; this costs little more, so that one route serves the search and its end.
 """
 
 from collections.abc import Iterator
@@ -79,6 +79,9 @@ def rows_of(
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free or columns.trend else data.t
     for forced in form.forced(record, second):
+        if not len(forced):
+            # A piece without outputs.
+            continue
         rows = np.empty((columns.size, len(forced)))
         rows[: columns.u + 2] = forced.T
         if columns.free:

@@ -1,0 +1,1 @@
+"""Structure, treatment and warnings of a fit: chosen and tried on the records."""
