@@ -55,12 +55,12 @@ def system(rng, samples, integrating):
     return b, np.append(a, np.zeros(integrating)), delay
 
 
-def drive(rng, t, hold):
-    """A pseudo-random binary signal, a step or a multisine."""
+def drive(rng, t, hold, before):
+    """A pseudo-random binary signal, a step after some samples that are not recorded, or a multisine."""
     kind = rng.choice(["binary", "step", "multisine"]) if hold == "zoh" else "multisine"
     samples = t.size
     if kind == "step":
-        return (np.arange(samples) >= rng.uniform(0.05, 0.15) * samples).astype(float)
+        return (np.arange(samples) >= before + rng.uniform(0.05, 0.15) * (samples - before)).astype(float)
     if kind == "binary":
         each = int(rng.integers(2, 12))
         return np.repeat(rng.choice([-1.0, 1.0], samples // each + 1), each)[:samples]
@@ -90,7 +90,7 @@ def made(rng, fault):
     t = np.arange(samples + before, dtype=float)
     if rng.random() < 0.25:
         t = t + rng.uniform(-0.4, 0.4, t.size)
-    u = drive(rng, t, hold)
+    u = drive(rng, t, hold, before)
     if integrating:
         u = u - (u.mean() if np.unique(u).size > 2 else 0.0)
     x = simulate(TransferFunction(numerator, denominator, delay), HeldSignal(t, u, hold), t)[before:]

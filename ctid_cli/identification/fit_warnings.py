@@ -132,8 +132,8 @@ def _slow_pole(found: Identification) -> str:
     longest = max(record.duration for record in found.records)
     if not sizes.size or sizes.min() * longest * SLOW >= 1.0:
         return ""
-    what = f"A pole has a time constant of {1 / sizes.min():.4g}, and the record lasts {longest:.4g}"
-    return f"{what}: it hardly tells this pole from an integrator, nor the static gain"
+    what = f"A pole has a time constant of {1 / sizes.min():.4g}"
+    return f"{what}: over a record of {longest:.4g} it is nearly indistinguishable from an integrator"
 
 
 # --- what has no remedy ------------------------------------------------------------------------------
@@ -169,8 +169,8 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
 
 
 def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
-    """That a fit is low, and what did not raise it."""
-    if fit.fit_percent < LOW_FIT:
+    """That a fit is low, and what did not raise it; with outliers it always is."""
+    if fit.fit_percent < LOW_FIT and fit.weighting is None:
         what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
         yield f"{what}; tried without gain: {', '.join(tried.without_gain)}" if tried.without_gain else what
 
@@ -185,7 +185,8 @@ def _of_search(fit: MeasuredFit) -> Iterator[str]:
         why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
         yield f"Held at the border of the admissible models: {held} (poles, rad per unit of time){why}"
     if fit.status is Status.DELAY_AT_BOUND:
-        yield f"The delay stopped at the end of its range, {fit.model.delay:.4g}, and has no standard error"
+        where = f"end of its range, {fit.model.delay:.4g}" if fit.model.delay else "least possible, 0"
+        yield f"The delay is at the {where}, and has no standard error"
     if fit.poles_at_infinity:
         lost = "1 pole runs" if fit.poles_at_infinity == 1 else f"{fit.poles_at_infinity} poles run"
         yield f"{lost} to infinity: more than {fit.model.order} lower the cost no further"

@@ -31,13 +31,13 @@ class Gain:
     standard_error: float
     #: Mean logarithm of the ratio of squared errors of a block, in its standard errors [-].
     score: float
-    #: Whether the end of the records, where a fit extrapolates, is fitted better too.
-    at_the_end: bool
+    #: Ratio of the squared errors at the end of the records, where a fit extrapolates [-].
+    end: float
 
     @property
     def helps(self) -> bool:
         """Whether the difference is worth it, more than two standard errors, and not in the middle of records only."""
-        return self.at_the_end and self.after - self.before > WORTHWHILE and self.score > 2.0
+        return self.end < 1.0 and self.after - self.before > WORTHWHILE and self.score > 2.0
 
 
 def block_numbers(records: Sequence[Record]) -> list[IntArray]:
@@ -104,18 +104,20 @@ def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[
     errors do not; their standard error becomes, to first order, that of the difference of the fits.
     """
     sums: list[Array] = []
-    total, end = 0.0, 0.0
+    total, end = 0.0, np.zeros(2)
     each = zip(before, after, records, block_numbers(records), _folds(records), strict=True)
     for first, second, record, blocks, folds in each:
         both = np.isfinite(first) & np.isfinite(second)
         y, pair = record.y[both], np.array([first[both], second[both]]) ** 2
         total += float(np.sum((y - y.mean()) ** 2))
         sums += [pair[:, blocks[both] == block].sum(axis=1) for block in range(_blocks_each(records))]
-        end += float(np.sum((pair[0] - pair[1])[folds[both] == FOLDS - 1]))
+        end += pair[:, folds[both] == FOLDS - 1].sum(axis=1)
     squared = np.array(sums)
     told = (squared > 0.0).all(axis=1)
     ratios = np.log(squared[told, 0] / squared[told, 1])
     error = float(np.std(ratios, ddof=1) / np.sqrt(ratios.size)) if ratios.size > 1 else np.inf
     worse, better = (percent_from_r_squared(1.0 - one / total) for one in squared.sum(axis=0).tolist())
     score = float(ratios.mean()) / error if error > 0.0 else 0.0
-    return Gain(worse, better, 0.5 * error * (100.0 - better), score, end > 0.0)
+    return Gain(
+        worse, better, 0.5 * error * (100.0 - better), score, float(end[1] / end[0]) if end[0] > 0.0 else np.inf
+    )

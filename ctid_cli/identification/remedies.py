@@ -18,14 +18,17 @@ from ctid_cli.inference.signal_features import input_moves, residual_outliers
 from ctid_cli.models.additive import Term
 from ctid_cli.signals.held import HeldSignal, Hold, regular_interval
 from ctid_cli.signals.record import Record, beginning
+from ctid_cli.signals.treatment import Offset
 
 #: Samples of all records on which changes are tried.
 MOST_SAMPLES = 10_000
 #: What the criterion counts for a parameter, in logarithms of the number of samples; and its least fall where it alone
 #: decides, very strong evidence by Kass and Raftery (1995).
 PENALTY, DECISIVE = 1.5, 10.0
+#: There, the end of the records must not be fitted worse by more than this factor of the squared error.
+NO_WORSE = 1.1
 #: Changes of one kind that are compared on blocks that are held back, and most changes that are named.
-MOST_COMPARED, MOST_NAMED = 3, 3
+MOST_COMPARED, MOST_NAMED = 5, 3
 #: Delays are tried up to this fraction of the shortest record, and this many times the greatest that was searched.
 LATEST, FARTHER = 0.1, 2.0
 #: Rates of a pole that is added, from three periods of the record to the sampling rate, and delays of starts.
@@ -110,6 +113,18 @@ class Trial:
         """Where its model is."""
         model = self.fit.model
         return model.denominator[: model.denominator.size - self.options.integrators], model.delay
+
+    @property
+    def starts(self) -> tuple[Near, ...]:
+        """Where the search for a changed estimate begins."""
+        return (self.near,) if isinstance(self.options, DelayProfile) else ()
+
+    @property
+    def rates(self) -> Array:
+        """Rates of poles [rad/s] that the records can show."""
+        longest = max(record.duration for record in self.records)
+        shortest = min(float(np.median(np.diff(record.t))) for record in self.records)
+        return np.geomspace(3.0 / longest, 1.0 / shortest, RATES)
 
     @cached_property
     def errors(self) -> list[Array]:
@@ -218,11 +233,11 @@ def _changed(base: Trial, starts: Sequence[Near] = (), **fields: object) -> Iter
     except ValueError:
         return
     if options != base.options:
-        yield Change(options, base.hold, tuple(starts) or (base.near,))
+        yield Change(options, base.hold, tuple(starts) or base.starts)
 
 
 def _structures(base: Trial) -> Iterator[Change]:
-    """One and two more poles, one more zero, an integrator besides or in the place of a pole."""
+    """One and two more poles, more zeros, an integrator besides or in the place of a pole."""
     options = base.options
     if options.fixed or base.fit.poles_at_infinity:
         return
@@ -230,14 +245,10 @@ def _structures(base: Trial) -> Iterator[Change]:
         yield from _submodels(base)
         return
     (denominator, delay), n, m = base.near, options.poles, options.zeros
-    rates = np.geomspace(
-        3.0 / max(record.duration for record in base.records),
-        1.0 / min(float(np.median(np.diff(record.t))) for record in base.records),
-        RATES,
-    )
-    one = [(np.polymul(denominator, [1.0, rate]), delay) for rate in rates]
-    two = [(np.polymul(denominator, [1.0, 2.0 * DAMPING * rate, rate**2]), delay) for rate in rates]
-    for starts, poles, zeros in ((one, n + 1, m), (one, n + 1, m + 1), (two, n + 2, m + 1), ((), n, m + 1)):
+    one = [(np.polymul(denominator, [1.0, rate]), delay) for rate in base.rates]
+    two = [(np.polymul(denominator, [1.0, 2.0 * DAMPING * rate, rate**2]), delay) for rate in base.rates]
+    more = (one, n + 1, m), (one, n + 1, m + 1), (two, n + 2, m + 1), (two, n + 2, m + 2), ((), n, m + 1)
+    for starts, poles, zeros in more:
         yield from _changed(base, starts, poles=poles, zeros=zeros)
     if not options.integrators:
         offset = "estimate" if options.offset in ("remove", "drift") else options.offset
@@ -246,12 +257,12 @@ def _structures(base: Trial) -> Iterator[Change]:
 
 
 def _submodels(base: Trial) -> Iterator[Change]:
-    """One more submodel; one more pole of the only one."""
+    """One more pole of the first submodel, or one more submodel."""
     first, *others = base.options.terms
+    yield from _changed(base, terms=(replace(first, poles=first.poles + 1), *others))
     if base.options.factored:
-        yield from _changed(base, terms=(first, *others, Term(1, 0)))
-    else:
-        yield from _changed(base, terms=(Term(first.poles + 1, first.zeros),))
+        for poles in (1, 2):
+            yield from _changed(base, terms=(first, *others, Term(poles, 0)))
 
 
 def _with_fewer(denominator: Array, delay: float) -> list[Near]:
@@ -261,7 +272,7 @@ def _with_fewer(denominator: Array, delay: float) -> list[Near]:
     for pole in poles[poles.imag >= 0.0].tolist():
         left = poles[(poles != pole) & (poles != np.conj(pole))]
         left = np.append(left, [-abs(pole)] * (pole.imag > 0.0))
-        found.append((np.atleast_1d(np.poly(left).real), delay))
+        found.append((polynomial(left), delay))
     return found
 
 
@@ -286,17 +297,26 @@ def _holds(base: Trial) -> Iterator[Change]:
     regular = all(regular_interval(record.input.t) is not None for record in base.records)
     for hold in get_args(Hold):
         if hold != base.hold and (hold != "band-limited" or (regular and kinds == {"continuous"})):
-            yield Change(base.options, hold, (base.near,))
+            yield Change(base.options, hold, base.starts)
 
 
 def _treatments(base: Trial) -> Iterator[Change]:
     """An initial state, an offset, both, and a drift."""
-    options = base.options
+    options, starts = base.options, base.starts
+    offsets: tuple[Offset, ...] = ("remove",)
+    if isinstance(options, DelayProfile):
+        offsets = ("estimate", "drift")
+        # What was left out may have moved the poles far away.
+        starts += tuple((polynomial(np.full(options.poles, -rate)), base.near[1]) for rate in base.rates)
     state = "estimate" if options.initial_state == "rest" else options.initial_state
-    offsets = ("remove",) if isinstance(options, MeasuredSubmodels) else ("estimate", "drift")
     for offset in dict.fromkeys((options.offset, *offsets)):
         for initial_state in dict.fromkeys((options.initial_state, state)):
-            yield from _changed(base, initial_state=initial_state, offset=offset)
+            yield from _changed(base, starts, initial_state=initial_state, offset=offset)
+
+
+def polynomial(roots: Array) -> Array:
+    """Return the monic polynomial with given roots, in descending powers."""
+    return np.atleast_1d(np.real(np.poly(roots)))
 
 
 def _losses(base: Trial) -> Iterator[Change]:
@@ -377,11 +397,11 @@ class _Step:
             if not gain.helps:
                 return None
             return self._remedy(trial, gain.before, gain.after, gain.standard_error, held_back=True)
-        return self._by_criterion(trial) if gain.at_the_end else None
+        return self._by_criterion(trial) if gain.end < NO_WORSE else None
 
     def _searched(self, remedy: Remedy, trial: Trial) -> tuple[Remedy, Trial] | None:
         """Return a change with what the search of the fit itself gives; None where that does not help."""
-        if trial.kind not in ("structure", "delay") or not self.able:
+        if trial.kind in ("loss", "hold") or not self.able:
             return remedy, trial
         fit = replace(trial.options, covariance="white").fit(trial.records)
         if fit.cost >= trial.fit.cost * (1.0 - SAME):
@@ -406,9 +426,10 @@ class _Step:
 
     def _simplest(self, helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
         """Return the simplest of the changes that are not worse than the best by more than a standard error."""
-        best = max(helpful, key=lambda pair: pair[0].gain)
-        error = best[0].standard_error if self.blocks else 0.0
-        as_good = [pair for pair in helpful if pair[0].gain >= best[0].gain - error]
+        if not helpful[0][0].held_back:
+            return min(helpful, key=lambda pair: pair[0].after)
+        best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
+        as_good = [pair for pair in helpful if pair[0].after >= best.after - best.standard_error]
         return min(as_good, key=lambda pair: pair[1].parameters)
 
 
