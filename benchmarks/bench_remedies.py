@@ -175,6 +175,19 @@ def report(rows):
     print(f"remedies printed: {len(rows)}; obeyed, {sum(helped)} ({share:.0f} %) improve the last quarter")
 
 
+def summary(rows, costly, spent):
+    """Print which remedies helped, which faults were named, and the time of the trials."""
+    report(rows)
+    for fault in FAULTS:
+        of_fault = [case for case in costly if case[0] == fault]
+        count = len(of_fault)
+        print(f"{fault}: {count} cost more than {COSTLY:g} points, named {sum(n for _, n, _ in of_fault)},", end=" ")
+        print(f"half of the loss mended {sum(m for _, _, m in of_fault)}")
+    if costly:
+        print(f"named of all: {100 * np.mean([n for _, n, _ in costly]):.0f} % of {len(costly)}")
+    print(f"CPU seconds of the trials: median {np.median(spent):.2f}, most {max(spent):.2f}")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=0)
@@ -212,15 +225,8 @@ def main():
                 "costly" if right - before > COSTLY else "",
             )
             tell(found)
-    report(rows)
-    for fault in FAULTS:
-        of_fault = [case for case in costly if case[0] == fault]
-        count = len(of_fault)
-        print(f"{fault}: {count} cost more than {COSTLY:g} points, named {sum(n for _, n, _ in of_fault)},", end=" ")
-        print(f"half of the loss mended {sum(m for _, _, m in of_fault)}")
-    if costly:
-        print(f"named of all: {100 * np.mean([n for _, n, _ in costly]):.0f} % of {len(costly)}")
-    print(f"CPU seconds of the trials: median {np.median(spent):.2f}, most {max(spent):.2f}")
+    if given.records:
+        summary(rows, costly, spent)
     rows = []
     for file in given.measured:
         for poles in (1, 2, 3):

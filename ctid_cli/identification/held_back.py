@@ -29,15 +29,16 @@ class Gain:
     before: float
     after: float
     standard_error: float
-    #: Mean logarithm of the ratio of squared errors of a block, in its standard errors [-].
+    #: Mean of the blocks in its standard errors [-], the greater one of two: of the falls of their squared errors, and
+    #: of the logarithms of the ratios, which blocks of different size give alike.
     score: float
     #: Ratio of the squared errors at the end of the records, where a fit extrapolates [-].
     end: float
 
     @property
     def helps(self) -> bool:
-        """Whether the difference is worth it, more than two standard errors, and not in the middle of records only."""
-        return self.end < 1.0 and self.after - self.before > WORTHWHILE and self.score > 2.0
+        """Whether the difference is worth it, and more than two standard errors."""
+        return self.after - self.before > WORTHWHILE and self.score > 2.0
 
 
 def block_numbers(records: Sequence[Record]) -> list[IntArray]:
@@ -100,8 +101,8 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: tup
 def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[Record]) -> Gain:
     """Compare two fits by their errors at the same samples; the others are NaN.
 
-    The differences of blocks differ in size, as the outputs do, but the logarithms of the ratios of their squared
-    errors do not; their standard error becomes, to first order, that of the difference of the fits.
+    The standard error of a difference of fits is, to first order, that of the mean fall of a block's squared error, or
+    of the mean logarithm of the ratio of both, whichever tells more.
     """
     sums: list[Array] = []
     total, end = 0.0, np.zeros(2)
@@ -113,11 +114,14 @@ def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[
         sums += [pair[:, blocks[both] == block].sum(axis=1) for block in range(_blocks_each(records))]
         end += pair[:, folds[both] == FOLDS - 1].sum(axis=1)
     squared = np.array(sums)
-    told = (squared > 0.0).all(axis=1)
-    ratios = np.log(squared[told, 0] / squared[told, 1])
-    error = float(np.std(ratios, ddof=1) / np.sqrt(ratios.size)) if ratios.size > 1 else np.inf
     worse, better = (percent_from_r_squared(1.0 - one / total) for one in squared.sum(axis=0).tolist())
-    score = float(ratios.mean()) / error if error > 0.0 else 0.0
-    return Gain(
-        worse, better, 0.5 * error * (100.0 - better), score, float(end[1] / end[0]) if end[0] > 0.0 else np.inf
-    )
+    squared = squared[(squared > 0.0).all(axis=1)]
+    score = max(_score(squared[:, 0] - squared[:, 1]), _score(np.log(squared[:, 0] / squared[:, 1])))
+    error = (better - worse) / score if score > 0.0 else float("inf")
+    return Gain(worse, better, error, score, float(end[1] / end[0]) if end[0] > 0.0 else float("inf"))
+
+
+def _score(values: Array) -> float:
+    """Return the mean of values in its standard errors."""
+    error = float(np.std(values, ddof=1) / np.sqrt(values.size)) if values.size > 1 else 0.0
+    return float(values.mean()) / error if error > 0.0 else 0.0

@@ -172,11 +172,12 @@ def tried_remedies(
 
     Notes
     -----
-    A change helps if Schwarz's criterion of the innovations is less with it, under one autoregressive noise model of
-    the residuals of the closer fit and 1.5 times the usual penalty, and if it improves the fit of ten blocks of the
-    records, each predicted by a fit that did not see its outputs, by more than twice the standard error of the
-    difference, and that of the last two, which are held back together, at all. Where blocks are too short, or the input
-    moves in too few of them, the criterion decides, if it falls by ten.
+    A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one autoregressive
+    noise model of the residuals of the closer fit and 1.5 times the usual penalty. It improves the fit of ten blocks of
+    the records, each predicted by a fit that did not see its outputs, by more than twice the standard error of the
+    difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
+    extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few
+    of them, the criterion decides, if it falls by ten.
     """
     submodels = isinstance(options, MeasuredSubmodels)
     # A record in a loop cannot be cut.
@@ -209,7 +210,7 @@ def _best_step(
         found.without_gain.extend(step.without_gain)
     if not helpful:
         return base, ()
-    remedy, trial = max(helpful, key=lambda pair: pair[0].gain)
+    remedy, trial = _simplest(helpful)
     found.remedies.append(replace(remedy, besides=bool(found.remedies)))
     return trial, tuple(other.kind for other, _ in helpful if other is not remedy)
 
@@ -356,7 +357,7 @@ class _Step:
             better = sorted((pair for pair in scored if pair[0] > least), key=lambda pair: -pair[0])
             judged = [(self._judged(trial), trial) for _, trial in better[:MOST_COMPARED]]
             helpful = [(remedy, trial) for remedy, trial in judged if remedy is not None]
-            best = self._searched(*self._simplest(helpful)) if helpful else None
+            best = self._searched(*_simplest(helpful)) if helpful else None
             if best is not None:
                 found.append(best)
             else:
@@ -394,7 +395,8 @@ class _Step:
         except CtidError:
             return None
         if self.blocks or trial.kind == "loss":
-            if not gain.helps:
+            # Outliers bend a fit everywhere; what else is wrong must show where a fit extrapolates, too.
+            if not gain.helps or (trial.kind != "loss" and gain.end > 1.0):
                 return None
             return self._remedy(trial, gain.before, gain.after, gain.standard_error, held_back=True)
         return self._by_criterion(trial) if gain.end < NO_WORSE else None
@@ -424,13 +426,14 @@ class _Step:
         words = [typed(self.base.options, trial.options), f"--hold {trial.hold}" * (trial.hold != self.base.hold)]
         return " ".join(word for word in words if word)
 
-    def _simplest(self, helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
-        """Return the simplest of the changes that are not worse than the best by more than a standard error."""
-        if not helpful[0][0].held_back:
-            return min(helpful, key=lambda pair: pair[0].after)
-        best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
-        as_good = [pair for pair in helpful if pair[0].after >= best.after - best.standard_error]
-        return min(as_good, key=lambda pair: pair[1].parameters)
+
+def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
+    """Return the simplest of the changes that are not worse than the best by more than a standard error."""
+    if not helpful[0][0].held_back:
+        return max(helpful, key=lambda pair: pair[0].before - pair[0].after)
+    best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
+    as_good = [pair for pair in helpful if pair[0].after >= best.after - best.standard_error]
+    return min(as_good, key=lambda pair: pair[1].parameters)
 
 
 def criteria(

@@ -151,7 +151,11 @@ def test_the_held_back_fit_is_that_of_fits_that_did_not_see_the_blocks():
     np.testing.assert_allclose(errors[held], expected[held], atol=1e-5)
     gain = compared([2.0 * errors], [errors], [record])
     assert (100 - gain.before) / (100 - gain.after) == pytest.approx(2.0)
-    assert gain.standard_error == pytest.approx(0.0, abs=1e-9)
+    falls = [3 * np.sum(errors[numbers == block] ** 2) for block in range(10)]
+    score = np.mean(falls) / np.std(falls, ddof=1) * np.sqrt(10)
+    assert gain.score == pytest.approx(score)
+    assert gain.standard_error == pytest.approx((gain.after - gain.before) / score)
+    assert (gain.helps, gain.end) == (True, 0.25)
 
 
 def test_several_records_say_which_one():

@@ -11,8 +11,8 @@ import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.identification.identify import identify
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.identification.identify import identify
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.estimate import Units
