@@ -172,8 +172,8 @@ def tried_remedies(
 
     Notes
     -----
-    A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one autoregressive
-    noise model of the residuals of the closer fit and 1.5 times the usual penalty. It improves the fit of ten blocks of
+    A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one noise model
+    (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten blocks of
     the records, each predicted by a fit that did not see its outputs, by more than twice the standard error of the
     difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
     extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few

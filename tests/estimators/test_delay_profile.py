@@ -231,3 +231,18 @@ def test_a_range_beyond_the_record_or_no_record_is_refused():
         DelayProfile(2, 0, (0, 100)).fit(record_of())
     with pytest.raises(DataError, match="no record"):
         DelayProfile(2, 0, (0, 1)).fit([])
+
+
+# --- a drift of the output -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_a_drift_is_a_constant_and_a_slope(initial_state, irregular):
+    record = record_of(irregular=irregular)
+    drifting = Record(record.t, record.y + 4.0 + 0.3 * (record.t - record.t[0]), record.input)
+    fit = DelayProfile(2, 0, (0, 3), initial_state=initial_state, offset="drift").fit(drifting)
+    assert [fit.parameters["offset"], fit.parameters["drift"]] == pytest.approx([4.0, 0.3], rel=1e-6)
+    assert fit.model.delay == pytest.approx(SYSTEM.delay, abs=1e-6)
+    with pytest.raises(ValueError, match="offset drift is a slope, which the output of an integrating system has"):
+        DelayProfile(2, 0, (0, 3), offset="drift", integrators=1)
