@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
@@ -173,9 +173,9 @@ def tried_remedies(
     Notes
     -----
     A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one noise model
-    (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten blocks of
-    the records, each predicted by a fit that did not see its outputs, by more than twice the standard error of the
-    difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
+    (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
+    blocks of the records, each predicted by a fit that did not see its outputs, by more than twice the standard error
+    of the difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
     extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few
     of them, the criterion decides, if it falls by ten.
     """
@@ -188,9 +188,9 @@ def tried_remedies(
     try:
         if isinstance(options, DelayProfile) and any(map(is_not, part, records)):
             base = replace(base, fit=options.refine(part, base.near))
-        wild = [residual_outliers(e) for e in base.fit.linear.residuals]
+        wild = [_outliers(base.fit, k) for k in range(len(part))]
         kinds: tuple[Kind, ...] = get_args(Kind)[1:] if suspicious else ("treatment",)
-        if any(len(places) for places, _ in wild):
+        if any(off.any() for off in wild):
             base = _best_step(base, wild, ("loss",), found)[0]
         kinds = kinds if response else ("delay",)
         while kinds and len(found.remedies) < MOST_NAMED:
@@ -201,7 +201,7 @@ def tried_remedies(
 
 
 def _best_step(
-    base: Trial, wild: Sequence[tuple[IntArray, Array]], kinds: Sequence[Kind], found: Trials
+    base: Trial, wild: Sequence[Array], kinds: Sequence[Kind], found: Trials
 ) -> tuple[Trial, tuple[Kind, ...]]:
     """Add the change of some kinds that helps most; return its fit, and the other kinds that help by themselves."""
     step = _Step(base, wild)
@@ -341,7 +341,7 @@ CHANGES: dict[Kind, Callable[[Trial], Iterator[Change]]] = {
 class _Step:
     """Trials of changes of one fit."""
 
-    def __init__(self, base: Trial, wild: Sequence[tuple[IntArray, Array]]) -> None:
+    def __init__(self, base: Trial, wild: Sequence[Array]) -> None:
         self.base, self.wild = base, wild
         self.able = isinstance(base.options, DelayProfile)
         self.blocks = self.able and long_enough(base.records)
@@ -388,9 +388,7 @@ class _Step:
         try:
             if not self.able:
                 return self._by_criterion(trial)
-            before = [e.copy() for e in self.base.errors]
-            for e, (places, _), use in zip(before, self.wild, self.base.fit.linear.used, strict=True):
-                e[np.flatnonzero(use)[places]] = np.nan
+            before = [np.where(off == 0.0, e, np.nan) for e, off in zip(self.base.errors, self.wild, strict=True)]
             gain = compared(before, trial.errors, self.base.records)
         except CtidError:
             return None
@@ -436,15 +434,17 @@ def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
     return min(as_good, key=lambda pair: pair[1].parameters)
 
 
-def criteria(
-    fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Sequence[tuple[IntArray, Array]]
-) -> list[float]:
+def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Sequence[Array]) -> list[float]:
     """Schwarz's criterion of the innovations of each fit at the samples that all of them use, under one noise model.
 
-    Outliers of the first fit are replaced by what lies between their neighbours.
+    ``wild`` is how far outliers are from their neighbours, which does not count.
     """
     masks = [np.logical_and.reduce(uses) for uses in zip(*(fit.used for fit in fits), strict=True)]
-    cut = [[_at(_tamed(fit, fits[0], k, *wild[k]), fit.used[k], mask) for k, mask in enumerate(masks)] for fit in fits]
+    tamed = [[e - off[use] for e, off, use in zip(fit.residuals, wild, fit.used, strict=True)] for fit in fits]
+    cut = [
+        [_at(e, use, mask) for e, use, mask in zip(errors, fit.used, masks, strict=True)]
+        for errors, fit in zip(tamed, fits, strict=True)
+    ]
     closest = min(cut, key=lambda errors: sum(float(e @ e) for e in errors))
     noise = shared_noise(closest)
     found = []
@@ -456,11 +456,13 @@ def criteria(
     return found
 
 
-def _tamed(fit: MeasuredFit, first: MeasuredFit, k: int, places: IntArray, off: Array) -> Array:
-    """Errors of a record, less what its outliers are away from their neighbours in the errors of the first fit."""
-    e, whole = fit.residuals[k].copy(), np.zeros(fit.used[k].size)
-    whole[np.flatnonzero(first.used[k])[places]] = off
-    return e - whole[fit.used[k]]
+def _outliers(fit: MeasuredFit, k: int) -> Array:
+    """How far outliers of a record are from their neighbours [output unit], 0 for all other samples, shape (N,)."""
+    law = fit.linear
+    places, off = residual_outliers(law.residuals[k])
+    found = np.zeros(law.used[k].size)
+    found[np.flatnonzero(law.used[k])[places]] = off
+    return found
 
 
 def _at(values: Array, used: BoolArray, mask: BoolArray) -> Array:
