@@ -139,7 +139,7 @@ def judged(options, record):
     whole = options.prepare(record).laid_out
     offset = fit.offsets[0] if options.offset == "remove" else 0.0
     simulated = np.full(record.n_samples, np.nan)
-    simulated[whole.used()[0]] = options.simulated(fit, whole)[0] + offset
+    simulated[whole.used()[0]] = options._simulated(fit, whole)[0] + offset
     # In shares of what the output varies in the whole record: after a step it does not at the end.
     error = record.y[n:] - simulated[n:]
     return fit, 100 * (1 - np.sqrt(np.mean(error**2)) / record.y.std())

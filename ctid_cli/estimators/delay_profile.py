@@ -315,7 +315,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
-    def refine(self, records: Sequence[Record], *near: tuple[Array, float]) -> MeasuredFit:
+    def _refine(self, records: Sequence[Record], *near: tuple[Array, float]) -> MeasuredFit:
         """Return the least output error in the basins of denominators, without their integrators, and delays.
 
         It has no covariance.
@@ -327,7 +327,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         robust = robust_local(measured, self.loss, found)
         return fitted(measured, robust.found, None, robust)
 
-    def simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
+    def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
         """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
         layout = measured.layout_of(fit.model.order, measured.structure.delay)
         parts = sensitivities(measured.problem, layout, fit.theta, fit.model.delay)

@@ -89,8 +89,8 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: tup
     for number in range(FOLDS):
         held = [fold == number for fold in folds]
         each = zip(records, held, strict=True)
-        fit = options.refine([replace(record, y=np.where(out, np.nan, record.y)) for record, out in each], near)
-        outputs = options.simulated(fit, whole), whole.used(), fit.offsets
+        fit = options._refine([replace(record, y=np.where(out, np.nan, record.y)) for record, out in each], near)
+        outputs = options._simulated(fit, whole), whole.used(), fit.offsets
         for error, out, record, simulated, use, offset in zip(errors, held, records, *outputs, strict=True):
             known = np.full(record.n_samples, np.nan)
             known[use] = record.y[use] - simulated - (offset if options.offset == "remove" else 0.0)

@@ -45,39 +45,23 @@ Near = tuple[Array, float]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A change of a fit that helps on its own records.
-
-    Parameters
-    ----------
-    kind : {"loss", "structure", "delay", "hold", "treatment"}
-        What is changed.
-    option : str
-        Options of ``ctid fit`` that make the change, besides those of the remedies before.
-    options : DelayProfile or MeasuredSubmodels
-        The changed estimator.
-    hold : {"zoh", "foh", "band-limited"}
-        The input between its samples.
-    before, after : float
-        Fit of blocks that were held back without and with the change [%], or the criterion [-].
-    standard_error : float
-        Standard error of the difference [%]; NaN of the criterion.
-    held_back : bool
-        Whether these are fits of held-back blocks.
-    fits : tuple of float
-        Fit of all samples without and with the change [%].
-    besides : bool
-        Whether the remedies before it are made too.
-    """
+    """A change of a fit that helps on its own records."""
 
     kind: Kind
+    #: Options of ``ctid fit`` that make the change.
     option: str
+    #: The changed estimator, and the input between its samples.
     options: Options
     hold: Hold
+    #: Fit of blocks that were held back without and with the change, and standard error of the difference [%]; or the
+    #: criterion [-], and NaN.
     before: float
     after: float
     standard_error: float
     held_back: bool
+    #: Fit of all samples without and with the change [%].
     fits: tuple[float, float]
+    #: Whether the remedies before it are made too.
     besides: bool = False
 
     @property
@@ -151,27 +135,10 @@ def tried_remedies(
 ) -> Trials:
     """Try changes of a fit on its records, and return those that help, each besides those before it.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        What was fitted.
-    options : DelayProfile or MeasuredSubmodels
-        The estimator.
-    fit : MeasuredFit
-        Its estimate.
-    suspicious : bool, default True
-        Whether the residuals or the search give a cause to try other structures, delays and holds too.
-    response : bool, default True
-        Whether a response to the input is seen; else only other delays are tried.
+    There are at most three, one of each kind: another loss where there are outliers, then what helps most. Structures,
+    delays and holds are tried where the residuals or the search give a cause, and delays alone where no response to the
+    input is seen. Of submodels the criterion decides.
 
-    Returns
-    -------
-    Trials
-        At most three remedies, one of each kind: another loss where there are outliers, then what helps most. Of
-        MeasuredSubmodels the criterion decides, if it falls by ten.
-
-    Notes
-    -----
     A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one noise model
     (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
     blocks of the records, each predicted by a fit that did not see its outputs, by more than twice the standard error
@@ -187,7 +154,7 @@ def tried_remedies(
     found = Trials([], [])
     try:
         if isinstance(options, DelayProfile) and any(map(is_not, part, records)):
-            base = replace(base, fit=options.refine(part, base.near))
+            base = replace(base, fit=options._refine(part, base.near))
         wild = [_outliers(base.fit, k) for k in range(len(part))]
         kinds: tuple[Kind, ...] = get_args(Kind)[1:] if suspicious else ("treatment",)
         if any(off.any() for off in wild):
@@ -368,7 +335,7 @@ class _Step:
         """Return the fit with a change; None where it is refused."""
         records = tuple(_held(record, change.hold) for record in self.base.records)
         try:
-            fit = change.options.refine(records, *change.starts) if self.able else change.options.fit(records)
+            fit = change.options._refine(records, *change.starts) if self.able else change.options.fit(records)
         except CtidError:
             return None
         return Trial(kind, change.options, change.hold, records, fit)
