@@ -20,7 +20,7 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
-from ctid_cli.estimation.optimum.box import ANYWHERE, box_of, point_of
+from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
@@ -321,10 +321,9 @@ class MeasuredRecords:
             known=self.known,
         )
 
-    def local(self, near: Optimum) -> Optimum:
-        """Return the least output error in the basin of an optimum of other outputs."""
-        starts, delays = [(near.denominator, near.delay)], self.treatment.delay_bounds
-        poles = near.denominator.size - 1
+    def local(self, *starts: tuple[Array, float]) -> Optimum:
+        """Return the least output error in the basins of denominators, without their integrators, and delays."""
+        poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
         return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
@@ -346,19 +345,6 @@ class MeasuredRecords:
         return local_minimum(
             self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
         ).squared_error
-
-    def squared_error_with(
-        self, model: TransferFunction, *, initial_state: bool = False, offset: bool = False
-    ) -> float:
-        """Return the least sum of squared output errors if an initial state or an offset were estimated too.
-
-        Among the models that are admissible without them: in a smaller set the cost might be higher.
-        """
-        problem, bounds = self.problem, self.treatment.delay_bounds
-        trend = problem.trend or (0,) * offset
-        more = problem._replace(free_response=problem.free_response or initial_state, trend=trend)
-        box = box_of(problem, bounds)
-        return local_minimum(more, self.free_poles(model), model.delay, bounds, box=box, known=self.known).squared_error
 
     def errors_of(self, model: TransferFunction) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""

@@ -63,9 +63,19 @@ def robust_fit(
         if trial.cost(smaller) > best.cost(smaller) * (1.0 - WORTHWHILE):
             break
         best = trial
-    if kind == "tukey":
-        best = _descend(measured, best.found, kind, tuple(replace(loss, kind=kind) for loss in best.losses))
-    return best
+    return _of_kind(measured, best, kind)
+
+
+def robust_local(measured: MeasuredRecords, kind: RobustKind, near: Optimum) -> RobustFit:
+    """Return the least loss in the basin of an optimum."""
+    return _of_kind(measured, _descend(measured, near, "huber"), kind)
+
+
+def _of_kind(measured: MeasuredRecords, best: RobustFit, kind: RobustKind) -> RobustFit:
+    """Return the least loss of a kind from the least Huber loss."""
+    if kind == "huber":
+        return best
+    return _descend(measured, best.found, kind, tuple(replace(loss, kind=kind) for loss in best.losses))
 
 
 def _descend(
@@ -75,7 +85,7 @@ def _descend(
     here = _at(measured, found, kind, losses)
     settled = losses is not None
     for k in range(MOST_FITS):
-        there = measured.with_outputs(here.modified()).local(here.found)
+        there = measured.with_outputs(here.modified()).local((here.found.denominator, here.found.delay))
         there = replace(there, tried=found.tried, agree=found.agree, poles_at_infinity=found.poles_at_infinity)
         following = _at(measured, there, kind, here.losses if settled else None)
         if settled and following.cost(here.losses) >= here.cost(here.losses) * (1.0 - DONE):

@@ -14,7 +14,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.profile_search import Profile, search_delay
-from ctid_cli.estimation.robust_fit import RobustFit, robust_fit
+from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
@@ -328,6 +328,24 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
+    def _refine(self, records: Sequence[Record], *near: tuple[Array, float]) -> MeasuredFit:
+        """Return the least output error in the basins of denominators, without their integrators, and delays.
+
+        It has no covariance.
+        """
+        measured = self._lay_out(records)
+        found = measured.local(*near)
+        if self.loss == "squares":
+            return fitted(measured, found, None, None)
+        robust = robust_local(measured, self.loss, found)
+        return fitted(measured, robust.found, None, robust)
+
+    def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
+        """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
+        layout = measured.layout_of(fit.model.order, measured.structure.delay)
+        parts = sensitivities(measured.problem, layout, fit.theta, fit.model.delay)
+        return [data.y_used - eps for data, (_, eps) in zip(measured.problem.records, parts, strict=True)]
+
     # --- what a fit is judged by -----------------------------------------------------------------------
 
     def _acting(self, record: Record) -> Record:
@@ -342,11 +360,6 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         """The model on another record."""
         found: AppliedModel = measured.errors_of(fit.model)
         return found
-
-    def _lowered(self, fit: MeasuredFit, measured: Any) -> dict[str, float]:
-        """Sums of squared errors if an initial state or an offset that were taken as zero were estimated too."""
-        tried = {"initial_state": self.initial_state == "rest", "offset": self.offset == "none"}
-        return {name: measured.squared_error_with(fit.model, **{name: True}) for name in tried if tried[name]}
 
 
 def fitted(

@@ -1,7 +1,7 @@
 """A fit to measured records with everything that tells whether to believe it."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import ClassVar, NamedTuple
@@ -10,15 +10,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
-from ctid_cli.estimators import identification_warnings as warnings
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.estimators.hold_comparison import OtherHold, best_other_hold, decisive, otherwise_held
 from ctid_cli.estimators.measured_submodels import LaidOut, MeasuredSubmodels, Options, SubmodelsFit
-from ctid_cli.estimators.residual_causes import another_delay, another_order
-from ctid_cli.estimators.second_look import SecondLook, look_again
-from ctid_cli.estimators.second_look_words import of_second_look
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
@@ -36,9 +30,6 @@ from ctid_cli.text import Shown
 
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
-#: An initial state or offset is asked for where it lowers the cost by this fraction, and Schwarz's criterion by ten.
-WORTHWHILE = 0.02
-DECISIVE = 10.0
 #: Delays about the estimate at which its cost is computed to be drawn, and how far: in half-widths of the interval.
 DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
@@ -140,42 +131,11 @@ def identify(
     bootstrap_draws: int = DRAWS,
     progress: Progress | None = None,
 ) -> Identification:
-    """Fit one model to the records and judge it.
+    """Fit one model to the records and judge it, without warnings.
 
-    Parameters
-    ----------
-    options : DelayProfile or MeasuredSubmodels
-        The estimator.
-    records : sequence of Record
-        One for each experiment.
-    validation : Record, optional
-        Another record of the same system; its initial state and offset are treated as those of the others, with the
-        model fixed.
-    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        What the noise is taken for: white unless the residuals are not, white, or coloured with standard errors and
-        Student's t, or coloured with the intervals of a bootstrap-t.
-    bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
-    progress : callable, optional
-        Told after each of them how many of how many are done.
-
-    Returns
-    -------
-    Identification
-        The model and everything about it.
-
-    Raises
-    ------
-    DataError
-        If a record cannot be used.
-
-    Notes
-    -----
     Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and those for
-    coloured noise (:func:`~ctid_cli.inference.robust.robust_covariance`) otherwise. Intervals are those of Student's t
-    with as many degrees of freedom as the record is worth independent samples, less the number of parameters. The delay
-    has a profile-likelihood interval where the quadratic one is doubtful. Whether there is a model at all is tested
-    against noise of the outputs' colour, the search over poles and delays included.
+    coloured noise otherwise. Whether there is a model at all is tested against noise of the outputs' colour, the search
+    over poles and delays included.
     """
     # Before the fit takes its time.
     checked = None if validation is None else laid_out_validation(options, validation)
@@ -193,12 +153,12 @@ def identify(
     answering = [options._acting(record) for record in prepared.laid_out.records]
     answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
-    tests = tests_of(options, linear, records, answer)
+    tests = tests_of(options, linear, records)
     # What the data determine can be told even where no standard error can be given.
     biased = uncertainty.kind == "biased"
     known = fit.uncertainty("white") if biased else uncertainty
     matrix = known.covariance
-    free, hessian = _free(linear)
+    free, hessian = free_directions(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
     unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, matrix))}
     if not answer.seen:
@@ -209,7 +169,7 @@ def identify(
     judged = None
     if checked is not None and validation is not None:
         judged = validated(options._applied(fit, checked), validation)
-    found = Identification(
+    return Identification(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
@@ -224,55 +184,19 @@ def identify(
         validation=judged,
         records=tuple(records),
     )
-    acting = [options._acting(record) for record in records]
-    tried = laid_out, linear, options
-    failed = answer.seen and not all(test.white and test.uncorrelated for test in tests)
-    look = look_again(
-        linear,
-        acting,
-        _other_hold(options, laid_out, linear, records),
-        another_order(*tried) if failed else None,
-        another_delay(*tried) if failed else None,
-    )
-    gains = _gains(linear, options._lowered(linear, laid_out))
-    unsafe = _unsafe(found, prepared.laid_out)
-    return replace(found, warnings=tuple(dict.fromkeys(_warnings(found, look, hessian, gains, unsafe))))
-
-
-def _warnings(
-    found: Identification, look: SecondLook, hessian: Array, gains: dict[str, float], unsafe: Sequence[str]
-) -> Iterator[str]:
-    """What the user should know, the worst first; of a model without an answer to the input only that it is none."""
-    options, fit = found.options, found.fit
-    yield from warnings.of_answer(found.answer, options)
-    yield from of_second_look(look, options, fit, found.tests, gains, answered=found.answer.seen)
-    if found.answer.seen:
-        yield from warnings.of_status(fit, said=look.integrator > 0)
-        known = fit.uncertainty("white") if found.uncertainty.kind == "biased" else found.uncertainty
-        yield from warnings.of_conditioning(fit, known.free_covariance, hessian)
-        yield from warnings.of_short_record(found.uncertainty, fit.count, "offset" in gains)
-        yield from warnings.of_nonlinearity(unsafe)
-        yield from warnings.of_interval(found.delay_interval, options, fit)
-    yield from warnings.of_residuals(found.tests, len(fit.residuals), FEWEST_TESTED)
-    yield from warnings.of_treatment(gains, options)
-    if found.validation is not None:
-        yield from warnings.of_validation(fit.r2, found.validation.r2)
 
 
 # --- residuals and uncertainty ----------------------------------------------------------------------
 
 
-def tests_of(
-    options: Options, fit: MeasuredFit, records: Sequence[Record], answer: AnswerTest
-) -> tuple[ResidualTests, ...]:
+def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
     """Tests of each experiment, at levels that make a false alarm as likely as with one."""
     level = 1.0 - (1.0 - LEVEL) / len(records)
     found = []
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
             delayed = options._acting(record).input.at(record.t[use] - fit.model.delay)
-            tested = residual_tests(eps, delayed, level=level, sensitivities=psi)
-            found.append(replace(tested, answered=answer.seen))
+            found.append(residual_tests(eps, delayed, level=level, sensitivities=psi))
     return tuple(found)
 
 
@@ -291,38 +215,22 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     return set(np.flatnonzero(unclear | moving).tolist())
 
 
-def _unsafe(found: Identification, laid_out: LaidOut) -> list[str]:
+def unsafe_intervals(found: Identification) -> list[str]:
     """Parameters whose intervals reach as far as the output is not linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
     if not shown or (isinstance(options, MeasuredSubmodels) and options.closed):
         return []
-    records, linear = [options._acting(record) for record in laid_out.records], fit.linear
-    model = Parametric(fit.parametrised, fit.parameter_names)
+    records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
+    model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear
     shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities)
     return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
 
 
-def _free(fit: MeasuredFit) -> tuple[IndexArray, Array]:
+def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
     """Indices of the parameters that are not held at a bound, and ``sum psi psi'`` along the free directions."""
     hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
     return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
-
-
-def _other_hold(options: Options, laid_out: LaidOut, fit: MeasuredFit, records: Sequence[Record]) -> OtherHold | None:
-    """The best other hold of the input; None where the holds cannot be compared."""
-    if isinstance(laid_out, MeasuredRecords):
-        return best_other_hold(laid_out, fit, records) if options.loss == "squares" else None
-    assert isinstance(options, MeasuredSubmodels)
-    if options.closed:
-        # A discrete controller holds its input.
-        return None
-    try:
-        held = otherwise_held(records[0])
-        other = options.prepare(held).fit(Start(model=options._factors(fit)))
-    except DataError:
-        return None
-    return OtherHold(held.input.hold, decisive(fit.cost, other.cost, fit, records))
 
 
 # --- the delay -------------------------------------------------------------------------------------
@@ -392,18 +300,6 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
 # --- results ---------------------------------------------------------------------------------------
 
 
-def _gains(fit: MeasuredFit, squared_errors: Mapping[str, float]) -> dict[str, float]:
-    """Shares by which estimating what was taken as zero would lower the cost, where that is worth it."""
-    squared_error, gains = fit.cost * fit.count, {}
-    for name, lowered in squared_errors.items():
-        added = fit.model.order if name == "initial_state" else 1
-        share = 1.0 - lowered / squared_error if squared_error > 0 else 0.0
-        evidence = -fit.count * np.log(max(1.0 - share, 1e-300)) - added * len(fit.residuals) * np.log(fit.count)
-        if share > WORTHWHILE and evidence > DECISIVE:
-            gains[name] = share
-    return gains
-
-
 def _estimates(
     fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], interval: DelayInterval | None
 ) -> tuple[UncertainValue, ...]:
@@ -411,7 +307,7 @@ def _estimates(
     found: dict[str, UncertainValue] = {}
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(uncertainty.covariance))
-    free = set(_free(fit)[0].tolist())
+    free = set(free_directions(fit)[0].tolist())
     for k, (name, value) in enumerate(zip(fit.parameter_names, fit.theta.tolist(), strict=True)):
         if name in unclear:
             found[name] = UncertainValue(name, value, status="undetermined")

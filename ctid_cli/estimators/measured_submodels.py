@@ -246,26 +246,6 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         sensitivities = np.column_stack((psi, free))
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
 
-    def _lowered(self, fit: MeasuredFit, laid_out: Any) -> dict[str, float]:
-        """Sums of squared errors if an initial state or an offset were estimated too, to first order."""
-        error, psi = fit.residuals[0], fit.sensitivities[0] @ fit.tangent
-
-        def left(columns: Array) -> float:
-            beside = np.column_stack((psi, columns))
-            beside = beside / np.maximum(np.linalg.norm(beside, axis=0), TINY)
-            rest = error - beside @ np.linalg.lstsq(beside, error)[0]
-            return float(rest @ rest)
-
-        found = {}
-        if self.initial_state == "rest":
-            found["initial_state"] = left(self._rows(fit, laid_out, loop=OPEN_LOOP, initial_state="estimated")[1])
-        if self.offset == "none":
-            found["offset"] = left(np.ones((error.size, 1)))
-        return found
-
-
-TINY = float(np.finfo(float).tiny)
-
 
 def _padded(b: Array, size: int) -> Array:
     """Numerator with its declared length."""

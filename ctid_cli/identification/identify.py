@@ -10,6 +10,7 @@ from ctid_cli.estimators.measured_submodels import Options
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
+from ctid_cli.identification.fit_warnings import with_warnings
 from ctid_cli.identification.validation import judged_on, laid_out_for
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
 from ctid_cli.signals.record import Record
@@ -74,7 +75,7 @@ def identify(
     several = [records] if isinstance(records, Record) else list(records)
     noise = covariance, bootstrap_draws, progress
     if options is not None and not isinstance(options, Given):
-        return identification.identify(options, several, validation, *noise)
+        return with_warnings(identification.identify(options, several, validation, *noise))
     given = options or Given()
     choice = choose(several, given)
     if given.poles is None and not choice.seen:
@@ -84,5 +85,5 @@ def identify(
         # Refused before the fit takes its time.
         laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
-    found = replace(found, choices=choice.sentences)
+    found = with_warnings(replace(found, choices=choice.sentences))
     return found if other is None else replace(found, validation=judged_on(other, choice.options, found.fit, given))

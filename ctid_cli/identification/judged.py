@@ -46,6 +46,6 @@ def _judged(candidate: Candidate, choice: Choice, given: Given, other: Record | 
         candidate,
         criteria.young_information_criterion(residuals, np.concatenate(outputs), fit.theta[free], covariance),
         criteria.fit_percent(total, total - np.concatenate(left)),
-        tests_of(options, fit, choice.fitted, choice.answer),
+        tests_of(options, fit, choice.fitted),
         None if other is None else judged_on(other, options, fit, given).fit_percent,
     )

@@ -143,7 +143,7 @@ def describe_conditioning(
         if len(group) == 1:
             start = f"{what} has no effect that these data show ({number})"
         end = "their standard errors are not reliable" if defined else "no standard errors can be given"
-        sentences.append(f"{start}; {end}. {_advice(group, names)}")
+        sentences.append(f"{start}; {end}.")
     if defined:
         errors = np.sqrt(variances)
         sentences += _large_errors(estimates, errors, names)
@@ -157,14 +157,14 @@ def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator
         if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
             times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
             start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
-            yield f"{start}: these data do not determine it, not even its sign; a simpler model may do."
+            yield f"{start}: these data do not determine it, not even its sign."
 
 
 def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
     def told(group: Sequence[int], how: str, combinations: str) -> str:
         several = [names[i] for i in group]
         start = f"{listed(several)} can hardly be told apart by these data ({how}): only"
-        return f"{start} {combinations} well determined. {_advice(several, names)}"
+        return f"{start} {combinations} well determined.{_of_delay(several)}"
 
     size = len(names)
     pairs = [(j, i) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
@@ -190,11 +190,8 @@ def _singular_direction(hessian: Array) -> list[int]:
     return np.flatnonzero(np.abs(direction) > 0.1).tolist()
 
 
-def _advice(group: Sequence[str], names: Sequence[str]) -> str:
-    numerator = [name for name in group if re.fullmatch(r"b\d+", name)]
-    zeros = sum(bool(re.fullmatch(r"b\d+", name)) for name in names) - 1
-    if "delay" in group and numerator and zeros > 0:
-        return "A zero and a delay have nearly the same effect here: fix the delay, or use fewer zeros."
-    if "delay" in group and numerator:
-        return "The input hardly shows when the response begins: fix the delay, or use an input with sharper changes."
-    return "Use fewer poles or zeros, or an input that excites the system at more frequencies."
+def _of_delay(group: Sequence[str]) -> str:
+    """Return why a delay can hardly be told from coefficients."""
+    if "delay" not in group or not any(re.fullmatch(r"b\d+", name) for name in group):
+        return ""
+    return " The input hardly shows when the response begins."

@@ -20,7 +20,7 @@ from ctid_cli.text import Shown, wrapped
 
 
 class Status(Enum):
-    """Outcome of an estimation: what happened, the usual cause, and what to change."""
+    """Outcome of an estimation: what happened, and the usual cause."""
 
     CONVERGED = "The iterations converged to a minimum of the output-error cost."
     LEAST_SQUARES = "A one-shot least-squares estimate: biased by output noise; use it as a start, not as a result."
@@ -29,17 +29,17 @@ class Status(Enum):
     )
     STALLED = (
         "No step lowers the cost although no minimum is reached: too many parameters for these data, or a tolerance "
-        "below what rounding allows; use fewer poles or zeros, or a larger tolerance."
+        "below what rounding allows."
     )
     AT_BOUND = (
         "The least output-error cost is at the border of the admissible models: a pole is as fast, as slow or as "
-        "little damped as may be; use fewer poles, or a record that shows more of it."
+        "little damped as may be."
     )
     RIDGE = (
         "The output-error cost is least and hardly changes along a line as far as models are admissible: the data do "
-        "not determine all parameters; use fewer poles or zeros."
+        "not determine all parameters."
     )
-    DELAY_AT_BOUND = "The delay stopped at one of its bounds; widen delay_bounds, or start the delay elsewhere."
+    DELAY_AT_BOUND = "The delay stopped at one of its bounds."
     LOCAL = "A local minimum: at another delay within the bounds the cost is lower; start there, or use delay_profile."
     REFLECTED = (
         "The last step led to an unstable model, whose poles were mirrored: this is no minimum of the output-error "

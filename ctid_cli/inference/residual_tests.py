@@ -125,8 +125,6 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
-    #: Whether the output is seen to respond to the input at all; else no dynamics can be missed.
-    answered: bool = True
 
     @property
     def white(self) -> bool:
@@ -147,17 +145,16 @@ class ResidualTests:
         if not self.white:
             first = first.replace("pass as white", "are not white").removesuffix(".")
             first += ": the noise is coloured, so that standard errors for white noise do not hold."
-        correlated = f"They are correlated with the input (p = {self.cross_p_value:.2g})"
         if np.isnan(self.cross_p_value):
             second = "Their correlation with the input cannot be tested: the input does not vary enough."
         elif self.uncorrelated:
-            second = f"{correlated.replace('are', 'are not')}{': no missing dynamics are seen' * self.answered}."
+            second = f"They are not seen to depend on the input (p = {self.cross_p_value:.2g})."
         elif int(np.argmax(np.abs(self.cross_correlation))) < self.lags:
-            why = "feedback from the output, the delay is too long, or the clocks of input and output differ"
-            second = f"{correlated}, most with later inputs: there is {why}."
+            why = "as with feedback from the output, a delay that is too long, or clocks that differ"
+            second = f"They depend on the input, most on later values (p = {self.cross_p_value:.2g}), {why}."
         else:
-            why = "more poles or zeros, another delay, or a nonlinear model may be needed"
-            second = f"{correlated}: the model misses a part of the response; {why}."
+            what = "the model misses a part of the response"
+            second = f"They depend on the input (p = {self.cross_p_value:.2g}): {what}."
         return f"{first} {second}"
 
 

@@ -209,24 +209,6 @@ def test_squared_errors_around_the_estimate():
     assert prepared.laid_out.squared_error_at(fit.model, fit.model.delay) == pytest.approx(lowest)
     known = replace(options, delay_bounds=(0.6, 0.6)).fit(prepared.laid_out.records)
     assert prepared.laid_out.squared_error_at(fit.model, 0.6) == pytest.approx(known.cost * known.count, rel=1e-6)
-    better = replace(options, offset="estimate").fit(prepared.laid_out.records)
-    assert prepared.laid_out.squared_error_with(fit.model, offset=True) == pytest.approx(
-        better.cost * better.count, rel=1e-6
-    )
-
-
-def test_an_estimated_state_never_costs_more_than_rest():
-    # Of an integrating drive the set with an estimated state would not have the pole of the fit at rest.
-    rng = np.random.default_rng(2)
-    t = np.arange(300.0)
-    u = np.repeat(rng.choice([-1.0, 1.0], 15), 20)
-    x = simulate(TransferFunction([1.0], [8.0, 1.0, 0.0]), HeldSignal(t, u), t)
-    prepared = DelayProfile(2, 0, (0, 0), nested=True).prepare(
-        Record(t, x + rng.standard_normal(300), HeldSignal(t, u))
-    )
-    fit = prepared.fit()
-    more = prepared.laid_out.squared_error_with(fit.model, initial_state=True)
-    assert 0.9 < more / (fit.cost * fit.count) <= 1.0
 
 
 # --- refusals --------------------------------------------------------------------------------------
@@ -249,3 +231,18 @@ def test_a_range_beyond_the_record_or_no_record_is_refused():
         DelayProfile(2, 0, (0, 100)).fit(record_of())
     with pytest.raises(DataError, match="no record"):
         DelayProfile(2, 0, (0, 1)).fit([])
+
+
+# --- a drift of the output -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+@pytest.mark.parametrize("initial_state", ["rest", "estimate"])
+def test_a_drift_is_a_constant_and_a_slope(initial_state, irregular):
+    record = record_of(irregular=irregular)
+    drifting = Record(record.t, record.y + 4.0 + 0.3 * (record.t - record.t[0]), record.input)
+    fit = DelayProfile(2, 0, (0, 3), initial_state=initial_state, offset="drift").fit(drifting)
+    assert [fit.parameters["offset"], fit.parameters["drift"]] == pytest.approx([4.0, 0.3], rel=1e-6)
+    assert fit.model.delay == pytest.approx(SYSTEM.delay, abs=1e-6)
+    with pytest.raises(ValueError, match="offset drift is a slope, which the output of an integrating system has"):
+        DelayProfile(2, 0, (0, 3), offset="drift", integrators=1)

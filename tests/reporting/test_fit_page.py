@@ -59,7 +59,7 @@ def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
         assert title in page.text
     assert page.tags["svg"] == 8
     assert not fitted[0].warnings
-    assert "the search ended well, and the residuals pass their tests." in page.text
+    assert "The search ended well, the residuals pass their tests, and no change" in page.text
     for words in ("natural_frequency_1", "95 % low", "without a model", "cost above the least", "@software{ctid"):
         assert words in page.text or words in text
     assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0

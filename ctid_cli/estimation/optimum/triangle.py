@@ -79,6 +79,9 @@ def rows_of(
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
     for forced in form.forced(record, second):
+        if not len(forced):
+            # A piece without outputs.
+            continue
         rows = np.empty((columns.size, len(forced)))
         rows[: columns.u + 2] = forced.T
         if columns.free:

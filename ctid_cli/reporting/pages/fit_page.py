@@ -28,7 +28,7 @@ from ctid_cli.signals.measurement import Measurement
 from ctid_cli.text import count
 
 #: What stands in the place of warnings.
-FINE = "Nothing that was tested speaks against this model: the search ended well, and the residuals pass their tests."
+FINE = "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."
 #: Digits of the coefficients in the equation.
 DIGITS = 5
 #: Frequencies at which a model is drawn.

@@ -1,0 +1,227 @@
+"""What to know before a fit is used: at most five sentences, ordered by what they cost."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctid_cli.arrays import BoolArray
+from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.identification import Identification, free_directions, unsafe_intervals
+from ctid_cli.identification.remedies import Kind, Remedy, Trials, tried_remedies
+from ctid_cli.inference.covariance import condition_number, describe_conditioning
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
+from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
+from ctid_cli.signals.record import Record
+from ctid_cli.text import count, listed
+
+#: Sentences that are printed.
+MOST = 5
+#: Below this fit something may be missing [%].
+LOW_FIT = 80.0
+#: Residuals depend on the input where chance gives as much less often than this; of feedback, which is looked for among
+#: many inputs, and explains this share of the residuals' variance.
+DEPENDENT, FED_BACK, FEEDBACK_SHARE = 0.01, 1e-4, 0.01
+#: A real pole is slow where its time constant exceeds this fraction of the record.
+SLOW = 0.6
+#: Instants of outliers that are listed.
+LISTED = 3
+
+
+@dataclass(frozen=True)
+class FitWarning:
+    """What was observed of a fit, and a remedy that was tried and helped, if there is one."""
+
+    observed: str
+    remedy: Remedy | None = None
+
+    def __str__(self) -> str:
+        return f"{self.observed}." if self.remedy is None else f"{self.observed}: {self.remedy}."
+
+
+def with_warnings(found: Identification) -> Identification:
+    """Return a fit with its warnings, after changes of it have been tried on its records."""
+    return replace(found, warnings=tuple(map(str, fit_warnings(found))))
+
+
+def fit_warnings(found: Identification) -> list[FitWarning]:
+    """Try changes of a fit, and return its warnings, the costliest first."""
+    fit, records = found.fit, found.records
+    growing = [
+        growth_time(record.t[use], record.y[use], record.input.at(record.t[use])) for record, use in _used(found)
+    ]
+    if any(np.isfinite(growing)):
+        fastest = float(np.nanmin(growing))
+        what = f"The output diverges: it grows by a factor of e every {fastest:.2g}, and the input does not"
+        return [FitWarning(f"{what}; an unstable plant is not among the models")]
+    seen = found.answer.seen
+    suspicious = fit.fit_percent < LOW_FIT or fit.status is not Status.CONVERGED or len(found.tests) < len(records)
+    suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
+    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
+    named = [FitWarning(_observed(remedy, found), remedy) for remedy in tried.remedies]
+    mended = {remedy.kind for remedy in tried.remedies}
+    if not seen:
+        no_model = f"No model: the output is not seen to respond to the input (p = {found.answer.p_value:.2g})"
+        return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
+    others = list(_of_residuals(found, mended))
+    if not named:
+        # Of an estimate that will change, neither its search nor its errors need to be known.
+        others += [*_of_fit(fit, tried), *_of_search(fit), *_of_uncertainty(found)]
+    failed = list(_of_validation(found))
+    return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
+
+
+def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
+    return zip(found.records, found.fit.linear.used, strict=True)
+
+
+# --- what a remedy is for ----------------------------------------------------------------------------
+
+
+def _observed(remedy: Remedy, found: Identification) -> str:
+    """Return what a kind of remedy mends, as it was seen."""
+    fit, options = found.fit, found.options
+    if remedy.kind == "loss":
+        return _outliers(found)
+    if remedy.kind == "hold":
+        return f"The input is taken with --hold {found.records[0].input.hold}"
+    if remedy.kind == "treatment":
+        return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
+    low, high = options.delay_bounds
+    if remedy.kind == "delay" and fit.status is Status.DELAY_AT_BOUND:
+        return f"The delay lies at the end of its range, {fit.model.delay:.4g}"
+    if remedy.kind == "delay" and low == high:
+        return f"The delay is taken as {low:g}"
+    if getattr(remedy.options, "integrators", 0) and (slow := _slow_pole(found)):
+        return slow
+    return _dependence(found) or f"The model has {count(options.poles, 'pole')} and {count(options.zeros, 'zero')}"
+
+
+def _dependence(found: Identification, least: float = 0.05) -> str:
+    """Return which residuals depend on the input most, if chance would give as much less often than a level."""
+    tests = [(test.cross_p_value, k, test) for k, test in enumerate(found.tests, start=1)]
+    p, k, test = min(tests, default=(1.0, 0, None), key=lambda each: np.nan_to_num(each[0], nan=1.0))
+    if test is None or not p < least:
+        return ""
+    later = int(np.argmax(np.abs(test.cross_correlation))) < test.lags
+    of = f" of experiment {k}" * (len(found.records) > 1)
+    return f"The residuals{of} depend on the input{', most on later values' * later} (p = {p:.2g})"
+
+
+def _outliers(found: Identification) -> str:
+    """Return which samples are far from their neighbours; nothing where none is."""
+    listed_times, largest, total = [], 0.0, 0
+    for k, ((record, use), e) in enumerate(zip(_used(found), found.fit.linear.residuals, strict=True), start=1):
+        places, off = residual_outliers(e)
+        total += places.size
+        largest = max(largest, float(np.abs(off).max(initial=0.0)))
+        of = f" of experiment {k}" * (len(found.records) > 1)
+        times = [f"{t:.6g}" for t in record.t[use][places][:LISTED]]
+        listed_times += [f"t = {', '.join(times)}{', ...' * (places.size > LISTED)}{of}"] * (places.size > 0)
+    if not total:
+        return ""
+    what = "1 output sample is an outlier" if total == 1 else f"{total} output samples are outliers"
+    return f"{what} ({'; '.join(listed_times)}), up to {largest:.3g} away from the neighbours"
+
+
+def _slow_pole(found: Identification) -> str:
+    """Return that a real pole is slow for the record; nothing where none is."""
+    poles = found.fit.model.poles
+    sizes = np.abs(poles[(poles.imag == 0.0) & (poles.real != 0.0)])
+    longest = max(record.duration for record in found.records)
+    if not sizes.size or sizes.min() * longest * SLOW >= 1.0:
+        return ""
+    what = f"A pole has a time constant of {1 / sizes.min():.4g}"
+    return f"{what}: over a record of {longest:.4g} it is nearly indistinguishable from an integrator"
+
+
+# --- what has no remedy ------------------------------------------------------------------------------
+
+
+def _of_validation(found: Identification) -> Iterator[FitWarning]:
+    fitted, other = found.fit.r2, found.validation
+    if other is not None and other.r2 < 0.5 < fitted:
+        what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
+        yield FitWarning(f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: it does not carry over")
+
+
+def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
+    """What residuals and record show beside the model."""
+    if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
+        yield f"{what}: the model misses a part of the response"
+    if "loss" not in mended and (what := _outliers(found)):
+        yield what
+    share = max(saturated(record.y[record.valid]) for record in found.records)
+    if share:
+        yield f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value, as at a limit"
+    fit = found.fit.linear
+    for k, (record, use) in enumerate(_used(found)):
+        e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
+        acting = found.options._acting(record)
+        seen = input_dependence(e, record.y[use] - e, psi, t, acting, fit.model.delay)
+        if seen is None or _outliers(found) or seen.feedback_share < FEEDBACK_SHARE:
+            continue
+        # Dynamics that are missed may leave something for later inputs to tell.
+        if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
+            what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
+            yield f"{what} (p = {seen.feedback_p_value:.1g}), as in a loop, where noise biases the estimate"
+
+
+def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
+    """That a fit is low, and what did not raise it; with outliers it always is."""
+    if fit.fit_percent < LOW_FIT and fit.weighting is None:
+        what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
+        yield f"{what}; tried without gain: {', '.join(tried.without_gain)}" if tried.without_gain else what
+
+
+def _of_search(fit: MeasuredFit) -> Iterator[str]:
+    """How the search ended, where it did not end well."""
+    if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not fit.held_poles:
+        yield fit.status.value.removesuffix(".")
+    if fit.held_poles:
+        held = listed(f"{pole:.4g}" if pole.imag else f"{pole.real:.4g}" for pole in fit.held_poles)
+        met = () if fit.box is None else fit.box.limits_met(fit.held_poles)
+        why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
+        yield f"Held at the border of the admissible models: {held} (poles, rad per unit of time){why}"
+    if fit.status is Status.DELAY_AT_BOUND:
+        where = f"end of its range, {fit.model.delay:.4g}" if fit.model.delay else "least possible, 0"
+        yield f"The delay is at the {where}, and has no standard error"
+    if fit.poles_at_infinity:
+        lost = "1 pole runs" if fit.poles_at_infinity == 1 else f"{fit.poles_at_infinity} poles run"
+        yield f"{lost} to infinity: more than {fit.model.order} lower the cost no further"
+
+
+def _of_uncertainty(found: Identification) -> Iterator[str]:
+    """What the record does not determine, and intervals that cannot be trusted."""
+    if slow := _slow_pole(found):
+        yield slow
+    fit, uncertainty = found.fit, found.uncertainty
+    known = fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
+    _, hessian = free_directions(fit.linear)
+    names: list[str] = []
+    values: list[float] = []
+    for column in fit.tangent.T:
+        place = int(np.argmax(np.abs(column)))
+        own = np.count_nonzero(column) == 1
+        names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
+        values.append(fit.theta[place])
+    told = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
+    yield from (each.removesuffix(".") for each in told)
+    if uncertainty.short:
+        worth = f"its {fit.count} samples are worth {uncertainty.effective_count:.2g} independent ones"
+        size = len(uncertainty.free_covariance)
+        yield f"The record is short for its noise: {worth}, the model has {size} parameters, and intervals are rough"
+    if unsafe := unsafe_intervals(found):
+        what = f"Intervals of {listed(unsafe)} are" if len(unsafe) > 1 else f"The interval of {unsafe[0]} is"
+        yield f"{what} unsafe: so far from the estimate the output is not linear in the parameters"
+    low, high = found.options.delay_bounds
+    interval = found.delay_interval
+    # Below zero there is nothing left to search.
+    ends = (
+        [] if interval is None else [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
+    )
+    if ends:
+        yield f"The interval of the delay reaches the end of its range ({' and '.join(ends)})"
+    if len(found.tests) < len(fit.residuals):
+        yield f"Fewer than {FEWEST_TESTED} residuals are too few to test; standard errors take them as white"

@@ -1,0 +1,456 @@
+"""Changes of a fit that are tried on its own records, and those of them that help."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from operator import is_not
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import CtidError
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
+from ctid_cli.identification.candidates import with_hold
+from ctid_cli.identification.criterion import noise_of, penalised
+from ctid_cli.identification.held_back import compared, held_back_errors, long_enough
+from ctid_cli.inference.criteria import innovations_count, squared_innovations
+from ctid_cli.inference.signal_features import input_moves, residual_outliers
+from ctid_cli.models.additive import Term
+from ctid_cli.signals.held import Hold, regular_interval
+from ctid_cli.signals.record import Record, beginning
+from ctid_cli.signals.treatment import Offset
+
+#: Samples of all records on which changes are tried.
+MOST_SAMPLES = 10_000
+#: Least fall of the criterion where it alone decides, very strong evidence by Kass and Raftery (1995).
+DECISIVE = 10.0
+#: There, the end of the records must not be fitted worse by more than this factor of the squared error.
+NO_WORSE = 1.1
+#: Changes of one kind that are compared on blocks that are held back, and most changes that are named.
+MOST_COMPARED, MOST_NAMED = 5, 3
+#: Delays are tried up to this fraction of the shortest record, and this many times the greatest that was searched.
+LATEST, FARTHER = 0.1, 2.0
+#: Rates of a pole that is added, from three periods of the record to the sampling rate, and delays of starts.
+RATES, DELAYS = 4, 12
+#: Costs that differ by less than this fraction are those of one model.
+SAME = 1e-6
+#: Damping of a pair that is added.
+DAMPING = 0.3
+
+Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
+#: Where a local search begins: a denominator without its integrators, and a delay [s].
+Near = tuple[Array, float]
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """A change of a fit that helps on its own records."""
+
+    kind: Kind
+    #: Options of ``ctid fit`` that make the change.
+    option: str
+    #: The changed estimator, and the input between its samples.
+    options: Options
+    hold: Hold
+    #: Fit of blocks that were held back without and with the change, and standard error of the difference [%]; or the
+    #: criterion [-], and NaN.
+    before: float
+    after: float
+    standard_error: float
+    held_back: bool
+    #: Fit of all samples without and with the change [%].
+    fits: tuple[float, float]
+    #: Whether the remedies before it are made too.
+    besides: bool = False
+
+    @property
+    def gain(self) -> float:
+        """Points of fit that the change gives [%]."""
+        return self.after - self.before if self.held_back else self.fits[1] - self.fits[0]
+
+    def __str__(self) -> str:
+        made = f"with {self.option}{' besides' * self.besides}"
+        if self.held_back:
+            return f"{made} the held-back fit is {self.after:.1f} instead of {self.before:.1f} %"
+        numbers = f"BIC is {self.after:.1f} instead of {self.before:.1f}, the fit"
+        return f"{made} {numbers} {self.fits[1]:.1f} instead of {self.fits[0]:.1f} %"
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A fit of an estimator to the records with a hold of their input."""
+
+    kind: Kind
+    options: Any
+    hold: Hold
+    records: tuple[Record, ...]
+    fit: MeasuredFit
+
+    @property
+    def parameters(self) -> int:
+        """Number of free parameters, those that have run to infinity included."""
+        return self.fit.theta.size - len(self.fit.known) + self.fit.poles_at_infinity
+
+    @property
+    def near(self) -> Near:
+        """Where its model is."""
+        model = self.fit.model
+        return model.denominator[: model.denominator.size - self.options.integrators], model.delay
+
+    @property
+    def starts(self) -> tuple[Near, ...]:
+        """Where the search for a changed estimate begins."""
+        return (self.near,) if isinstance(self.options, DelayProfile) else ()
+
+    @property
+    def rates(self) -> Array:
+        """Rates of poles [rad/s] that the records can show."""
+        longest = max(record.duration for record in self.records)
+        shortest = min(float(np.median(np.diff(record.t))) for record in self.records)
+        return np.geomspace(3.0 / longest, 1.0 / shortest, RATES)
+
+    @cached_property
+    def errors(self) -> list[Array]:
+        """Errors of the blocks that are held back."""
+        return held_back_errors(self.options, self.records, self.near)
+
+
+class Trials(NamedTuple):
+    """What was tried of a fit."""
+
+    #: Changes that help, each besides those before it.
+    remedies: list[Remedy]
+    #: Options of those that do not.
+    without_gain: list[str]
+
+
+def tried_remedies(
+    records: Sequence[Record],
+    options: Options,
+    fit: MeasuredFit,
+    *,
+    suspicious: bool = True,
+    response: bool = True,
+) -> Trials:
+    """Try changes of a fit on its records, and return those that help, each besides those before it.
+
+    There are at most three, one of each kind: another loss where there are outliers, then what helps most. Structures,
+    delays and holds are tried where the residuals or the search give a cause, and delays alone where no response to the
+    input is seen. Of submodels the criterion decides.
+
+    A change helps if three things hold. Schwarz's criterion of the innovations is less with it, under one noise model
+    (autoregressive, of the residuals of the closer fit) and 1.5 times the usual penalty. It improves the fit of ten
+    blocks of the records, each predicted by a fit that did not see its outputs, by more than twice the standard error
+    of the difference. And it does not make the fit of the last two worse, which are held back together, so that a fit
+    extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few
+    of them, the criterion decides, if it falls by ten.
+    """
+    submodels = isinstance(options, MeasuredSubmodels)
+    # A record in a loop cannot be cut.
+    most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
+    part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
+    base = Trial("structure", options, records[0].input.hold, part, fit)
+    found = Trials([], [])
+    try:
+        if isinstance(options, DelayProfile) and any(map(is_not, part, records)):
+            base = replace(base, fit=options._refine(part, base.near))
+        wild = [_outliers(base.fit, k) for k in range(len(part))]
+        kinds: tuple[Kind, ...] = get_args(Kind)[1:] if suspicious else ("treatment",)
+        if any(off.any() for off in wild):
+            base = _best_step(base, wild, ("loss",), found)[0]
+        kinds = kinds if response else ("delay",)
+        while kinds and len(found.remedies) < MOST_NAMED:
+            base, kinds = _best_step(base, wild, kinds, found)
+    except CtidError:
+        return found
+    return found
+
+
+def _best_step(
+    base: Trial, wild: Sequence[Array], kinds: Sequence[Kind], found: Trials
+) -> tuple[Trial, tuple[Kind, ...]]:
+    """Add the change of some kinds that helps most; return its fit, and the other kinds that help by themselves."""
+    step = _Step(base, wild)
+    helpful = step.helpful(kinds)
+    if not found.remedies:
+        found.without_gain.extend(step.without_gain)
+    if not helpful:
+        return base, ()
+    remedy, trial = _simplest(helpful)
+    found.remedies.append(replace(remedy, besides=bool(found.remedies)))
+    return trial, tuple(other.kind for other, _ in helpful if other is not remedy)
+
+
+# --- what is tried -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Change:
+    """An estimator and a hold, and where the search for their estimate begins."""
+
+    options: Any
+    hold: Hold
+    starts: tuple[Near, ...]
+
+
+def _changed(base: Trial, starts: Sequence[Near] = (), **fields: object) -> Iterator[Change]:
+    """Yield a change of some options, unless the estimator refuses it."""
+    try:
+        options = replace(base.options, **fields)
+    except ValueError:
+        return
+    if options != base.options:
+        yield Change(options, base.hold, tuple(starts) or base.starts)
+
+
+def _structures(base: Trial) -> Iterator[Change]:
+    """One and two more poles, more zeros, an integrator besides or in the place of a pole."""
+    options = base.options
+    if options.fixed or base.fit.poles_at_infinity:
+        return
+    if isinstance(options, MeasuredSubmodels):
+        yield from _submodels(base)
+        return
+    (denominator, delay), n, m = base.near, options.poles, options.zeros
+    one = [(np.polymul(denominator, [1.0, rate]), delay) for rate in base.rates]
+    two = [(np.polymul(denominator, [1.0, 2.0 * DAMPING * rate, rate**2]), delay) for rate in base.rates]
+    more = (one, n + 1, m), (one, n + 1, m + 1), (two, n + 2, m + 1), (two, n + 2, m + 2), ((), n, m + 1)
+    for starts, poles, zeros in more:
+        yield from _changed(base, starts, poles=poles, zeros=zeros)
+    if not options.integrators:
+        offset = "estimate" if options.offset in ("remove", "drift") else options.offset
+        yield from _changed(base, integrators=1, offset=offset)
+        yield from _changed(base, _with_fewer(denominator, delay), poles=n - 1, integrators=1, offset=offset)
+
+
+def _submodels(base: Trial) -> Iterator[Change]:
+    """One more pole of the first submodel, or one more submodel."""
+    first, *others = base.options.terms
+    yield from _changed(base, terms=(replace(first, poles=first.poles + 1), *others))
+    if base.options.factored:
+        for poles in (1, 2):
+            yield from _changed(base, terms=(first, *others, Term(poles, 0)))
+
+
+def _with_fewer(denominator: Array, delay: float) -> list[Near]:
+    """Denominators without one of their real poles, or of a pair with a real pole of its size."""
+    poles = np.roots(denominator)
+    found = []
+    for pole in poles[poles.imag >= 0.0].tolist():
+        left = poles[(poles != pole) & (poles != np.conj(pole))]
+        left = np.append(left, [-abs(pole)] * (pole.imag > 0.0))
+        found.append((polynomial(left), delay))
+    return found
+
+
+def _delays(base: Trial) -> Iterator[Change]:
+    """A range of delays from zero to a tenth of the record."""
+    if isinstance(base.options, MeasuredSubmodels):
+        return
+    denominator, _ = base.near
+    shortest = min(record.duration for record in base.records)
+    reach = float(f"{max(FARTHER * base.options.delay_bounds[1], LATEST * shortest):.2g}")
+    if reach < 0.5 * shortest:
+        starts = [(denominator, float(delay)) for delay in np.linspace(0.0, reach, DELAYS)]
+        yield from _changed(base, starts, delay_bounds=(0.0, reach))
+
+
+def _holds(base: Trial) -> Iterator[Change]:
+    """The other holds; steps show their shape themselves, and an input that jumps is not band-limited."""
+    kinds = {input_moves(record).kind for record in base.records}
+    # A discrete controller holds its input.
+    if kinds <= {"constant", "steps"} or any(record.loop is not None for record in base.records):
+        return
+    regular = all(regular_interval(record.input.t) is not None for record in base.records)
+    for hold in get_args(Hold):
+        if hold != base.hold and (hold != "band-limited" or (regular and kinds == {"continuous"})):
+            yield Change(base.options, hold, base.starts)
+
+
+def _treatments(base: Trial) -> Iterator[Change]:
+    """An initial state, an offset, both, and a drift."""
+    options, starts = base.options, base.starts
+    offsets: tuple[Offset, ...] = ("remove",)
+    if isinstance(options, DelayProfile):
+        offsets = ("estimate", "drift")
+        # What was left out may have moved the poles far away.
+        starts += tuple((polynomial(np.full(options.poles, -rate)), base.near[1]) for rate in base.rates)
+    state = "estimate" if options.initial_state == "rest" else options.initial_state
+    for offset in dict.fromkeys((options.offset, *offsets)):
+        for initial_state in dict.fromkeys((options.initial_state, state)):
+            fields = {"initial_state": initial_state, "offset": offset}
+            if getattr(options, "input_before", None) is not None and initial_state != "rest":
+                fields["input_before"] = None
+            yield from _changed(base, starts, **fields)
+
+
+def polynomial(roots: Array) -> Array:
+    """Return the monic polynomial with given roots, in descending powers."""
+    return np.atleast_1d(np.real(np.poly(roots)))
+
+
+def _losses(base: Trial) -> Iterator[Change]:
+    """A loss on which outliers leave no mark."""
+    if base.options.loss == "squares":
+        yield from _changed(base, loss="tukey")
+
+
+CHANGES: dict[Kind, Callable[[Trial], Iterator[Change]]] = {
+    "loss": _losses,
+    "structure": _structures,
+    "delay": _delays,
+    "hold": _holds,
+    "treatment": _treatments,
+}
+
+
+# --- how it is judged --------------------------------------------------------------------------------
+
+
+class _Step:
+    """Trials of changes of one fit."""
+
+    def __init__(self, base: Trial, wild: Sequence[Array]) -> None:
+        self.base, self.wild = base, wild
+        self.able = isinstance(base.options, DelayProfile)
+        self.blocks = self.able and long_enough(base.records)
+        self.without_gain: list[str] = []
+
+    def helpful(self, kinds: Sequence[Kind]) -> list[tuple[Remedy, Trial]]:
+        """Return the best change of each kind, if it helps."""
+        found = []
+        for kind in kinds:
+            trials = [trial for change in CHANGES[kind](self.base) if (trial := self._tried(kind, change)) is not None]
+            scored = [(self._fall(trial), trial) for trial in trials]
+            least = 0.0 if self.blocks or kind == "loss" else DECISIVE
+            better = sorted((pair for pair in scored if pair[0] > least), key=lambda pair: -pair[0])
+            judged = [(self._judged(trial), trial) for _, trial in better[:MOST_COMPARED]]
+            helpful = [(remedy, trial) for remedy, trial in judged if remedy is not None]
+            best = self._searched(*_simplest(helpful)) if helpful else None
+            if best is not None:
+                found.append(best)
+            else:
+                self.without_gain += [self._option(trial) for trial in trials]
+        return found
+
+    def _tried(self, kind: Kind, change: Change) -> Trial | None:
+        """Return the fit with a change; None where it is refused."""
+        records = tuple(with_hold(record, change.hold) for record in self.base.records)
+        try:
+            fit = change.options._refine(records, *change.starts) if self.able else change.options.fit(records)
+        except CtidError:
+            return None
+        return Trial(kind, change.options, change.hold, records, fit)
+
+    def _fall(self, trial: Trial) -> float:
+        """Fall of the criterion; of another loss, to which it does not apply, 1."""
+        if trial.kind == "loss":
+            return 1.0
+        before, after = self._criteria(trial)
+        return before - after
+
+    def _criteria(self, trial: Trial) -> list[float]:
+        return criteria([self.base.fit, trial.fit], [self.base.parameters, trial.parameters], self.wild)
+
+    def _judged(self, trial: Trial) -> Remedy | None:
+        """Return a change with what it gives; None where it does not help."""
+        try:
+            if not self.able:
+                return self._by_criterion(trial)
+            before = [np.where(off == 0.0, e, np.nan) for e, off in zip(self.base.errors, self.wild, strict=True)]
+            gain = compared(before, trial.errors, self.base.records)
+        except CtidError:
+            return None
+        if self.blocks or trial.kind == "loss":
+            # Outliers bend a fit everywhere; what else is wrong must show where a fit extrapolates, too.
+            if not gain.helps or (trial.kind != "loss" and gain.end > 1.0):
+                return None
+            return self._remedy(trial, gain.before, gain.after, gain.standard_error, held_back=True)
+        return self._by_criterion(trial) if gain.end < NO_WORSE else None
+
+    def _searched(self, remedy: Remedy, trial: Trial) -> tuple[Remedy, Trial] | None:
+        """Return a change with what the search of the fit itself gives; None where that does not help."""
+        if trial.kind in ("loss", "hold") or not self.able:
+            return remedy, trial
+        fit = replace(trial.options, covariance="white").fit(trial.records)
+        if fit.cost >= trial.fit.cost * (1.0 - SAME):
+            return remedy, trial
+        trial = replace(trial, fit=fit)
+        judged = self._judged(trial)
+        return None if judged is None else (judged, trial)
+
+    def _by_criterion(self, trial: Trial) -> Remedy:
+        before, after = self._criteria(trial)
+        return self._remedy(trial, before, after, np.nan, held_back=False)
+
+    def _remedy(self, trial: Trial, before: float, after: float, error: float, *, held_back: bool) -> Remedy:
+        made = trial.kind, self._option(trial), trial.options, trial.hold
+        fits = self.base.fit.fit_percent, trial.fit.fit_percent
+        return Remedy(*made, before, after, error, held_back, fits)
+
+    def _option(self, trial: Trial) -> str:
+        """Return the options that make a change."""
+        words = [typed(self.base.options, trial.options), f"--hold {trial.hold}" * (trial.hold != self.base.hold)]
+        return " ".join(word for word in words if word)
+
+
+def _simplest(helpful: Sequence[tuple[Remedy, Trial]]) -> tuple[Remedy, Trial]:
+    """Return the simplest of the changes that are not worse than the best by more than a standard error."""
+    if not helpful[0][0].held_back:
+        return max(helpful, key=lambda pair: pair[0].before - pair[0].after)
+    best = max((remedy for remedy, _ in helpful), key=lambda remedy: remedy.after)
+    as_good = [pair for pair in helpful if pair[0].after >= best.after - best.standard_error]
+    return min(as_good, key=lambda pair: pair[1].parameters)
+
+
+def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Sequence[Array]) -> list[float]:
+    """Schwarz's criterion of the innovations of each fit at the samples that all of them use, under one noise model.
+
+    ``wild`` is how far outliers are from their neighbours, which does not count.
+    """
+    masks = [np.logical_and.reduce(uses) for uses in zip(*(fit.used for fit in fits), strict=True)]
+    tamed = [[e - off[use] for e, off, use in zip(fit.residuals, wild, fit.used, strict=True)] for fit in fits]
+    cut = [
+        [_at(e, use, mask) for e, use, mask in zip(errors, fit.used, masks, strict=True)]
+        for errors, fit in zip(tamed, fits, strict=True)
+    ]
+    closest = min(cut, key=lambda errors: sum(float(e @ e) for e in errors))
+    noise = noise_of(closest)
+    found = []
+    for fit, errors, size in zip(fits, cut, parameters, strict=True):
+        psi = [_at(fit.sensitivities[k] @ fit.tangent, fit.used[k], mask) for k, mask in enumerate(masks)]
+        count = innovations_count(errors, noise)
+        found.append(penalised(squared_innovations(errors, psi, noise), count, size))
+    return found
+
+
+def _outliers(fit: MeasuredFit, k: int) -> Array:
+    """How far outliers of a record are from their neighbours [output unit], 0 for all other samples, shape (N,)."""
+    law = fit.linear
+    places, off = residual_outliers(law.residuals[k])
+    found = np.zeros(law.used[k].size)
+    found[np.flatnonzero(law.used[k])[places]] = off
+    return found
+
+
+def _at(values: Array, used: BoolArray, mask: BoolArray) -> Array:
+    """Values at the used samples, cut to fewer samples."""
+    return values[mask[used]]
+
+
+def typed(old: Any, new: Any) -> str:
+    """Options of ``ctid fit`` that turn one estimator into another."""
+    words = []
+    if isinstance(new, MeasuredSubmodels):
+        if old.terms != new.terms and new.factored:
+            words.append(f"--terms {','.join(f'{term.poles}/{term.zeros}' for term in new.terms)}")
+    elif old.delay_bounds != new.delay_bounds:
+        words.append("--delay {:g}:{:g}".format(*new.delay_bounds))
+    if not getattr(new, "factored", False) and (old.poles, old.zeros) != (new.poles, new.zeros):
+        words += [f"--poles {new.poles} --zeros {new.zeros}"]
+    for name in ("integrators", "initial_state", "offset", "loss"):
+        if getattr(old, name, None) != getattr(new, name, None):
+            words.append(f"--{name.replace('_', '-')} {getattr(new, name)}")
+    return " ".join(words)

@@ -1,0 +1,169 @@
+"""What ``identify`` says of faults that are planted in a record, and that it says nothing where there are none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.filtering.simulate import simulate
+from ctid_cli.identification.fit_warnings import MOST
+from ctid_cli.identification.held_back import block_numbers, compared, held_back_errors
+from ctid_cli.identification.identify import identify
+from ctid_cli.identification.remedies import tried_remedies
+from ctid_cli.models.additive import Term
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record
+
+SYSTEM = TransferFunction([2.0], [1.0, 0.8, 2.0], 0.0)
+LATE = TransferFunction([2.0], [1.0, 0.8, 2.0], 2.5)
+INTEGRATING = TransferFunction([2.0], [1.0, 0.8, 2.0, 0.0])
+KNOWN, SEARCHED, FIRST_ORDER = DelayProfile(2, 0, (0, 0)), DelayProfile(2, 0, (0, 1)), DelayProfile(1, 0, (0, 0))
+NOISE = 0.1
+
+
+def record_of(model=SYSTEM, *, seed=0, hold="zoh", read_as=None, interval=0.2, n=1000):
+    """A record of steps of random length, or of a random walk that is followed along straight lines."""
+    rng = np.random.default_rng(seed)
+    t = interval * np.arange(n)
+    u = np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] if hold == "zoh" else rng.standard_normal(n)
+    y = simulate(model, HeldSignal(t, u, hold), t) + NOISE * rng.standard_normal(n)
+    return Record(t, y, HeldSignal(t, u, read_as or hold))
+
+
+def changed(record, y):
+    return Record(record.t, y, record.input)
+
+
+def spoilt(record, samples, size):
+    y = record.y.copy()
+    y[samples] += size
+    return changed(record, y)
+
+
+def step_of(lead, model=SYSTEM):
+    rng, t = np.random.default_rng(1), 0.2 * np.arange(400)
+    signal = HeldSignal(t, (t >= lead).astype(float))
+    return Record(t, simulate(model, signal, t) + NOISE * rng.standard_normal(t.size), signal)
+
+
+def looped(gain=0.8, n=1000):
+    """A record in the loop of a proportional controller."""
+    rng = np.random.default_rng(5)
+    r = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
+    u, y, e, pole = np.zeros(n), np.zeros(n), 0.05 * rng.standard_normal(n), np.exp(-0.2)
+    x = 0.0
+    for k in range(n):
+        y[k] = x + e[k]
+        u[k] = gain * (r[k] - y[k])
+        x = pole * x + (1 - pole) * u[k]
+    return Record.from_arrays(0.2 * np.arange(n), u, y)
+
+
+CLEAN = record_of()
+FEW = 40 + 61 * np.arange(15)
+FREE = 3.0 * np.exp(-0.4 * CLEAN.t) * np.cos(1.36 * CLEAN.t)
+DRIFTING = changed(CLEAN, CLEAN.y + 5.0 + 10 * NOISE * np.linspace(0, 1, 1000))
+MENDED = {
+    "one pole too few": (CLEAN, FIRST_ORDER, "with --poles 2 --zeros 0 the held-back fit is"),
+    "two poles too few": (
+        record_of(TransferFunction([8.0, 4.0, 20.0], np.polymul([1.0, 0.4, 2.0], [1.0, 0.8, 12.0]))),
+        KNOWN,
+        "with --poles 4 --zeros",
+    ),
+    "an integrator": (record_of(INTEGRATING), KNOWN, "with --integrators 1 the held-back fit is"),
+    "a delay that is not searched": (record_of(LATE), KNOWN, "The delay is taken as 0: with --delay 0:20 "),
+    "a delay outside the range": (
+        record_of(LATE),
+        SEARCHED,
+        "The delay lies at the end of its range, 1: with --delay ",
+    ),
+    "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
+    "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4, ...)"),
+    "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "with --offset estimate the held-back fit is"),
+    "a drift": (DRIFTING, KNOWN, "with --offset drift the held-back fit is"),
+    "a step of one pole too few": (step_of(20.0), FIRST_ORDER, "with --poles 2 --zeros 0 BIC is"),
+    "a submodel too few": (CLEAN, MeasuredSubmodels((Term(1, 0),)), "with --terms 2/0 BIC is"),
+}
+SEEN = {
+    "an unstable plant": (record_of(TransferFunction([1.0], [1.0, -0.04])), FIRST_ORDER, "The output diverges"),
+    "feedback": (looped(), FIRST_ORDER, "The input follows earlier residuals"),
+    "saturation": (changed(CLEAN, np.clip(CLEAN.y, -0.9, 0.9)), KNOWN, "exactly at the least or greatest value"),
+}
+
+
+@pytest.mark.parametrize("fault", MENDED)
+def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
+    record, options, words = MENDED[fault]
+    warnings = identify(options, [record]).warnings
+    assert words in warnings[0]
+    assert len(warnings) <= MOST
+
+
+@pytest.mark.parametrize("fault", SEEN)
+def test_what_has_no_remedy_is_said_without_one(fault):
+    record, options, words = SEEN[fault]
+    (found,) = (warning for warning in identify(options, [record]).warnings if words in warning)
+    assert "--" not in found
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_clean_record_needs_no_words(hold):
+    assert identify(KNOWN, [record_of(seed=3, hold=hold)]).warnings == ()
+
+
+def test_a_pole_that_is_as_slow_as_the_record_names_no_remedy_that_was_not_tried():
+    record = record_of(TransferFunction([1.0], [1.0, 1e-4]), n=300)
+    found = identify(DelayProfile(1, 0, (0, 0), initial_state="estimate"), [record])
+    options = {str(each.option) for each in tried_remedies([record], found.options, found.fit).remedies}
+    (slow,) = (warning for warning in found.warnings if "integrator" in warning)
+    assert "--" not in slow or any(option in slow for option in options)
+
+
+def test_a_low_fit_says_what_was_tried_without_gain():
+    loud = changed(CLEAN, CLEAN.y + 10 * NOISE * np.random.default_rng(7).standard_normal(1000))
+    result = identify(KNOWN, [loud])
+    (low,) = (warning for warning in result.warnings if warning.startswith("The fit is "))
+    assert f"{result.fit.fit_percent:.1f} %" in low
+    assert "tried without gain: --poles 3 --zeros 0, " in low
+
+
+def test_another_remedy_is_named_besides_the_first():
+    record = changed(CLEAN, CLEAN.y + 0.6)
+    found = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
+    assert [remedy.besides for remedy in found] == [False, True]
+    assert [remedy.kind for remedy in found] == ["structure", "treatment"]
+    assert found[1].before == pytest.approx(found[0].after, abs=0.01)
+    assert found[1].options == replace(found[0].options, offset="estimate")
+
+
+def test_the_held_back_fit_is_that_of_fits_that_did_not_see_the_blocks():
+    record = record_of(n=440)
+    (numbers,) = block_numbers([record])
+    assert np.bincount(numbers + 1).tolist() == [40] * 11
+    fit = KNOWN.fit(record)
+    (errors,) = held_back_errors(KNOWN, [record], (fit.model.denominator, 0.0))
+    held = np.isin(numbers, [1, 5])
+    other = KNOWN.fit(Record(record.t, np.where(held, np.nan, record.y), record.input))
+    expected = record.y - simulate(other.model, record.input, record.t)
+    np.testing.assert_allclose(errors[held], expected[held], atol=1e-5)
+    gain = compared([2.0 * errors], [errors], [record])
+    assert (100 - gain.before) / (100 - gain.after) == pytest.approx(2.0)
+    falls = [3 * np.sum(errors[numbers == block] ** 2) for block in range(10)]
+    score = np.mean(falls) / np.std(falls, ddof=1) * np.sqrt(10)
+    assert gain.score == pytest.approx(score)
+    assert gain.standard_error == pytest.approx((gain.after - gain.before) / score)
+    assert (gain.helps, gain.end) == (True, 0.25)
+
+
+def test_several_records_say_which_one():
+    warnings = identify(KNOWN, [CLEAN, spoilt(record_of(seed=1), [500], 2.0)]).warnings
+    assert warnings[0].startswith("1 output sample is an outlier (t = 100 of experiment 2)")
+
+
+def test_a_long_record_is_tried_on_its_beginning():
+    record = record_of(n=12_000)
+    (remedy,) = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
+    assert remedy.option == "--poles 2 --zeros 0"
