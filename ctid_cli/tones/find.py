@@ -169,7 +169,7 @@ def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Ar
     for k in range(found.shape[1]):
         place = ratio[rows].argmax(axis=1)
         height = ratio[rows, place]
-        energy = np.where(np.isinf(height), left.peak_height[rows], spectrum.ordinates[rows, place] / spectrum.length)
+        energy = spectrum.ordinates[rows, place] / spectrum.length
         line = (spectrum.chance(height) < c.LEVEL) & (energy > c.SIDE_LOBE * top[rows])
         rows, place, energy = rows[line], place[line], energy[line]
         if not rows.size:
