@@ -39,7 +39,7 @@ def by_name(result):
 
 def test_white_residuals_keep_the_classical_covariance():
     record = record_of()
-    result = identify(OPTIONS, [record])
+    result = identify([record], OPTIONS)
     assert result.uncertainty.kind == "white"
     np.testing.assert_array_equal(result.uncertainty.covariance, result.fit.covariance)
     items = by_name(result)
@@ -59,7 +59,7 @@ def test_white_residuals_keep_the_classical_covariance():
 
 
 def test_coloured_residuals_take_the_sandwich():
-    result = identify(OPTIONS, [record_of(colour=0.9)])
+    result = identify([record_of(colour=0.9)], OPTIONS)
     assert result.uncertainty.kind == "robust"
     expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
     np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
@@ -78,7 +78,7 @@ def test_intervals_that_reach_beyond_the_linear_are_called_unsafe():
     x = simulate(TransferFunction([2.0], [0.4, 1.4, 1.0], 0.63), step, t)
     drawn = np.random.default_rng(5).standard_normal(600)
     options = DelayProfile(2, 0, (0, 2))
-    quiet, loud = (identify(options, [Record(t, x + level * drawn, step)]) for level in (0.01, 0.2))
+    quiet, loud = (identify([Record(t, x + level * drawn, step)], options) for level in (0.01, 0.2))
     assert not any("unsafe" in warning for warning in quiet.warnings)
     assert any("unsafe" in warning and "a1" in warning for warning in loud.warnings)
 
@@ -88,7 +88,7 @@ def test_a_clock_that_jitters_a_little_counts_as_regular(jitter, regular):
     record = record_of(colour=0.9)
     t = record.t + np.random.default_rng(2).uniform(-jitter, jitter, record.n_samples)
     moved = Record(t, record.y, HeldSignal(t, record.input.values))
-    result = identify(OPTIONS, [moved])
+    result = identify([moved], OPTIONS)
     expected, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=regular)
     np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
     other, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=not regular)
@@ -96,7 +96,7 @@ def test_a_clock_that_jitters_a_little_counts_as_regular(jitter, regular):
 
 
 def test_a_delay_at_its_bound_has_no_standard_error():
-    result = identify(DelayProfile(1, 0, (0, 0.4)), [record_of()])
+    result = identify([record_of()], DelayProfile(1, 0, (0, 0.4)))
     assert result.fit.status is Status.DELAY_AT_BOUND
     delay = by_name(result)["delay"]
     assert (delay.estimate, delay.status) == (0.4, "at bound")
@@ -109,7 +109,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
 def test_a_zero_beside_a_delay_is_undetermined():
     """A small zero shifts the response like a delay: the two are singular at b0 = 0."""
     smooth = TransferFunction([4.0], [1.0, 4.0, 4.0], 0.5)
-    result = identify(DelayProfile(2, 1, (0, 3)), [record_of(smooth, noise=0.02)])
+    result = identify([record_of(smooth, noise=0.02)], DelayProfile(2, 1, (0, 3)))
     items = by_name(result)
     assert items["b0"].status == "undetermined"
     assert all(np.isnan([items["b0"].standard_error, items["b0"].low, items["b0"].high]))
@@ -120,7 +120,7 @@ def test_equations_without_information_leave_everything_undetermined():
     t = np.arange(60.0)
     record = Record.from_arrays(t, np.full(60, 2.0), 3.0 + np.exp(-0.2 * t))
     options = DelayProfile(1, 0, (0, 0), initial_state="estimate", offset="estimate")
-    result = identify(options, [record])
+    result = identify([record], options)
     statuses = {item.name: item.status for item in result.estimates}
     # A constant input and a constant offset have the same effect.
     assert statuses["b0"] == statuses["offset"] == "undetermined"
@@ -130,7 +130,7 @@ def test_equations_without_information_leave_everything_undetermined():
 
 def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
     # A held input puts kinks into the cost, and noise makes the interval reach over them.
-    result = identify(OPTIONS, [record_of(n=60, noise=0.1, every=3)])
+    result = identify([record_of(n=60, noise=0.1, every=3)], OPTIONS)
     interval = result.delay_interval
     assert interval is not None
     delay = by_name(result)["delay"]
@@ -147,14 +147,14 @@ def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
 )
 def test_what_should_be_estimated_too_is_named(changes, option, silent):
     record = record_of(**changes)
-    assert any(option in warning for warning in identify(OPTIONS, [record]).warnings)
-    better = identify(DelayProfile(1, 0, (0, 3), **silent), [record])
+    assert any(option in warning for warning in identify([record], OPTIONS).warnings)
+    better = identify([record], DelayProfile(1, 0, (0, 3), **silent))
     assert not any(option in warning for warning in better.warnings)
 
 
 def test_a_model_that_does_not_carry_over_is_said():
     other = record_of(TransferFunction([-1.0], [1.0, 2.0], 0.55), seed=1)
-    result = identify(OPTIONS, [record_of()], other)
+    result = identify([record_of()], OPTIONS, other)
     x = simulate(result.fit.model, other.input, other.t)
     assert result.validation.r2 == pytest.approx(1 - np.mean((other.y - x) ** 2) / np.var(other.y))
     assert result.validation.r2 < 0
@@ -163,7 +163,7 @@ def test_a_model_that_does_not_carry_over_is_said():
 
 def test_validation_estimates_its_own_state_and_offset():
     options = DelayProfile(1, 0, (0, 3), initial_state="estimate", offset="estimate")
-    result = identify(options, [record_of(offset=3.0)], record_of(seed=1, offset=-7.0, past=50))
+    result = identify([record_of(offset=3.0)], options, record_of(seed=1, offset=-7.0, past=50))
     assert result.validation.applied.offsets[0] == pytest.approx(-7.0, abs=0.02)
     assert result.validation.r2 > 0.9
 
@@ -171,7 +171,7 @@ def test_validation_estimates_its_own_state_and_offset():
 def test_where_no_answer_is_seen_the_first_warning_says_so():
     record = record_of(FIRST_ORDER, seed=3, n=300)
     noise = Record(record.t, np.random.default_rng(3).standard_normal(300), record.input)
-    result = identify(DelayProfile(1, 0, (0, 3), offset="estimate"), [noise])
+    result = identify([noise], DelayProfile(1, 0, (0, 3), offset="estimate"))
     assert not result.answer.seen
     assert result.warnings[0].startswith("No model: the output is not seen to respond to the input (p = ")
     for name in ("b0", "a1", "delay"):
@@ -179,24 +179,24 @@ def test_where_no_answer_is_seen_the_first_warning_says_so():
         assert (item.status, np.isnan(item.standard_error)) == ("undetermined", True)
     assert all(np.isnan(row.standard_error) for row in result.derived)
     assert "missing dynamics" not in " ".join((result.tests[0].sentence, *result.warnings))
-    assert identify(OPTIONS, [record]).answer.p_value == 0.005
+    assert identify([record], OPTIONS).answer.p_value == 0.005
 
 
 def test_too_few_residuals_are_not_tested():
-    result = identify(DelayProfile(1, 0, (0.55, 0.55)), [record_of(n=16, every=2)])
+    result = identify([record_of(n=16, every=2)], DelayProfile(1, 0, (0.55, 0.55)))
     assert result.tests == ()
 
 
 def test_a_bad_validation_record_is_refused():
     flat = Record.from_arrays(0.1 * np.arange(50), np.ones(50), np.arange(50.0))
     with pytest.raises(DataError, match=r"validation record: .*constant"):
-        identify(OPTIONS, [record_of()], flat)
+        identify([record_of()], OPTIONS, flat)
 
 
 def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     """Those of the model whose parameters are the free pole and the numerator, from central differences."""
     record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
-    result = identify(DelayProfile(2, 1, (0, 0)), [record], covariance="white")
+    result = identify([record], DelayProfile(2, 1, (0, 0)), covariance="white")
     slow, free = LIMITS["slowest"].rest / record.t[-1], float(result.fit.model.poles.real.min())
     assert result.fit.status is Status.AT_BOUND
     assert result.fit.held_poles == pytest.approx([-slow])
@@ -221,7 +221,7 @@ def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
 
 def test_a_record_too_short_for_its_noise_is_said():
     options = DelayProfile(1, 0, (0.55, 0.55), offset="drift")
-    result = identify(options, [record_of(n=60, colour=0.99, noise=0.02, seed=1)])
+    result = identify([record_of(n=60, colour=0.99, noise=0.02, seed=1)], options)
     assert any("The record is short for its noise" in warning for warning in result.warnings)
 
 
@@ -232,14 +232,14 @@ def test_one_submodel_of_a_band_limited_input_is_the_fraction():
     u = HeldSignal(t, np.convolve(rng.standard_normal(404), np.ones(5) / 5, "valid"), "band-limited")
     y = simulate(TransferFunction([4.0], [1.0, 0.8, 4.0]), u, t) + 0.02 * rng.standard_normal(t.size)
     record = Record(t, y, u)
-    additive = identify(MeasuredSubmodels((Term(2, 0),)), [record])
-    fraction = identify(DelayProfile(2, 0, (0.0, 0.0)), [record])
+    additive = identify([record], MeasuredSubmodels((Term(2, 0),)))
+    fraction = identify([record], DelayProfile(2, 0, (0.0, 0.0)))
     assert additive.fit.used[0].size == t.size
     np.testing.assert_allclose(additive.fit.model.denominator, fraction.fit.model.denominator, rtol=1e-3)
     np.testing.assert_allclose(additive.fit.cost, fraction.fit.cost, rtol=1e-4)
 
 
 def test_two_experiments_are_tested_one_by_one():
-    result = identify(OPTIONS, [record_of(), record_of(seed=1, colour=0.9)])
+    result = identify([record_of(), record_of(seed=1, colour=0.9)], OPTIONS)
     assert [test.white for test in result.tests] == [True, False]
     assert result.tests[0].level == pytest.approx(0.975)

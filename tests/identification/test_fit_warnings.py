@@ -97,7 +97,7 @@ SEEN = {
 @pytest.mark.parametrize("fault", MENDED)
 def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
     record, options, words = MENDED[fault]
-    warnings = identify(options, [record]).warnings
+    warnings = identify([record], options).warnings
     assert words in warnings[0]
     assert len(warnings) <= MOST
 
@@ -105,18 +105,18 @@ def test_a_planted_fault_is_named_first_with_a_remedy_that_was_tried(fault):
 @pytest.mark.parametrize("fault", SEEN)
 def test_what_has_no_remedy_is_said_without_one(fault):
     record, options, words = SEEN[fault]
-    (found,) = (warning for warning in identify(options, [record]).warnings if words in warning)
+    (found,) = (warning for warning in identify([record], options).warnings if words in warning)
     assert "--" not in found
 
 
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_a_clean_record_needs_no_words(hold):
-    assert identify(KNOWN, [record_of(seed=3, hold=hold)]).warnings == ()
+    assert identify([record_of(seed=3, hold=hold)], KNOWN).warnings == ()
 
 
 def test_a_pole_that_is_as_slow_as_the_record_names_no_remedy_that_was_not_tried():
     record = record_of(TransferFunction([1.0], [1.0, 1e-4]), n=300)
-    found = identify(DelayProfile(1, 0, (0, 0), initial_state="estimate"), [record])
+    found = identify([record], DelayProfile(1, 0, (0, 0), initial_state="estimate"))
     options = {str(each.option) for each in tried_remedies([record], found.options, found.fit).remedies}
     (slow,) = (warning for warning in found.warnings if "integrator" in warning)
     assert "--" not in slow or any(option in slow for option in options)
@@ -124,7 +124,7 @@ def test_a_pole_that_is_as_slow_as_the_record_names_no_remedy_that_was_not_tried
 
 def test_a_low_fit_says_what_was_tried_without_gain():
     loud = changed(CLEAN, CLEAN.y + 10 * NOISE * np.random.default_rng(7).standard_normal(1000))
-    result = identify(KNOWN, [loud])
+    result = identify([loud], KNOWN)
     (low,) = (warning for warning in result.warnings if warning.startswith("The fit is "))
     assert f"{result.fit.fit_percent:.1f} %" in low
     assert "tried without gain: --poles 3 --zeros 0, " in low
@@ -159,7 +159,7 @@ def test_the_held_back_fit_is_that_of_fits_that_did_not_see_the_blocks():
 
 
 def test_several_records_say_which_one():
-    warnings = identify(KNOWN, [CLEAN, spoilt(record_of(seed=1), [500], 2.0)]).warnings
+    warnings = identify([CLEAN, spoilt(record_of(seed=1), [500], 2.0)], KNOWN).warnings
     assert warnings[0].startswith("1 output sample is an outlier (t = 100 of experiment 2)")
 
 

@@ -49,7 +49,7 @@ def spiked(y):
 def result_of(*measurements, other=None, poles=2, delay=(0.0, 3.0), **options):
     records = [item.record for item in measurements]
     validation = None if other is None else other.record
-    fitted = identify(DelayProfile(poles, 0, delay, **options), records, validation)
+    fitted = identify(records, DelayProfile(poles, 0, delay, **options), validation)
     return FitResult(fitted, Records(measurements, other))
 
 
