@@ -25,7 +25,7 @@ def check(
     hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
 ) -> None:
-    """State facts on a measured record, and the command that identifies a model of it.
+    """State facts on a measured record, and the fit to begin with.
 
     Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
     rest and feedback, tested beside the response to the input in noise of any colour. Columns are found by their usual

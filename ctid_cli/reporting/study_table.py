@@ -82,7 +82,7 @@ def _results_called(name: str, study: Study, out: Path) -> Results:
     if results is None:
         known = [*map(str, study.tables), study.name, *experiments_in(out)]
         hint = did_you_mean(name, known) or "."
-        wrong = f"{name!r} is neither a table nor an experiment with results in {out}{hint}"
+        wrong = f"{name!r} is neither a table nor an experiment with results in the folder {out}{hint}"
         raise UsageError(f"{wrong} Known: {', '.join(known)}")
     return results
 

@@ -59,7 +59,7 @@ def results():
     noise = with_output(lambda y: np.random.default_rng(4).standard_normal(y.size))
     validated = result_of(measurement(notes=("A note.",)), other=measurement(1))
     return {
-        "validated": replace(validated, choices=["Hold: zoh, for a reason."]),
+        "validated": replace(validated, fitted=replace(validated.fitted, choices=("Hold: zoh, for a reason.",))),
         "outliers": result_of(with_output(spiked), delay=(0.73, 0.73), loss="tukey"),
         "no response": result_of(noise, poles=1),
         "delay at a bound": result_of(measurement(), delay=(0.0, 0.5)),

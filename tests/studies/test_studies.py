@@ -130,8 +130,7 @@ def clean(monkeypatch, tmp_path):
     monkeypatch.setattr(publishing, "spec_from_canonical", lambda content, folder: content)
     monkeypatch.setattr(publishing, "build_plan", lambda spec: spec)
     monkeypatch.setattr(publishing, "current_version", lambda plan: answers.get("version", "c"))
-    for module in (publishing, claims):
-        monkeypatch.setattr(module, "published_folder", lambda study: tmp_path / "published")
+    monkeypatch.setattr(publishing, "published_folder", lambda study: tmp_path / "published")
     return answers
 
 
@@ -145,7 +144,6 @@ def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
     (target / "figures" / "figure_9.svg").write_text("old", encoding="utf-8")
     first = Claim("one", "1", "at most 2", True, "two-tones")
     other = Claim("other", "3", "at most 2", False, "two-tones")
-    assert checked(small, out, first).changed == []
     publishing.publish(checked(small, out, first, other), out)
     names = {"settling.csv", "claims.md", "claims.csv", "environment.json", "figures/figure_1.svg"}
     assert {file.relative_to(target).as_posix() for file in target.rglob("*.*")} == names
@@ -154,7 +152,6 @@ def test_everything_is_published_with_its_commit(small, out, tmp_path, clean):
     text = (target / "claims.md").read_text(encoding="utf-8")
     assert "| two-tones | other | 3 | at most 2 | NO |" in text
     assert "1 of 2 hold" in text
-    assert checked(small, out, dataclasses.replace(other, holds=True), first).changed == [other]
 
 
 @pytest.mark.parametrize(
