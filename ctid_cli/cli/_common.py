@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import sys
 import tempfile
 import time
@@ -120,11 +121,13 @@ def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str
     names = list(map(str, written))
     if form == "json":
         if stored is None:
-            content = result.content()
+            content = result.json_content()
             stored = json.dumps(plain({**content, "written": names} if names else content), allow_nan=False)
         typer.echo(stored.rstrip("\n"))
         return
-    typer.echo(result.write(form))
+    # In a terminal text fits in its lines; in a pipe or a file it is the same everywhere.
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    typer.echo(result.write(form, columns))
     if names and form == "text":
         typer.echo(f"\nWritten: {', '.join(names)}")
 

@@ -56,7 +56,7 @@ def order(
         choice = choose(records.data, given)
         result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]
-    content = json.dumps(plain({**result.content(), "written": list(map(str, written))}), allow_nan=False)
+    content = json.dumps(plain({**result.json_content(), "written": list(map(str, written))}), allow_nan=False)
     write_files({written[0]: content.encode() + b"\n", written[1]: result.drawing().saved()})
     emit(result, form.form, written)
 

@@ -36,6 +36,8 @@ SETTINGS = 6
 class AccuracyResult(Result):
     """Expected accuracy of all estimators of an experiment, and what its stored results show beside it."""
 
+    schema = "ctid-accuracy-1"
+
     experiment: str
     #: Of each estimator, setting and number of samples: the standard errors by theory and their formula, or the reason
     #: why there are none.

@@ -87,6 +87,8 @@ def require_units(
 class ModelComparison(Result):
     """Stored fits on the same samples of one record."""
 
+    schema = "ctid-compare-1"
+
     models: Sequence[NamedFit]
     measurement: Measurement
     found: Sequence[ModelOnRecord]

@@ -36,6 +36,8 @@ COMPARED = (
 class ComparisonResult(Result):
     """Comparisons of cells of tables, a row for each, with the columns ``COMPARED`` and the keys of the cell."""
 
+    schema = "ctid-tables-check-1"
+
     cells: pd.DataFrame
     reference: str | None
     not_run: int

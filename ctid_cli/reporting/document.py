@@ -5,14 +5,15 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from ctid_cli.canonical import plain
 from ctid_cli.reporting.layout import latex, markdown_table
-from ctid_cli.text import wrapped
+from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,6 +56,10 @@ class Result(ABC):
     rendered from ``sections``.
     """
 
+    #: Name and version of the JSON object, such as ``ctid-check-1``; empty for rows of a table, and for files of
+    #: results, which say their kind and format.
+    schema: ClassVar[str] = ""
+
     @abstractmethod
     def sections(self) -> Sequence[Section]:
         """Return what is shown, in order."""
@@ -62,6 +67,11 @@ class Result(ABC):
     @abstractmethod
     def content(self) -> Any:
         """Return the result as plain data for JSON."""
+
+    def json_content(self) -> Any:
+        """Return the content as it is written, with the name and version of its schema."""
+        content = self.content()
+        return {"schema": self.schema, **content} if self.schema and isinstance(content, dict) else content
 
     def to_frame(self) -> pd.DataFrame:
         """Return the main table of the result."""
@@ -77,10 +87,12 @@ class Result(ABC):
         """Return the result as text."""
         return self.write("text")
 
-    def write(self, form: Format = "text") -> str:
-        """Return the result in one of the forms."""
+    def write(self, form: Format = "text", columns: int | None = None) -> str:
+        """Return the result in one of the forms; text fits in the columns of a terminal, if they are given."""
         if form == "json":
-            return json.dumps(plain(self.content()), indent=1, allow_nan=False)
+            return json.dumps(plain(self.json_content()), indent=1, allow_nan=False)
+        if form == "text":
+            return render_text(self.sections(), columns)
         if form == "csv":
             frame = self.to_frame().copy()
             for name, values in frame.select_dtypes(["object", "str"]).items():
@@ -126,33 +138,60 @@ def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
 
 
 def _is_number(text: str) -> bool:
-    return text in ("", "-") or text[0].isdigit() or (text[0] in "-+[±" and text[1:2].isdigit())
+    """Whether a cell is a number, with its error, interval or unit, but no sentence."""
+    begins = text[:1].isdigit() or (text[:1] in "-+[±" and text[1:2].isdigit())
+    return text in ("", "-") or (begins and not re.search("[A-Za-z]{6}", text))
 
 
-def render_text(sections: Iterable[Section]) -> str:
-    """Render sections as text, wrapped at the width of a page, tables with aligned columns."""
+def render_text(sections: Iterable[Section], columns: int | None = None) -> str:
+    """Render sections as text, wrapped at the width of a page or a narrower terminal, tables with aligned columns."""
+    width = WIDTH if columns is None else min(WIDTH, columns)
     blocks = []
     for section in sections:
-        parts = [section.title] if section.title else []
-        parts += [*(_paragraph(sentence) for sentence in section.sentences), *section.lines]
-        parts += [_text_table(*aligned_lines(section))] if section.frame is not None else []
-        parts += [_paragraph(note) for note in section.notes]
+        parts = [_paragraph(section.title, width)] if section.title else []
+        parts += [*(_paragraph(sentence, width) for sentence in section.sentences), *section.lines]
+        parts += [_text_table(*aligned_lines(section), columns)] if section.frame is not None else []
+        parts += [_paragraph(note, width) for note in section.notes]
         blocks += ["\n".join(parts)] if parts else []
     return "\n\n".join(blocks)
 
 
-def _paragraph(sentence: str) -> str:
+def _paragraph(sentence: str, width: int) -> str:
     """Wrap a sentence; one that begins with a hyphen hangs, one with line ends is drawn already."""
-    return sentence if "\n" in sentence else wrapped(sentence, hanging="  " if sentence.startswith("- ") else "")
+    if "\n" in sentence:
+        return sentence
+    return wrapped(sentence, hanging="  " if sentence.startswith("- ") else "", width=width)
 
 
-def _text_table(lines: list[list[str]], sides: str) -> str:
+def _text_table(lines: list[list[str]], sides: str, columns: int | None = None) -> str:
     if not any(lines[0]):
-        return "\n".join(wrapped(f"{label:{LABEL}} {text}", hanging=" " * (LABEL + 1)) for label, text in lines[1:])
+        width, hanging = min(WIDTH, columns or WIDTH), " " * (LABEL + 1)
+        return "\n".join(wrapped(f"{label:{LABEL}} {text}", "", hanging, width) for label, text in lines[1:])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    formats = [f"{'<' if side == 'l' else '>'}{width}" for side, width in zip(sides, widths, strict=True)]
-    header, *body = ("  ".join(map(format, row, formats)).rstrip() for row in lines)
-    return "\n".join([header, "-" * (sum(widths) + 2 * (len(widths) - 1)), *body])
+    # Columns that stand closer may fit where they would not otherwise.
+    gap = 1 if columns and _width(widths, 1) <= columns < _width(widths, 2) else 2
+    blocks = []
+    for part in _parts(widths, sides, gap, columns):
+        formats = [f"{'<' if sides[k] == 'l' else '>'}{widths[k]}" for k in part]
+        header, *body = ((" " * gap).join(map(format, (row[k] for k in part), formats)).rstrip() for row in lines)
+        blocks.append("\n".join([header, "-" * _width([widths[k] for k in part], gap), *body]))
+    return "\n\n".join(blocks)
+
+
+def _parts(widths: Sequence[int], sides: str, gap: int, columns: int | None) -> Iterator[list[int]]:
+    """Yield which columns of a table stand side by side in a terminal; those that name the rows come in every part."""
+    keys = list(range(max(1, sides.find("r", 1))))
+    part = keys
+    for k in range(len(keys), len(widths)):
+        if columns and part != keys and _width([widths[i] for i in (*part, k)], gap) > columns:
+            yield part
+            part = keys
+        part = [*part, k]
+    yield part
+
+
+def _width(widths: Sequence[int], gap: int) -> int:
+    return sum(widths) + gap * (len(widths) - 1)
 
 
 def render_markdown(sections: Iterable[Section]) -> str:

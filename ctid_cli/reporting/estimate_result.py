@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 class EstimateResult(Result):
     """One stored estimate: its parameters with their uncertainty, its status, and what it was computed from."""
 
+    schema = "ctid-estimate-1"
+
     found: FoundEstimate
 
     @property

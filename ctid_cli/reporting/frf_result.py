@@ -29,6 +29,8 @@ METHODS = {
 class FrequencyResponseResult(Result):
     """A frequency response with the records that it was estimated from."""
 
+    schema = "ctid-frf-1"
+
     found: FrequencyResponse
     records: Records
 

@@ -28,6 +28,8 @@ FORMATS = {**dict.fromkeys(("fit %", "validation %"), ".2f"), "criterion": "+.1f
 class OrderSearchResult(Result):
     """The structures of a choice with the records that they were fitted to."""
 
+    schema = "ctid-order-1"
+
     choice: Choice
     judged: Sequence[JudgedCandidate]
     records: Records

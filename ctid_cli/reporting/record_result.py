@@ -50,6 +50,8 @@ class Finding(NamedTuple):
 class RecordCheckResult(Result):
     """Facts on a measured record, and the command that identifies a model of it."""
 
+    schema = "ctid-check-1"
+
     measurement: Measurement
     facts: RecordFacts
     #: None where no model can be identified.

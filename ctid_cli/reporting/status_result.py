@@ -38,6 +38,8 @@ _STATES = {"enough": "precise enough", "open": "goes on", "at_most": "at_most re
 class StatusResult(Result):
     """How much of one experiment is done, how well its measures are known, and what went wrong."""
 
+    schema = "ctid-status-1"
+
     status: ExperimentStatus
     out: Path
     #: None where the estimates were not read.
@@ -248,6 +250,8 @@ def _excess(cell: CellPrecision) -> float:
 class VerificationResult(Result):
     """Whether what is stored of an experiment is what was written."""
 
+    schema = "ctid-verify-1"
+
     found: Verification
     out: Path
 
@@ -269,6 +273,8 @@ class VerificationResult(Result):
 @dataclass(frozen=True, eq=False)
 class MergeResult(Result):
     """What a merge of shards has made."""
+
+    schema = "ctid-merge-1"
 
     merged: Merged
     out: Path
@@ -295,6 +301,8 @@ class MergeResult(Result):
 @dataclass(frozen=True, eq=False)
 class ValidationResult(Result):
     """How much work a specification without mistakes asks for."""
+
+    schema = "ctid-validate-1"
 
     file: Path
     experiment: str

@@ -36,6 +36,8 @@ TURN = 2.0 * math.pi
 class TrackResult(Result):
     """Tones over time, with the signal that they were found in, where it is known."""
 
+    schema = "ctid-track-1"
+
     track: Track
     signal: SampledSignal | None = None
     #: Largest standard error of a valid row that was asked for [Hz].

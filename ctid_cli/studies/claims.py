@@ -51,6 +51,8 @@ def near(claim: str, value: float | None, target: float, tolerance: float) -> Cl
 class CheckedClaims(Result):
     """The claims of a study, tested on its results."""
 
+    schema = "ctid-claims-1"
+
     results: StudyResults
     claims: Sequence[Claim]
 

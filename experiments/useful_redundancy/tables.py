@@ -64,7 +64,7 @@ def searches_table(found: StudyResults) -> list[Section]:
     rows = pd.concat([searches(results) for results in found.experiments.values()], ignore_index=True)
     searched = rows["search_percent"].notna()
     shown = pd.DataFrame({"experiment": rows["experiment"].map(last_part), "SNR": rows["snr_db"].map("{:g} dB".format)})
-    steps = rows["max_delay_step"].map("{:g} s".format, na_action="ignore").fillna("")
+    steps = rows["max_delay_step"].map("{:g} s".format, na_action="ignore").astype(object).fillna("")
     shown = shown.assign(method=rows["method"], **{"longest step": steps}, n=rows["n"])
     shown["converged"] = rows["percent"].map("{:.0f} %".format)
     shown["search alone"] = rows["search_percent"].map("{:.0f} %".format).where(searched, "")
