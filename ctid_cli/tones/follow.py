@@ -75,11 +75,17 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
 
 
 def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
-    """Join paths whose median frequencies are within one bin of their windows: the rows of the stronger one count."""
+    """Join paths within one bin of their windows: the rows of the stronger one count.
+
+    Those that are mostly there at once are compared then, others by their medians.
+    """
     merged: list[IndexArray] = []
     for path in paths:
         for k, other in enumerate(merged):
-            apart = abs(float(np.median(found.omega[path]) - np.median(found.omega[other])))
+            both_there, one, two = np.intersect1d(found.row[path], found.row[other], return_indices=True)
+            apart = abs(_centre(found, path) - _centre(found, other))
+            if 2 * both_there.size > path.size:
+                apart = float(np.median(np.abs(found.omega[path[one]] - found.omega[other[two]])))
             window = min(float(np.median(found.window[path])), float(np.median(found.window[other])))
             if apart * window < 2.0 * np.pi:
                 new = path[~np.isin(found.row[path], found.row[other])]
@@ -89,6 +95,11 @@ def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
         else:
             merged.append(path)
     return merged
+
+
+def _centre(found: Readings, path: IndexArray) -> float:
+    """Return the median frequency of the surer half of the readings of a path [rad/sample]."""
+    return float(np.median(found.omega[path][found.error[path] <= np.median(found.error[path])]))
 
 
 def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:

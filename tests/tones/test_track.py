@@ -115,6 +115,7 @@ def test_three_tones_that_short_windows_tell_apart_are_no_comb():
 def test_crossing_tones_keep_their_columns():
     up, down = 60.0 + 10.0 * T, 100.0 - 10.0 * T
     track = follow(tone(up) + tone(down, 0.5, 1.0), 2)
+    assert (track.valid.mean(axis=0) > 0.9).all()
     rising = int(np.nanmean(track.rate[:, 0]) < np.nanmean(track.rate[:, 1]))
     assert wrong(track, rising, up) + wrong(track, 1 - rising, down) == 0
     sure = track.valid[:, rising]
