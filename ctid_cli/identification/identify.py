@@ -85,5 +85,7 @@ def identify(
         # Refused before the fit takes its time.
         laid_out_for(other, choice.options, given)
     found = identification.identify(choice.options, choice.records, None, *noise)
-    found = with_warnings(replace(found, choices=choice.sentences))
-    return found if other is None else replace(found, validation=judged_on(other, choice.options, found.fit, given))
+    found = replace(found, choices=choice.sentences)
+    if other is not None:
+        found = replace(found, validation=judged_on(other, choice.options, found.fit, given))
+    return with_warnings(found)

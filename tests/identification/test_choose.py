@@ -116,6 +116,11 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     assert found.validation.fit_percent > 85
 
 
+def test_a_chosen_model_that_does_not_carry_over_is_said():
+    other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
+    assert "it does not carry over" in identify(record_of(SECOND), validation=other).warnings[0]
+
+
 def test_no_response_is_no_model():
     noise = record_of(SECOND)
     noise = Record(noise.t, np.random.default_rng(5).standard_normal(600), noise.input)
