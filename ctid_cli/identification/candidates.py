@@ -19,7 +19,7 @@ from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
 MOST_POLES = 12
-#: The grid ends at so many poles more than the best structure has, and not before the second number.
+#: The grid ends this many poles above the order of the best structure, and at this order at the least.
 BEYOND, FEWEST_TRIED = 2, 4
 #: From then on a number of integrators whose best structure is so far behind is left out.
 BEHIND = 30.0
@@ -57,7 +57,7 @@ class Span(NamedTuple):
         return cls((poles, poles), (zeros, zeros), (options.integrators,))
 
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
-        """Yield poles and zeros of all structures with so many poles in all."""
+        """Yield poles and zeros of all structures of an order, integrators included."""
         poles = order - integrators
         if max(self.poles[0], int(not integrators)) <= poles <= self.poles[1]:
             for zeros in range(self.zeros[0], min(self.zeros[1], order - int(delay_free)) + 1):

@@ -34,8 +34,8 @@ from ctid_cli.signals.record import Record
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
-#: The range of the delay reaches so many times beyond that of a small model, and so many samples further: the delay of
-#: a model with too few poles is too long.
+#: The range of the delay ends at this multiple of the delay of a small model, plus this number of sampling intervals:
+#: the delay of a model with too few poles is too long.
 REACH, FURTHER = 1.5, 3
 #: A delay beyond this share of the range is at its end.
 AT_END = 0.9

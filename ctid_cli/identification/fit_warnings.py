@@ -150,17 +150,19 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
     """What residuals and record show beside the model."""
     if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
         yield f"{what}: the model misses a part of the response"
-    if "loss" not in mended and (what := _outliers(found)):
-        yield what
+    outliers = _outliers(found)
+    if outliers and "loss" not in mended:
+        yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
         yield f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value, as at a limit"
     fit = found.fit.linear
-    for k, (record, use) in enumerate(_used(found)):
+    # Of residuals with outliers nothing else is told.
+    for k, (record, use) in enumerate(_used(found) if not outliers else ()):
         e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
         acting = found.options._acting(record)
         seen = input_dependence(e, record.y[use] - e, psi, t, acting, fit.model.delay)
-        if seen is None or _outliers(found) or seen.feedback_share < FEEDBACK_SHARE:
+        if seen is None or seen.feedback_share < FEEDBACK_SHARE:
             continue
         # Dynamics that are missed may leave something for later inputs to tell.
         if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):

@@ -17,8 +17,9 @@ from ctid_cli.signals.treatment import InitialState, InputBefore
 #: Share of the range of the input that it must still cross after the greatest delay, for an estimated state to leave
 #: the gain determined.
 EXCITED = 0.5
-#: Of an input that changes so seldom, the first change must leave so many samples after the greatest delay, and as many
-#: as there are before it: with 10 an estimated state had 30 times the error of rest, with 1 a hundred thousand times.
+#: A state is estimated beside an input that changes only a few times if its first change comes after at least this
+#: number of samples, and not before the greatest delay has passed. With a lead of 10 samples an estimated state had 30
+#: times the error of rest, with a lead of 1 a hundred thousand times.
 LEAD = 10
 #: Rest is refused where the first samples are, with it, this unlikely: to estimate a state in vain costs little.
 UNLIKELY = 1e-2

@@ -26,7 +26,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(records: Sequence[Record], most: int) -> Parts:
-    """Return parts with so many samples in all."""
+    """Return parts with at most this number of samples in all."""
     found = [_part(record, most // len(records)) for record in records]
     return Parts([record for record, _ in found], all(from_start for _, from_start in found))
 

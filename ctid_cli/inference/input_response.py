@@ -37,8 +37,6 @@ FIRST_ORDER = 12.7
 CERTAIN, CERTAIN_FRACTION = 5.0, 0.3
 #: Before that, a response may have begun where it is above this many standard deviations.
 DOUBTFUL = 3.0
-#: A response of the input to the output that is this many standard deviations of chance is none.
-FED_BACK = 8.0
 #: An input repeats itself where its correlation with its own past is above this.
 REPEATS = 0.3
 
@@ -74,22 +72,11 @@ class InputResponse:
 
     #: Frequency below which 95 % of the response lies [rad/s]; the Nyquist frequency where no response is seen.
     bandwidth: float
-    #: Highest frequency at which output and input are coherent [rad/s]; nan where they are nowhere.
-    visible_up_to: float = math.nan
-    explained: float = math.nan
     #: Frequencies between which 95 % of the power of the input lies [rad/s].
     input_band: tuple[float, float] = (math.nan, math.nan)
     delay: DelayHint | None = None
     #: Time after which the input repeats itself [s]; nan where it does not.
     period: float = math.nan
-    #: Greatest response of the input to the output, that is at negative lags, over the standard deviation of what
-    #: chance gives [-]; nan where it cannot be told. Feedback shows here.
-    before: float = math.nan
-
-    @property
-    def fed_back(self) -> bool:
-        """Whether the input seems to respond to the output."""
-        return self.before > FED_BACK and self.delay is not None and self.before >= 0.2 * self.delay.strength
 
 
 def output_bandwidth(record: Record) -> float:
@@ -123,12 +110,11 @@ def analyse_response(record: Record, moves: InputMoves | None = None) -> InputRe
     # Of those that show the response at all, whatever alignment shows it at the highest frequency is right there.
     spectra = [s for s in spectra if s.explained > 0.5 * best.explained]
     bandwidth = max((b for s in spectra for b in s.bandwidths), default=math.nan)
-    if math.isfinite(bandwidth):
-        visible, bandwidths = max(s.visible_up_to for s in spectra), best.bandwidths
-    else:
-        bandwidth, visible, bandwidths = nyquist, math.nan, (nyquist,)
+    bandwidths = best.bandwidths
+    if math.isnan(bandwidth):
+        bandwidth, bandwidths = nyquist, (nyquist,)
     timing = _delay_and_period(grid, bandwidths, moves)
-    return InputResponse(min(bandwidth, nyquist), visible, best.explained, best.input_band, *timing)
+    return InputResponse(min(bandwidth, nyquist), best.input_band, *timing)
 
 
 def regular_grid(record: Record) -> Grid:
@@ -219,11 +205,6 @@ class _Spectra:
         return tuple(self._quantile(power, SHARE) for power in (self.answer, gain) if power.any())
 
     @property
-    def visible_up_to(self) -> float:
-        seen = np.flatnonzero(self.answer > 0)
-        return float(self.edges[seen[-1] + 1]) if seen.size else math.nan
-
-    @property
     def input_band(self) -> tuple[float, float]:
         tail = (1 - SHARE) / 2
         k = int(np.searchsorted(np.cumsum(self.input_power), tail * self.input_power.sum()))
@@ -265,10 +246,8 @@ def _filtered(x: Array, coefficients: Array) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, n) * np.fft.rfft(coefficients, n), n)[: x.size], dtype=float)
 
 
-def _delay_and_period(
-    grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves
-) -> tuple[DelayHint | None, float, float]:
-    """Delay, period of the input, and the greatest response before the input.
+def _delay_and_period(grid: Grid, bandwidths: tuple[float, ...], moves: InputMoves) -> tuple[DelayHint | None, float]:
+    """Delay, and period of the input.
 
     The correlation of the whitened input with the equally filtered output is the impulse response in noise. The
     output does not respond before the input moves, so negative lags show what chance gives.
@@ -284,7 +263,7 @@ def _delay_and_period(
         y = np.where(holes, 0.0, y)
     power = math.sqrt(float(np.mean(u**2) * np.mean(y**2)))
     if power == 0.0:
-        return None, math.nan, math.nan
+        return None, math.nan
     own = _cross_correlation(u, u, n // 2)[n // 2 :] / float(np.mean(u**2))
     again = np.flatnonzero(own[4 * hold :] > REPEATS)
     # The response to a periodic input is periodic too: every lag within one period shows it, or its tail.
@@ -295,13 +274,12 @@ def _delay_and_period(
     slowest = math.pi / (4 * min(bandwidths) * h)
     pictures = list(_pictures(r, longest, slowest, reference, 4 if period else 1))
     if not pictures:
-        return None, period * h or math.nan, math.nan
+        return None, period * h or math.nan
     # The sharpest picture that is clear enough, else the clearest.
     clearest = max(pictures, key=lambda picture: picture.strength)
     found = next((p for p in pictures if p.strength > max(2 * CERTAIN, 0.5 * clearest.strength)), clearest)
-    before = math.nan if period else found.before
     hint = found.onset(4 * math.ceil(slowest), h) if found.strength >= CERTAIN else None
-    return hint, period * h or math.nan, before
+    return hint, period * h or math.nan
 
 
 def _pictures(r: Array, longest: int, slowest: float, reference: slice, parts: int) -> Iterator[_Picture]:
@@ -331,10 +309,6 @@ class _Picture:
     @property
     def strength(self) -> float:
         return float(self.after.max())
-
-    @property
-    def before(self) -> float:
-        return float(np.abs(self.z[: max(self.longest - self.width, 1)]).max())
 
     def onset(self, pause: int, interval: float) -> DelayHint:
         """Where the response that holds the peak begins, which no pause of ``pause`` lags interrupts."""

@@ -33,7 +33,7 @@ HIGHEST_ORDER = 50
 MOST_SAMPLES = 5000
 #: Fewer samples than this show no response beside noise.
 FEWEST_SAMPLES = 50
-#: An offset of so many deviations of the output needs no test.
+#: An offset of more standard deviations of the output than this needs no test.
 FAR = 1000.0
 #: Quantiles between which the others lie where gross errors are left out.
 TAILS = (0.01, 0.99)

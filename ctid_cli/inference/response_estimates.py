@@ -20,7 +20,7 @@ SHARE = 1 - math.exp(-1)
 #: The response between two samples is not seen: intervals of the response time are longer by this share of the sampling
 #: interval on each side. Without it they held the truth in 90 % of 200 simulated records, with it in 94 % of 400.
 BETWEEN = 0.25
-#: A response is sure at so many standard deviations.
+#: Standard deviations beyond which a response is taken as certain.
 SURE = 5.0
 #: A response has ended where the last quarter of its length changes it by less than this share.
 ENDED = 0.1

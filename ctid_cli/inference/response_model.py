@@ -32,8 +32,8 @@ from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel, fit_residual_noise
 from ctid_cli.inference.response_layout import CONSTANT, INTEGRAL, LINE, START, Layout, Signals, prior_factor
 
-#: Intervals of the impulse response while decay and noise are searched, and afterwards; so many sampling intervals long
-#: are the first third of them.
+#: Number of intervals of the impulse response while decay and noise are searched, and afterwards; the first third of
+#: them are one sampling interval long.
 COARSE, FINE = 60, 120
 #: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
 #: of neighbours.

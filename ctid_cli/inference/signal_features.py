@@ -97,8 +97,8 @@ def _heaps(u: Array, spread: float) -> IntArray | None:
 OUTLIER = 10.0
 #: Neighbours on each side that show how large residuals are about one of them.
 ABOUT = 20
-#: So many samples of one value are a recorder that stood still, if neighbours are otherwise alike this seldom.
-STILL, SELDOM_ALIKE = 6, 0.02
+#: Share of values that come more than once in an output whose single samples at a limit tell as much as runs do.
+SELDOM_ALIKE = 0.02
 #: A part of the record in which an unstable plant grows by less than this is not told from a polynomial in time.
 GROWTH = 4.0
 
@@ -160,22 +160,6 @@ def saturated(y: Array) -> float:
         if in_runs >= fewest and counts[k] > 5 * counts[inner]:
             total += in_runs
     return total / y.size
-
-
-def stood_still(y: Array) -> IntArray:
-    """First and last samples of the runs of one value in an output that else never keeps one, shape (k, 2).
-
-    At rest before the first change, and at a limit of the sensor, an output may keep its value.
-    """
-    alike = np.diff(y) == 0
-    first, last = _runs(alike)
-    long = last - first + 1 >= STILL
-    elsewhere = np.count_nonzero(alike) - int((last - first)[long].sum())
-    inside = long & (first > 0) & (y[first] > y.min()) & (y[first] < y.max())
-    if elsewhere > SELDOM_ALIKE * y.size:
-        inside[:] = False
-    runs: IntArray = np.column_stack((first, last))[inside]
-    return runs
 
 
 def _runs(marked: BoolArray) -> tuple[IntArray, IntArray]:

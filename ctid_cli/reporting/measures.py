@@ -35,7 +35,7 @@ from ctid_cli.reporting.model_measures import distances, pole_errors, system_of
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import base_name
-from ctid_cli.storage.columns import reserved_names
+from ctid_cli.storage.columns import COUNTS, reserved_names
 from ctid_cli.storage.estimates import CLOCKS
 from ctid_cli.storage.groups import places_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
@@ -46,12 +46,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-#: Columns of percentages, with their types.
-COUNTED = {
-    **dict.fromkeys(("n", "failed"), "int64"),
-    "converged": "Int64",
-    **dict.fromkeys(("percent", "low", "high", "published_percent", "median_seconds", "median_cpu_seconds"), "float64"),
-}
 #: Settings that are keys of every row, and their key path in a specification.
 ALWAYS = {"snr_db": "noise.snr_db"}
 #: Statuses of estimates with which nothing is wrong.
@@ -142,12 +136,12 @@ def _counted(results: Results) -> pd.DataFrame:
 
 def with_types(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the counts of cells in their types and order, zero where nothing was run."""
-    counts = frame.reindex(columns=[*COUNTED])
+    counts = frame.reindex(columns=[*COUNTS])
     empty = counts["n"].isna()
     for name in ("n", "failed", "converged"):
         counts[name] = counts[name].mask(empty, 0)
-    counts = counts.astype(COUNTED)
-    return frame.drop(columns=[*COUNTED], errors="ignore").join(counts)
+    counts = counts.astype(COUNTS)
+    return frame.drop(columns=[*COUNTS], errors="ignore").join(counts)
 
 
 def _frequencies(results: Results) -> pd.DataFrame:

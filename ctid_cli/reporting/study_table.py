@@ -12,7 +12,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import delay_label, number, seconds
-from ctid_cli.reporting.measures import COUNTED, percentage_frame, records_of, settings_of, with_types
+from ctid_cli.reporting.measures import percentage_frame, records_of, settings_of, with_types
 from ctid_cli.reporting.results import (
     Results,
     differences,
@@ -39,6 +39,7 @@ from ctid_cli.reporting.table_result import (
     time_of,
 )
 from ctid_cli.specification.load import load_spec
+from ctid_cli.storage.columns import COUNTS
 from ctid_cli.storage.folder import InUseError
 from ctid_cli.text import did_you_mean, listed
 
@@ -156,7 +157,7 @@ def study_frame(study: Study, table: StudyTable, found: Mapping[str, Results]) -
     frame = pd.concat([each for each in cells if len(each)], ignore_index=True)
     frame["table"] = table.number
     frame["sampling"] = frame["experiment"].map({name: one["sampling"] for name, one in study.experiments.items()})
-    first, last = ["table", "experiment", "sampling"], ["initial_delay", "method", *COUNTED]
+    first, last = ["table", "experiment", "sampling"], ["initial_delay", "method", *COUNTS]
     others = [name for name in settings_of(frame) if name not in first]
     return _sorted(study, with_types(frame))[[*first, *others, *last]]
 

@@ -132,7 +132,7 @@ COUNTS = {
     "n": "int64",
     "failed": "int64",
     "converged": "Int64",
-    **dict.fromkeys(("percent", "low", "high", "median_seconds", "median_cpu_seconds"), "float64"),
+    **dict.fromkeys(("percent", "low", "high", "published_percent", "median_seconds", "median_cpu_seconds"), "float64"),
 }
 
 
@@ -142,7 +142,7 @@ OF_MEASURES = ("parameter", "measure", "unit", "value", "error", "without_value"
 
 def reserved_names() -> frozenset[str]:
     """Return names of the columns of estimates and tables; a swept field of such a name is written with its section."""
-    of_tables = ("table", "sampling", "method", "published_percent", *OF_MEASURES)
+    of_tables = ("table", "sampling", "method", *OF_MEASURES)
     return frozenset((*(c.name for c in COLUMNS), *COUNTS, *of_tables))
 
 

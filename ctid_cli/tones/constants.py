@@ -85,7 +85,7 @@ CHANGE_TAIL = 3.6
 FURTHER = 4
 LOBES = 8
 SIDE_LOBE = 0.1
-#: A change of a tone of energy E explains lines of less than E up to so many bins away, and E (bins/d)^2 d bins away.
+#: A change of a tone of energy E explains lines of less than E within this number of bins, and of E (bins/d)^2 at d.
 CHANGED_BINS = 2.0
 
 # --- fit ------------------------------------------------------------------------------------------------------------
@@ -112,10 +112,10 @@ BLOCK_SAMPLES = 2**17
 
 # --- what is left ---------------------------------------------------------------------------------------------------
 
-#: A line of energy E, in units of the noise, d bins from a tone moves its frequency by at most so many sqrt(E)/d
+#: A line of energy E, in units of the noise, d bins from a tone moves its frequency by at most this times sqrt(E)/d
 #: standard errors: slope of the phase that it makes, 3 b/(pi d a), over sqrt(6/N) sigma/a, E = N (b/sigma)^2/4.
 LEAKAGE = 0.78
-#: Readings whose errors are larger than so many times those of the fit are not used.
+#: Greatest ratio of the error of a reading to that of its fit; readings beyond it are not used.
 MOST_RAISED = 20.0
 #: A window that takes no more lines and leaves one of more than this share of a tone's energy says nothing of it.
 COMPARABLE = 0.1
@@ -133,10 +133,10 @@ BENT = 4.0
 MOVES = 2.5
 KINK = 0.27
 HIDDEN_KINK = 18.0
-#: A change of energy E moves the frequency by at most so many sqrt(E) standard errors: the largest ratios for a step of
-#: phase anywhere in the window, and for one of frequency in its middle, computed without noise. A change that noise
-#: shows no more often than this may be there, and is a step of phase at most. What is larger than the last share of the
-#: tone's energy may be of any kind.
+#: A change of energy E moves the frequency by at most these multiples of sqrt(E) standard errors: the largest ratios
+#: for a step of phase anywhere in the window, and for one of frequency in its middle, computed without noise. A change
+#: that noise shows no more often than this may be there, and is a step of phase at most. What is larger than the last
+#: share of the tone's energy may be of any kind.
 STEP = 2.8
 KINKED = 18.1
 DOUBTFUL = 0.1

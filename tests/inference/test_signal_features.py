@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ctid_cli.inference.signal_features import growth_time, outliers, residual_outliers, saturated, stood_still
+from ctid_cli.inference.signal_features import growth_time, outliers, residual_outliers, saturated
 
 
 def test_one_sample_in_twenty_may_be_wild():
@@ -30,16 +30,6 @@ def test_a_few_samples_at_one_limit_are_cut_off():
     assert saturated(np.minimum(y, limit)) == 6 / 400
     # An output at rest before it moves may lie below all that follows.
     assert saturated(np.concatenate((np.full(40, y.min() - 1), y))) == 0
-
-
-def test_a_run_of_one_value_is_a_recorder_that_stood_still():
-    y = np.random.default_rng(2).standard_normal(200)
-    y[50:58] = y[50] / 10
-    np.testing.assert_array_equal(stood_still(y), [[50, 57]])
-    # An output in coarse steps keeps its value everywhere, one at rest before it moves.
-    assert stood_still(np.round(y)).size == 0
-    y[:20] = y[0]
-    np.testing.assert_array_equal(stood_still(y), [[50, 57]])
 
 
 @pytest.mark.parametrize(("grown", "diverges"), [(np.exp, True), (lambda t: t**3, False), (np.sin, False)])
