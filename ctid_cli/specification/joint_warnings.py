@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli.errors import DataError
 from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import Relay
 from ctid_cli.signals.noise import stream
@@ -65,8 +66,12 @@ def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
 def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Complaint]:
     if sampling.input_record != "sampled":
         return
-    times = sampling.times(stream(seed, "sampling", 0))
-    applied = excitation.generate(times, stream(seed, "input", 0))
+    try:
+        times = sampling.times(stream(seed, "sampling", 0))
+        applied = excitation.generate(times, stream(seed, "input", 0))
+    except DataError as error:  # of a case that was not tried
+        yield ("excitation",), f"{error}; estimates of such data sets are stored as FAILED"
+        return
     if applied.hold != "zoh":
         return
     edges = applied.t[1:][np.diff(applied.values) != 0.0]

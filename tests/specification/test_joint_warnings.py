@@ -38,3 +38,9 @@ def test_edges_between_the_samples_of_a_regular_clock(warnings):
     assert float(re.search(r"each change (\S+) s late", said)[1]) == pytest.approx(0.02, abs=0.0011)
     assert warnings("excitation.clock_period=0.24", "sampling.input_record=exact") == []
     assert warnings("excitation={kind: gaussian}") == []
+
+
+def test_a_data_set_that_cannot_be_made_and_was_not_tried(warnings):
+    (said,) = warnings("excitation={kind: step, time: 1e6}", "sampling.input_record=sampled")
+    assert "excitation: the step at 1e+06 s comes too late" in said
+    assert said.endswith("estimates of such data sets are stored as FAILED")
