@@ -20,6 +20,7 @@ from ctid_cli.identification.criterion import Ranking
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
+    changes_at_the_beginning_only,
     excited_after,
     states_of,
     without_beginning,
@@ -80,7 +81,10 @@ class _Choosing:
     """The steps of a choice."""
 
     def __init__(self, records: list[Record], given: Given) -> None:
-        self.records, self.given, self.span = records, given, given.span
+        self.records, self.given = records, given
+        drifts = len(given.span.integrators) > 1 and given.offset != "none" and changes_at_the_beginning_only(records)
+        self.span = given.span._replace(integrators=(0,)) if drifts else given.span
+        self.about_span = [sentences.NO_INTEGRATOR] if drifts else []
         whole = given.initial_state == "periodic"
         self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
         self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
@@ -109,7 +113,7 @@ class _Choosing:
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
         measured = best.options.prepare(fitted).laid_out
         answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
-        said = [*self.said, *sentences.of_grid(ranking, delays, self.given)]
+        said = [*self.said, *self.about_span, *sentences.of_grid(ranking, delays, self.given)]
         said += [sentences.of_criterion(ranking)] * bool(said)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
         return Choice(options, held, fitted, ranking, answer, tuple(said))

@@ -16,6 +16,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.inference.covariance import LARGEST_CONDITION
 from ctid_cli.inference.criteria import (
     InformationCriteria,
     information_criteria,
@@ -58,6 +59,11 @@ class Candidate:
     criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
 
     @property
+    def is_determined(self) -> bool:
+        """Whether the data determine its parameters: without that it has no standard errors."""
+        return self.fit.condition_number <= LARGEST_CONDITION
+
+    @property
     def name(self) -> str:
         """Poles and zeros, and integrators if there are any, for example ``2/1`` or ``1/0 + 1``."""
         integrators = f" + {self.options.integrators}" if self.options.integrators else ""
@@ -66,14 +72,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Candidates, the least criterion first, and the noise model that they share."""
+    """Candidates, the least criterion first and those whose parameters the data do not determine last; their noise."""
 
     candidates: tuple[Candidate, ...]
     noise: NoiseModel
 
     @property
     def best(self) -> Candidate:
-        """The candidate of the least criterion."""
+        """The first candidate."""
         return self.candidates[0]
 
     def of(self, **options: object) -> "Ranking | None":
@@ -97,7 +103,9 @@ class Ranking:
 def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Return candidates by their criterion; all must have been fitted to the same samples."""
     noise = noise_of(min(candidates, key=lambda each: each.fit.cost).fit.residuals)
-    judged = sorted((_judged(each, noise) for each in candidates), key=lambda each: each.criterion)
+    judged = sorted(
+        (_judged(each, noise) for each in candidates), key=lambda each: (not each.is_determined, each.criterion)
+    )
     return Ranking(tuple(judged), noise)
 
 

@@ -65,6 +65,11 @@ def excited_after(records: Sequence[Record], delay: float) -> bool:
     return True
 
 
+def changes_at_the_beginning_only(records: Sequence[Record]) -> bool:
+    """Whether all inputs are constant but for the first samples: an integrator then answers as a drift does."""
+    return all(np.ptp(record.input.at(record.t[LEAD:])) == 0.0 for record in records if record.t.size > LEAD)
+
+
 def without_beginning(records: Sequence[Record], length: float) -> list[Record]:
     """Return records whose first samples, up to a length [s], are marked as missing."""
     return [

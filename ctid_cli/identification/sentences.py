@@ -11,6 +11,13 @@ STATE_OF_PART = (
 )
 
 
+#: What is said where an integrator is no candidate.
+NO_INTEGRATOR = (
+    "Integrators: not tried, as the input changes at the beginning only, where the response of an integrator is that "
+    "of a drift (--integrators 1 --offset none tries one)."
+)
+
+
 def spelled(candidate: Candidate) -> str:
     """Return a structure in words."""
     options = candidate.options
