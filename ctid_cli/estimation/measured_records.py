@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
@@ -27,12 +27,14 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
+from ctid_cli.inference.innovations import SampledNoise
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
@@ -296,6 +298,18 @@ class MeasuredRecords:
             records.append(data._replace(y=y))
         other = copy(self)
         other.problem = self.problem._replace(records=tuple(records))
+        return other
+
+    @cached_property
+    def steps(self) -> list[IntArray]:
+        """Intervals of the clock from each used sample of each record to the next, 0 at the first one."""
+        places = [np.flatnonzero(use) for use in self.used()]
+        return [np.diff(place, prepend=place[0]) for place in places]
+
+    def whitened_by(self, noise: ArmaNoise) -> "MeasuredRecords":
+        """The same where errors count by their innovations under a noise."""
+        other = copy(self)
+        other.problem = self.problem._replace(noises=tuple(SampledNoise(noise, steps) for steps in self.steps))
         return other
 
     def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "MeasuredRecords":
