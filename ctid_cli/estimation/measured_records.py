@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
@@ -27,7 +27,7 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
-from ctid_cli.inference.innovations import SampledNoise
+from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure
@@ -300,20 +300,18 @@ class MeasuredRecords:
         other.problem = self.problem._replace(records=tuple(records))
         return other
 
-    @cached_property
-    def steps(self) -> list[IntArray]:
-        """Intervals of the clock from each used sample of each record to the next, 0 at the first one."""
-        places = [np.flatnonzero(use) for use in self.used()]
-        return [np.diff(place, prepend=place[0]) for place in places]
-
     def whitened_by(self, noise: ArmaNoise) -> "MeasuredRecords":
         """The same where errors count by their innovations under a noise."""
         other = copy(self)
-        other.problem = self.problem._replace(noises=tuple(SampledNoise(noise, steps) for steps in self.steps))
+        other.problem = self.problem._replace(noises=sampled(noise, self.used()))
         return other
 
-    def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "MeasuredRecords":
-        """The records whose least squares are, near the estimate, what its loss is."""
+    def near(
+        self, errors: Sequence[Array], weighting: Weighting | None, noise: ArmaNoise | None = None
+    ) -> "MeasuredRecords":
+        """The records whose least squares are, near the estimate, what its loss or likelihood is."""
+        if noise is not None:
+            return self.whitened_by(noise)
         if weighting is None:
             return self
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
@@ -367,7 +365,9 @@ class MeasuredRecords:
         found = sensitivities(self.problem, layout, theta, model.delay)
         for k, (psi, eps) in enumerate(found):
             own = slice(layout.first(k), layout.first(k) + layout.own)
-            theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
+            noises = self.problem.noises
+            weigh = noises[k].whitened if noises else np.asarray
+            theta[own] = np.linalg.lstsq(weigh(psi[:, own]), weigh(eps))[0]
             bridged = self.problem.records[k].y_used
             residuals.append(eps - psi[:, own] @ theta[own] + (self.outputs[k] - bridged))
         slopes = tuple(psi for psi, _ in found)

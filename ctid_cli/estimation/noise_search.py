@@ -1,19 +1,18 @@
 r"""Plant and ARMA noise of the greatest joint likelihood, from the least output error.
 
 Given the noise, the least squares of the innovations have the plant; given the plant, the output errors have the noise.
-Either step raises the likelihood. In open loop the information of both is block-diagonal, so that a few rounds do.
+Either step raises the likelihood, and where neither does any more its slope by all parameters is zero. In open loop
+the information on both is block-diagonal, so that a few rounds do.
 """
 
 from typing import NamedTuple
 
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum
-from ctid_cli.inference.innovations import NoiseFit, Orders, choose_arma, fit_arma
+from ctid_cli.inference.innovations import NoiseFit, Orders, choose_arma, fit_arma, steps_of
 
-#: The estimate has settled where a round lowers ``-2 ln L`` by less, and most rounds.
-SETTLED, MOST_ROUNDS = 1e-8, 40
-#: Most choices of the orders.
-MOST_CHOICES = 4
+#: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds, and most choices of orders.
+SETTLED, MOST_ROUNDS, MOST_CHOICES = 1e-8, 40, 4
 
 
 class JointOptimum(NamedTuple):
@@ -24,30 +23,34 @@ class JointOptimum(NamedTuple):
 
 
 def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
-    """Return plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC."""
-    if orders is not None:
-        return _of_orders(measured, found, fit_arma(_errors(measured, found), measured.steps, orders))
-    chosen = choose_arma(_errors(measured, found), measured.steps)
+    """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC."""
+    joint = JointOptimum(found, _noise_of(measured, found, orders))
     for _ in range(MOST_CHOICES):
-        joint = _of_orders(measured, found, chosen)
+        joint = _settled(measured, joint)
+        if orders is not None:
+            break
         # The output-error fit has taken a part of the noise with it.
-        chosen = choose_arma(_errors(measured, joint.found), measured.steps)
+        chosen = _noise_of(measured, joint.found, None)
         if chosen.orders == joint.noise.orders:
             break
-        found = joint.found
+        joint = JointOptimum(joint.found, chosen)
     return joint
 
 
-def _errors(measured: MeasuredRecords, found: Optimum) -> list:
-    return [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
+def _noise_of(measured: MeasuredRecords, found: Optimum, orders: Orders | None, *near: NoiseFit) -> NoiseFit:
+    """Noise of the output errors of a plant."""
+    errors = [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
+    steps = [steps_of(use) for use in measured.used()]
+    return choose_arma(errors, steps) if orders is None else fit_arma(errors, steps, orders, *near)
 
 
-def _of_orders(measured: MeasuredRecords, found: Optimum, noise: NoiseFit) -> JointOptimum:
-    for _ in range(MOST_ROUNDS):
+def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
+    """Plant and noise in turn, until the likelihood rises no further."""
+    found, noise = joint
+    for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
         found = measured.whitened_by(noise.noise).local((found.denominator, found.delay))
-        following = fit_arma(_errors(measured, found), measured.steps, noise.orders, noise)
-        settled = noise.deviance - following.deviance < SETTLED
-        noise = following
+        following = _noise_of(measured, found, noise.orders, noise)
+        settled, noise = noise.deviance - following.deviance < SETTLED, following
         if settled:
             break
     return JointOptimum(found, noise)

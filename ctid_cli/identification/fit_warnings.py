@@ -67,7 +67,7 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
     others = list(_of_residuals(found, mended))
     if not named:
         # Of an estimate that will change, neither its search nor its errors need to be known.
-        others += [*_of_fit(fit, tried), *_of_search(fit), *_of_uncertainty(found)]
+        others += [*_of_noise(fit), *_of_fit(fit, tried), *_of_search(fit), *_of_uncertainty(found)]
     failed = list(_of_validation(found))
     return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
 
@@ -156,7 +156,8 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
         yield f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value, as at a limit"
-    fit = found.fit.linear
+    # What acts on output errors is told from these, whose colour is taken into account.
+    fit = found.fit if found.fit.noise is not None else found.fit.linear
     # Of residuals with outliers nothing else is told.
     for k, (record, use) in enumerate(_used(found) if not outliers else ()):
         e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
@@ -175,6 +176,13 @@ def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
     if fit.fit_percent < LOW_FIT and fit.weighting is None:
         what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
         yield f"{what}; tried without gain: {', '.join(tried.without_gain)}" if tried.without_gain else what
+
+
+def _of_noise(fit: MeasuredFit) -> Iterator[str]:
+    """That the estimate depends on how the noise is modelled."""
+    if fit.noise is not None and fit.noise.differs:
+        what = "The output-error fit and the fit with the noise model differ by more than chance gives"
+        yield f"{what} (Hausman's test, p = {fit.noise.test.p_value:.2g}): the model of the plant or of the noise is too small"
 
 
 def _of_search(fit: MeasuredFit) -> Iterator[str]:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ctid_cli.arrays import Array, IntArray
+from ctid_cli.arrays import Array, BoolArray, IntArray
 from ctid_cli.inference.noise_model import levinson
 from ctid_cli.signals.noise import ArmaNoise
 
@@ -35,6 +35,10 @@ FARTHEST = 7.0
 #: Lags of the autoregression whose residuals start Hannan and Rissanen's regression, for each coefficient, and at
 #: least this number of samples for each lag.
 LONG_LAGS, SAMPLES_PER_LAG = 10, 10
+#: Relative falls of the scaled squares at which a fit has ended, the rough ones where orders are compared; evaluations.
+EXACT, ROUGH, EVALUATIONS = 1e-12, 1e-6, 40
+#: Step of differences by the transformed partial correlations.
+DIFFERENCE = 1e-5
 
 
 @njit(cache=True, nogil=True)
@@ -130,14 +134,23 @@ class SampledNoise:
         return found
 
 
+def steps_of(used: BoolArray) -> IntArray:
+    """Intervals of a regular clock from each used sample to the next, 0 at the first one."""
+    places = np.flatnonzero(used)
+    return np.diff(places, prepend=places[:1])
+
+
+def sampled(noise: ArmaNoise, used: Sequence[BoolArray]) -> tuple[SampledNoise, ...]:
+    """The noise at the used samples of records with regular clocks."""
+    return tuple(SampledNoise(noise, steps_of(use)) for use in used)
+
+
 class NoiseFit(NamedTuple):
     """ARMA noise of the greatest likelihood."""
 
     noise: ArmaNoise
     #: ``-2 ln L`` but for a constant.
     deviance: float
-    #: Derivatives of the scaled innovations by the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (N, P + Q).
-    slopes: Array
     count: int
 
     @property
@@ -150,75 +163,55 @@ class NoiseFit(NamedTuple):
         """Schwarz's criterion, the coefficients of the noise alone being counted."""
         return self.deviance + sum(self.orders) * float(np.log(self.count))
 
-    @property
-    def covariance(self) -> Array:
-        """Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``; that of a common factor is large."""
-        return np.asarray(self.noise.innovation_variance * np.linalg.pinv(self.slopes.T @ self.slopes))
-
 
 class _Likelihood:
-    """Least squares that have the likelihood, by the transformed partial correlations of D and C."""
+    """Least squares that have the likelihood, by the transformed partial correlations z of D and C."""
 
-    def __init__(self, errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders, tolerance=1e-12) -> None:
-        self.errors, self.steps, self.orders, self.tolerance = errors, steps, orders, tolerance
+    def __init__(self, errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders) -> None:
+        self.errors, self.steps, self.orders = errors, steps, orders
         self.count = sum(e.size for e in errors)
-
-    def polynomials(self, z: Array) -> tuple[Array, Array]:
-        """D and C in rising powers of q^-1."""
-        partial = np.tanh(z)
-        return levinson(partial[: self.orders[0]])[0], levinson(partial[self.orders[0] :])[0]
 
     def noise(self, z: Array, variance: float = 1.0) -> ArmaNoise:
         """The model with some innovation variance."""
-        d, c = self.polynomials(z)
-        return ArmaNoise(tuple(c.tolist()), tuple(d.tolist()), innovation_variance=variance)
+        d, c = (levinson(part)[0].tolist() for part in np.split(np.tanh(z), [self.orders[0]]))
+        return ArmaNoise(tuple(c), tuple(d), innovation_variance=variance)
 
-    def scaled(self, z: Array) -> Array:
-        """Innovations over their standard deviations, times ``|V|^(1/2N)``."""
+    def innovations(self, z: Array) -> tuple[Array, float]:
+        """Innovations over their standard deviations, and ``ln|V|``."""
         noise, parts, logarithm = self.noise(z), [], 0.0
         for e, steps in zip(self.errors, self.steps, strict=True):
             whitener = Whitener(noise, 1)
             parts.append(whitener(e[None].copy(), steps)[0])
             logarithm += whitener.logarithm
-        return np.asarray(np.concatenate(parts) * np.exp(logarithm / (2 * self.count)))
+        return np.concatenate(parts), logarithm
 
-    def found(self, starts: Sequence[Array]) -> NoiseFit:
-        """The best of the minima that some starts lead to."""
-        from scipy.optimize import least_squares  # slow to import
+    def scaled(self, z: Array) -> Array:
+        """The same times ``|V|^(1/2N)``."""
+        white, logarithm = self.innovations(z)
+        return np.asarray(white * np.exp(logarithm / (2 * self.count)))
 
-        if not sum(self.orders):
-            squared, slopes, z = float(np.sum(self.scaled(np.zeros(0)) ** 2)), np.zeros((self.count, 0)), np.zeros(0)
-        else:
-            bounded = [np.clip(start, -0.99 * FARTHEST, 0.99 * FARTHEST) for start in starts]
-            options = {"bounds": (-FARTHEST, FARTHEST), "x_scale": "jac", "ftol": self.tolerance, "xtol": 1e-8, "gtol": 1e-12, "max_nfev": 40}
-            ends = [least_squares(self.scaled, start, **options) for start in bounded]
-            best = min(ends, key=lambda end: float(end.cost))
-            squared, z = 2.0 * float(best.cost), best.x
-            slopes = best.jac @ np.linalg.pinv(self._coefficient_slopes(z))
-        deviance = self.count * float(np.log(squared / self.count))
-        # The scaled sum of squares has ln|V| in it; the innovations' variance has not.
-        noise = self.noise(z)
-        white = sum(
-            float(np.sum(SampledNoise(noise, s).whitened(e) ** 2)) for e, s in zip(self.errors, self.steps, strict=True)
-        )
-        scale = np.sqrt(white / squared)
-        return NoiseFit(self.noise(z, white / self.count), deviance, slopes * scale, self.count)
+    def found(self, z: Array, tolerance: float) -> NoiseFit:
+        """The minimum that a start leads to."""
+        if z.size:
+            from scipy.optimize import least_squares  # slow to import
 
-    def _coefficient_slopes(self, z: Array) -> Array:
-        """Derivatives of the coefficients by z, shape (P + Q, P + Q)."""
-        p, partial = self.orders[0], np.tanh(z)
-        slopes = np.zeros((z.size, z.size))
-        slopes[:p, :p] = levinson(partial[:p])[1][:, 1:].T
-        slopes[p:, p:] = levinson(partial[p:])[1][:, 1:].T
-        return slopes * (1.0 - partial**2)
+            start, bounds = np.clip(z, -0.99 * FARTHEST, 0.99 * FARTHEST), (-FARTHEST, FARTHEST)
+            limits = {"ftol": tolerance, "xtol": 1e-8, "gtol": 1e-12, "max_nfev": EVALUATIONS}
+            z = least_squares(self.scaled, start, bounds=bounds, x_scale="jac", **limits).x
+        white, logarithm = self.innovations(z)
+        variance = float(white @ white) / self.count
+        return NoiseFit(self.noise(z, variance), self.count * float(np.log(variance)) + logarithm, self.count)
 
 
-def fit_arma(errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders, *near: NoiseFit, tolerance=1e-12) -> NoiseFit:
+def fit_arma(
+    errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders, *near: NoiseFit, tolerance: float = EXACT
+) -> NoiseFit:
     """ARMA noise of given orders with the greatest likelihood, from Hannan and Rissanen's and from nearby models."""
     starts = [_transformed(*_padded(fit.noise, orders)) for fit in near]
-    if not near or sum(orders) > max(sum(fit.orders) for fit in near):
+    if not any(fit.orders == orders for fit in near):
         starts.append(_transformed(*_hannan_rissanen(errors, orders)))
-    return _Likelihood(errors, steps, orders, tolerance).found(starts)
+    likelihood = _Likelihood(errors, steps, orders)
+    return min((likelihood.found(start, tolerance) for start in starts), key=lambda fit: fit.deviance)
 
 
 def choose_arma(errors: Sequence[Array], steps: Sequence[IntArray]) -> NoiseFit:
@@ -226,8 +219,22 @@ def choose_arma(errors: Sequence[Array], steps: Sequence[IntArray]) -> NoiseFit:
     fits: dict[Orders, NoiseFit] = {}
     for p, q in sorted(product(range(MOST_CHOSEN + 1), repeat=2), key=sum):
         inner = [fits[each] for each in ((p - 1, q), (p, q - 1)) if each in fits]
-        fits[p, q] = fit_arma(errors, steps, (p, q), *inner, tolerance=1e-6)
+        fits[p, q] = fit_arma(errors, steps, (p, q), *inner, tolerance=ROUGH)
     return min(fits.values(), key=lambda fit: fit.bic)
+
+
+def coefficient_slopes(noise: ArmaNoise, errors: Sequence[Array], steps: Sequence[IntArray]) -> Array:
+    """Derivatives of the scaled innovations by the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (N, P + Q)."""
+    orders = len(noise.denominator) - 1, len(noise.numerator) - 1
+    if not sum(orders):
+        return np.zeros((sum(e.size for e in errors), 0))
+    likelihood = _Likelihood(errors, steps, orders)
+    z = _transformed(np.array(noise.denominator), np.array(noise.numerator))
+    each = DIFFERENCE * np.eye(z.size)
+    by_z = [(likelihood.scaled(z + h) - likelihood.scaled(z - h)) / (2 * DIFFERENCE) for h in each]
+    partial, p, slopes = np.tanh(z), orders[0], np.zeros((z.size, z.size))
+    slopes[:p, :p], slopes[p:, p:] = (levinson(part)[1][:, 1:] for part in np.split(partial, [p]))
+    return np.column_stack(by_z) @ np.linalg.inv(slopes * (1.0 - partial**2)[:, None]).T
 
 
 def _padded(noise: ArmaNoise, orders: Orders) -> tuple[Array, Array]:
@@ -255,18 +262,18 @@ def _transformed(*polynomials: Array) -> Array:
 
 def _hannan_rissanen(errors: Sequence[Array], orders: Orders) -> tuple[Array, Array]:
     """D and C by regression on the noise before and on the residuals of a long autoregression; gaps are not seen."""
-    p, q = orders
-    lags = max(min(LONG_LAGS * (p + q), sum(e.size for e in errors) // SAMPLES_PER_LAG), p, q)
-    columns = [np.column_stack([np.concatenate((np.zeros(k), e[: e.size - k])) for k in range(lags + 1)]) for e in errors]
-    solve = lambda past, now: np.linalg.lstsq(past, now)[0]  # noqa: E731
-    whole = np.concatenate([block[lags:] for block in columns])
-    long = solve(whole[:, 1:], whole[:, 0])
-    rows, now = [], []
-    for block in columns:
-        white = block[:, 0] - block[:, 1:] @ long
-        white[:lags] = 0.0
-        past = [np.concatenate((np.zeros(k), white[: white.size - k])) for k in range(1, q + 1)]
-        rows.append(np.column_stack([-block[:, 1 : p + 1], *past])[lags + q :])
-        now.append(block[lags + q :, 0])
-    found = solve(np.concatenate(rows), np.concatenate(now))
+    (p, q), count = orders, sum(e.size for e in errors)
+    lags = max(min(LONG_LAGS * (p + q), count // SAMPLES_PER_LAG), p, q)
+    blocks = [_lagged(e, lags) for e in errors]
+    past = np.concatenate([block[lags:] for block in blocks])
+    long = np.linalg.lstsq(past[:, 1:], past[:, 0])[0]
+    whites = [_lagged(block[:, 0] - block[:, 1:] @ long, q)[:, 1:] for block in blocks]
+    rows = [np.column_stack((-block[:, 1 : p + 1], white)) for block, white in zip(blocks, whites, strict=True)]
+    now = np.concatenate([e[lags + q :] for e in errors])
+    found = np.linalg.lstsq(np.concatenate([each[lags + q :] for each in rows]), now)[0]
     return np.concatenate(([1.0], found[:p])), np.concatenate(([1.0], found[p:]))
+
+
+def _lagged(e: Array, lags: int) -> Array:
+    """A signal and its past, zero before the first sample, shape (N, lags + 1)."""
+    return np.column_stack([np.concatenate((np.zeros(min(k, e.size)), e[: max(e.size - k, 0)])) for k in range(lags + 1)])

@@ -1,0 +1,130 @@
+r"""The noise model that is estimated with a plant, and Hausman's test of the plant against its output-error estimate.
+
+Both estimates of the plant are right if the models of plant and noise are; where either is too small they weigh
+what is missing differently. The joint one being efficient, their difference has the covariance ``C_oe - C_joint`` [1]_.
+
+References
+----------
+.. [1] J. A. Hausman, "Specification tests in econometrics", *Econometrica* 46 (1978) 1251-1271. doi:10.2307/1913827
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.errors import OptionError
+from ctid_cli.inference.innovations import MOST_GIVEN, NoiseFit, Orders, coefficient_slopes, sampled, steps_of
+from ctid_cli.inference.residual_tests import chi_square_tail, orthonormal
+from ctid_cli.signals.noise import ArmaNoise
+
+#: Level of Hausman's test.
+LEVEL = 0.01
+#: Directions in which the output-error estimate has at most this share more variance than the joint one tell nothing.
+NO_GAIN = 0.05
+#: Directions of the noise's coefficients below this share of the greatest one cannot be told apart.
+RANK = 1e-6
+
+
+def orders_of(noise_model: str) -> Orders | None:
+    """Orders of D and C that an option gives, (0, 0) for white noise; None where they are to be chosen."""
+    if noise_model in ("white", "auto"):
+        return None if noise_model == "auto" else (0, 0)
+    found = re.fullmatch(r"arma:(\d{1,2}),(\d{1,2})", noise_model) if isinstance(noise_model, str) else None
+    if found is None or max(orders := (int(found[1]), int(found[2]))) > MOST_GIVEN:
+        allowed = f"white, auto or arma:P,Q with P poles and Q zeros, 0 to {MOST_GIVEN}, for example arma:2,1"
+        raise OptionError("noise_model", f"noise_model must be {allowed}; got {noise_model!r}")
+    return orders
+
+
+class Hausman(NamedTuple):
+    """Chi-square statistic of the difference of two estimates of the plant."""
+
+    statistic: float
+    freedom: int
+    #: Probability of a larger one if both models are right; NaN where they have the same accuracy.
+    p_value: float
+
+
+def hausman(difference: Array, robust: Array, efficient: Array) -> Hausman:
+    """Test a difference of estimates in the directions in which one is more accurate than the other."""
+    if not (np.isfinite(robust).all() and np.isfinite(efficient).all() and difference.size):
+        return Hausman(0.0, 0, np.nan)
+    factor = np.linalg.cholesky(efficient)
+    relative = np.linalg.solve(factor, np.linalg.solve(factor, robust).T)
+    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    gained = values > 1.0 + NO_GAIN
+    along = vectors.T @ np.linalg.solve(factor, difference)
+    statistic, freedom = float(np.sum(along[gained] ** 2 / (values[gained] - 1.0))), int(gained.sum())
+    return Hausman(statistic, freedom, chi_square_tail(freedom, statistic) if freedom else float("nan"))
+
+
+def noise_covariance(fit: NoiseFit, errors: Sequence[Array], used: Sequence[BoolArray]) -> Array:
+    """Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``; that of a common factor is large."""
+    slopes = coefficient_slopes(fit.noise, errors, [steps_of(use) for use in used])
+    return np.asarray(np.exp(fit.deviance / fit.count) * np.linalg.pinv(slopes.T @ slopes, hermitian=True))
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEstimate:
+    """The noise of a joint fit, and the output-error fit beside it.
+
+    Parameters
+    ----------
+    noise : ArmaNoise
+        ``v = C(q)/D(q) e``, in rising powers of q^-1, with the variance of e [output unit^2].
+    covariance : ndarray, shape (P + Q, P + Q)
+        Of the coefficients ``d_1 ... d_P, c_1 ... c_Q`` [-].
+    deviance : float
+        ``-2 ln L`` of the joint fit but for a constant: N times the logarithm of the variance of e, first samples
+        weighed exactly.
+    chosen : bool
+        Whether BIC has chosen the orders.
+    output_error, output_error_errors : ndarray, shape (p,)
+        Parameters of the output-error fit, in the order of those of the joint fit, and their standard errors for
+        coloured noise.
+    output_error_fit : float
+        Fit of its simulated output [%].
+    test : Hausman
+        Of the difference of the coefficients and the delay.
+    """
+
+    noise: ArmaNoise
+    covariance: Array = field(repr=False)
+    deviance: float
+    chosen: bool
+    output_error: Array = field(repr=False)
+    output_error_errors: Array = field(repr=False)
+    output_error_fit: float
+    test: Hausman = Hausman(0.0, 0, np.nan)
+
+    @property
+    def orders(self) -> Orders:
+        """Numbers of coefficients of D and C."""
+        return len(self.noise.denominator) - 1, len(self.noise.numerator) - 1
+
+    @property
+    def differs(self) -> bool:
+        """Whether the estimates of the plant differ by more than chance gives."""
+        return self.test.p_value < LEVEL
+
+    def prediction_errors(self, errors: Sequence[Array], used: Sequence[BoolArray], ahead: int) -> list[Array]:
+        """Errors of predictions from outputs at least so many samples old, from output errors."""
+        each = zip(sampled(self.noise, used), errors, strict=True)
+        return [e - noise.predicted(e, ahead) for noise, e in each]
+
+    def whitened(
+        self, psi: Sequence[Array], errors: Sequence[Array], used: Sequence[BoolArray]
+    ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Sensitivities and innovations of the joint fit, less what the coefficients of the noise take with them."""
+        noises = sampled(self.noise, used)
+        innovations = tuple(noise.whitened(e) for noise, e in zip(noises, errors, strict=True))
+        columns = np.concatenate([noise.whitened(block) for noise, block in zip(noises, psi, strict=True)])
+        beside = coefficient_slopes(self.noise, errors, [noise.steps for noise in noises])
+        if beside.shape[1]:
+            basis = beside @ orthonormal(beside, RANK)
+            columns = columns - basis @ (basis.T @ columns)
+        return tuple(np.split(columns, np.cumsum([e.size for e in errors])[:-1])), innovations
