@@ -151,9 +151,6 @@ def tried_remedies(
     # A record in a loop cannot be cut.
     most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
     part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
-    if fit.noise is not None:
-        # The criteria estimate the noise themselves.
-        options, fit = replace(options, noise_model="white"), replace(fit, noise=None)
     base = Trial("structure", options, records[0].input.hold, part, fit)
     found = Trials([], [])
     try:
