@@ -7,12 +7,13 @@ the information on both is block-diagonal, so that a few rounds do.
 
 from typing import NamedTuple
 
+from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum
-from ctid_cli.inference.innovations import NoiseFit, Orders, choose_arma, fit_arma, steps_of
+from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
 
-#: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds, and most choices of orders.
-SETTLED, MOST_ROUNDS, MOST_CHOICES = 1e-8, 40, 4
+#: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
+SETTLED, MOST_ROUNDS = 1e-6, 40
 
 
 class JointOptimum(NamedTuple):
@@ -24,32 +25,31 @@ class JointOptimum(NamedTuple):
 
 def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
     """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC."""
-    joint = JointOptimum(found, _noise_of(measured, found, orders))
-    for _ in range(MOST_CHOICES):
-        joint = _settled(measured, joint)
-        if orders is not None:
-            break
-        # The output-error fit has taken a part of the noise with it.
-        chosen = _noise_of(measured, joint.found, None)
-        if chosen.orders == joint.noise.orders:
-            break
-        joint = JointOptimum(joint.found, chosen)
-    return joint
-
-
-def _noise_of(measured: MeasuredRecords, found: Optimum, orders: Orders | None, *near: NoiseFit) -> NoiseFit:
-    """Noise of the output errors of a plant."""
-    errors = [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
     steps = [steps_of(use) for use in measured.used()]
-    return choose_arma(errors, steps) if orders is None else fit_arma(errors, steps, orders, *near)
+    if orders is not None:
+        return _settled(measured, JointOptimum(found, fit_arma(_errors(measured, found), steps, orders)))
+    fits: dict[Orders, NoiseFit] = {}
+    tried: dict[Orders, JointOptimum] = {}
+    while True:
+        # The output-error fit has taken a part of the noise with it: once more from the joint one.
+        fits = all_arma(_errors(measured, found), steps, fits)
+        chosen = min(fits.values(), key=lambda fit: fit.bic)
+        if chosen.orders in tried:
+            return min(tried.values(), key=lambda joint: joint.noise.bic)
+        joint = tried[chosen.orders] = _settled(measured, JointOptimum(found, chosen))
+        found = joint.found
+
+
+def _errors(measured: MeasuredRecords, found: Optimum) -> list[Array]:
+    return [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
 
 
 def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
     """Plant and noise in turn, until the likelihood rises no further."""
-    found, noise = joint
+    (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
         found = measured.whitened_by(noise.noise).local((found.denominator, found.delay))
-        following = _noise_of(measured, found, noise.orders, noise)
+        following = fit_arma(_errors(measured, found), steps, noise.orders, noise)
         settled, noise = noise.deviance - following.deviance < SETTLED, following
         if settled:
             break

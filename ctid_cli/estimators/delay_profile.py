@@ -11,9 +11,9 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
+from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
-from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
@@ -26,6 +26,7 @@ from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
@@ -151,6 +152,11 @@ class MeasuredFit(DeferredFields, Fit):
         cost = sum(float(eps @ eps) for eps in law.residuals) / count
         return replace(self, **law._asdict(), count=count, cost=cost)
 
+    @property
+    def arma(self) -> ArmaNoise | None:
+        """The noise that was estimated with the plant."""
+        return None if self.noise is None else self.noise.noise
+
     @cached_property
     def _of_innovations(self) -> "MeasuredFit":
         assert self.noise is not None
@@ -159,9 +165,17 @@ class MeasuredFit(DeferredFields, Fit):
         return replace(self, sensitivities=psi, residuals=innovations, cost=cost, noise=None)
 
     def prediction_fit(self, ahead: int) -> float:
-        """Fit of predictions from outputs at least ``ahead`` samples old [%]; without a noise model the simulated one.
+        """Fit of predictions of the outputs; without a noise model that of the simulated ones.
 
-        The initial states and offsets are those of the fit.
+        Parameters
+        ----------
+        ahead : int
+            How many samples old the latest output is that a prediction uses [-].
+
+        Returns
+        -------
+        float
+            ``100 (1 - ||y - p|| / ||y - mean y||)`` of the predictions p [%].
         """
         if self.noise is None:
             return self.fit_percent
@@ -399,7 +413,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
-        weighed = measured if fit.noise is None else measured.whitened_by(fit.noise.noise)
+        weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
         found: AppliedModel = weighed.errors_of(fit.model)
         return found
 
@@ -456,7 +470,8 @@ def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, 
     joint = joint_optimum(measured, found, orders_of(noise_model))
     search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
     fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
-    robust = beside.uncertainty("robust").covariance
+    law = beside.uncertainty("robust")
+    robust = law.covariance
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(robust))
     estimate = NoiseEstimate(
@@ -470,10 +485,11 @@ def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, 
     )
     fit = replace(fit, noise=estimate)
     efficient = fit.uncertainty("white").covariance
-    own = [k for k, name in enumerate(fit.parameter_names) if name[0] in "abd" and errors[k] > 0 and efficient[k, k] > 0]
-    own = [k for k in own if not fit.parameter_names[k].startswith("drift")]
+    shared = measured.layout_of(fit.model.order, measured.structure.delay).structure.size
+    own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
     pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
-    return replace(fit, noise=replace(estimate, test=hausman((beside.theta - fit.theta)[own], *pair)))
+    test = hausman((beside.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
+    return replace(fit, noise=replace(estimate, test=test))
 
 
 def samples_at(

@@ -180,7 +180,7 @@ def identify(
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
     linear, laid_out = fit.linear, prepared.laid_out
     if isinstance(laid_out, MeasuredRecords):
-        laid_out = laid_out.near(fit.residuals, fit.weighting, fit.noise and fit.noise.noise)
+        laid_out = laid_out.near(fit.residuals, fit.weighting, fit.arma)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answering = [options._acting(record) for record in prepared.laid_out.records]
@@ -259,7 +259,7 @@ def unsafe_intervals(found: Identification) -> list[str]:
         return []
     records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
     model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear
-    noises = () if fit.noise is None else sampled(fit.noise.noise, fit.used)
+    noises = () if fit.arma is None else sampled(fit.arma, fit.used)
     shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities, noises)
     return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
 
@@ -325,7 +325,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     if not isinstance(laid_out, MeasuredRecords):
         return None
     profile, reach, _ = _cost_of_delay(
-        laid_out.near(result.fit.residuals, result.fit.weighting, result.fit.noise and result.fit.noise.noise),
+        laid_out.near(result.fit.residuals, result.fit.weighting, result.fit.arma),
         fit,
         result.uncertainty,
     )

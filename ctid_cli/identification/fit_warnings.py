@@ -185,7 +185,8 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
     """That the estimate depends on how the noise is modelled."""
     if fit.noise is not None and fit.noise.differs:
         what = "The output-error fit and the fit with the noise model differ by more than chance gives"
-        yield f"{what} (Hausman's test, p = {fit.noise.test.p_value:.2g}): the model of the plant or of the noise is too small"
+        found = f"(Hausman's test, p = {fit.noise.test.p_value:.2g})"
+        yield f"{what} {found}: the model of the plant or of the noise is too small"
 
 
 def _of_search(fit: MeasuredFit) -> Iterator[str]:

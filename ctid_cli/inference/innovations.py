@@ -14,7 +14,7 @@ References
    autoregressive-moving average disturbances", *Biometrika* 66 (1979) 49-58. doi:10.1093/biomet/66.1.49
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -47,9 +47,9 @@ def filter_innovations(
 ) -> float:
     """Make innovations over their standard deviations of each row, in place; states and covariance go on.
 
-    ``steps`` are the intervals of the clock from the sample before to each sample, 0 or 1 at the first one. F shifts, and
-    has minus the denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of the variances;
-    ``after`` gets the predicted states of the first row, if there is room.
+    ``steps`` are the intervals of the clock from the sample before to each sample, 0 or 1 at the first one. F shifts,
+    and has minus the denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of the
+    variances; ``after`` gets the predicted states of the first row, if there is room.
     """
     r, logarithms, known = gain.size, 0.0, False
     # A column and a row of zeros save questions at the ends.
@@ -69,7 +69,9 @@ def filter_innovations(
                 largest = 0.0
                 for i in range(r):
                     for j in range(r):
-                        value = moved[i + 1, j + 1] - denominator[j] * moved[i + 1, 0] - denominator[i] * moved[0, j + 1]
+                        value = (
+                            moved[i + 1, j + 1] - denominator[j] * moved[i + 1, 0] - denominator[i] * moved[0, j + 1]
+                        )
                         value += denominator[i] * denominator[j] * moved[0, 0] + gain[i] * gain[j]
                         if not left:
                             value -= variance * feedback[i] * feedback[j]
@@ -95,8 +97,8 @@ class Whitener:
     """The filter of one record on its way over the samples, for any number of rows."""
 
     def __init__(self, noise: ArmaNoise, rows: int) -> None:
-        self.transition, self.gain, _ = noise._state_space
-        self.states, self.covariance = np.zeros((self.gain.size, rows)), noise._state_covariance.copy()
+        self.transition, self.gain, _ = noise.state_space
+        self.states, self.covariance = np.zeros((self.gain.size, rows)), noise.state_covariance.copy()
         #: ``ln|V|`` of the samples so far, for innovations of variance one.
         self.logarithm = 0.0
 
@@ -151,7 +153,7 @@ class NoiseFit(NamedTuple):
     noise: ArmaNoise
     #: ``-2 ln L`` but for a constant.
     deviance: float
-    count: int
+    samples: int
 
     @property
     def orders(self) -> Orders:
@@ -161,7 +163,7 @@ class NoiseFit(NamedTuple):
     @property
     def bic(self) -> float:
         """Schwarz's criterion, the coefficients of the noise alone being counted."""
-        return self.deviance + sum(self.orders) * float(np.log(self.count))
+        return self.deviance + sum(self.orders) * float(np.log(self.samples))
 
 
 class _Likelihood:
@@ -214,13 +216,15 @@ def fit_arma(
     return min((likelihood.found(start, tolerance) for start in starts), key=lambda fit: fit.deviance)
 
 
-def choose_arma(errors: Sequence[Array], steps: Sequence[IntArray]) -> NoiseFit:
-    """ARMA noise of least BIC, up to ARMA(3,3); each model starts from those that it contains too."""
+def all_arma(
+    errors: Sequence[Array], steps: Sequence[IntArray], near: Mapping[Orders, NoiseFit]
+) -> dict[Orders, NoiseFit]:
+    """ARMA noises up to ARMA(3,3), each from a nearby one of its orders, or else also from those that it contains."""
     fits: dict[Orders, NoiseFit] = {}
     for p, q in sorted(product(range(MOST_CHOSEN + 1), repeat=2), key=sum):
-        inner = [fits[each] for each in ((p - 1, q), (p, q - 1)) if each in fits]
+        inner = [near[p, q]] if near else [fits[each] for each in ((p - 1, q), (p, q - 1)) if each in fits]
         fits[p, q] = fit_arma(errors, steps, (p, q), *inner, tolerance=ROUGH)
-    return min(fits.values(), key=lambda fit: fit.bic)
+    return fits
 
 
 def coefficient_slopes(noise: ArmaNoise, errors: Sequence[Array], steps: Sequence[IntArray]) -> Array:
@@ -276,4 +280,6 @@ def _hannan_rissanen(errors: Sequence[Array], orders: Orders) -> tuple[Array, Ar
 
 def _lagged(e: Array, lags: int) -> Array:
     """A signal and its past, zero before the first sample, shape (N, lags + 1)."""
-    return np.column_stack([np.concatenate((np.zeros(min(k, e.size)), e[: max(e.size - k, 0)])) for k in range(lags + 1)])
+    return np.column_stack(
+        [np.concatenate((np.zeros(min(k, e.size)), e[: max(e.size - k, 0)])) for k in range(lags + 1)]
+    )

@@ -18,7 +18,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import OptionError
 from ctid_cli.inference.innovations import MOST_GIVEN, NoiseFit, Orders, coefficient_slopes, sampled, steps_of
-from ctid_cli.inference.residual_tests import chi_square_tail, orthonormal
+from ctid_cli.inference.residual_tests import orthonormal
 from ctid_cli.signals.noise import ArmaNoise
 
 #: Level of Hausman's test.
@@ -40,8 +40,13 @@ def orders_of(noise_model: str) -> Orders | None:
     return orders
 
 
+def check_noise_model(noise_model: str) -> None:
+    """Refuse, with an OptionError, what is no noise model."""
+    orders_of(noise_model)
+
+
 class Hausman(NamedTuple):
-    """Chi-square statistic of the difference of two estimates of the plant."""
+    """F statistic of the difference of two estimates of the plant."""
 
     statistic: float
     freedom: int
@@ -49,57 +54,58 @@ class Hausman(NamedTuple):
     p_value: float
 
 
-def hausman(difference: Array, robust: Array, efficient: Array) -> Hausman:
-    """Test a difference of estimates in the directions in which one is more accurate than the other."""
+#: No test.
+UNTESTED = Hausman(0.0, 0, np.nan)
+
+
+def hausman(difference: Array, robust: Array, efficient: Array, degrees_of_freedom: float) -> Hausman:
+    """Test a difference of estimates in the directions in which one is more accurate than the other.
+
+    The less accurate covariance is known as well as some degrees of freedom tell: those of Student's t of intervals.
+    Measured at the level of 1 %, 600 samples of a noise with two poles at .99: 5 % false alarms by the chi-square
+    distribution, none by F; 58 % of models with a pole too few are detected by either.
+    """
+    from scipy.special import fdtrc  # slow to import
+
     if not (np.isfinite(robust).all() and np.isfinite(efficient).all() and difference.size):
-        return Hausman(0.0, 0, np.nan)
+        return UNTESTED
     factor = np.linalg.cholesky(efficient)
     relative = np.linalg.solve(factor, np.linalg.solve(factor, robust).T)
     values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
     gained = values > 1.0 + NO_GAIN
     along = vectors.T @ np.linalg.solve(factor, difference)
-    statistic, freedom = float(np.sum(along[gained] ** 2 / (values[gained] - 1.0))), int(gained.sum())
-    return Hausman(statistic, freedom, chi_square_tail(freedom, statistic) if freedom else float("nan"))
+    freedom = int(gained.sum())
+    if not freedom:
+        return UNTESTED
+    statistic = float(np.mean(along[gained] ** 2 / (values[gained] - 1.0)))
+    return Hausman(statistic, freedom, float(fdtrc(freedom, degrees_of_freedom, statistic)))
 
 
 def noise_covariance(fit: NoiseFit, errors: Sequence[Array], used: Sequence[BoolArray]) -> Array:
     """Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``; that of a common factor is large."""
     slopes = coefficient_slopes(fit.noise, errors, [steps_of(use) for use in used])
-    return np.asarray(np.exp(fit.deviance / fit.count) * np.linalg.pinv(slopes.T @ slopes, hermitian=True))
+    return np.asarray(np.exp(fit.deviance / fit.samples) * np.linalg.pinv(slopes.T @ slopes, hermitian=True))
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """The noise of a joint fit, and the output-error fit beside it.
+    """The noise of a joint fit, and the output-error fit beside it."""
 
-    Parameters
-    ----------
-    noise : ArmaNoise
-        ``v = C(q)/D(q) e``, in rising powers of q^-1, with the variance of e [output unit^2].
-    covariance : ndarray, shape (P + Q, P + Q)
-        Of the coefficients ``d_1 ... d_P, c_1 ... c_Q`` [-].
-    deviance : float
-        ``-2 ln L`` of the joint fit but for a constant: N times the logarithm of the variance of e, first samples
-        weighed exactly.
-    chosen : bool
-        Whether BIC has chosen the orders.
-    output_error, output_error_errors : ndarray, shape (p,)
-        Parameters of the output-error fit, in the order of those of the joint fit, and their standard errors for
-        coloured noise.
-    output_error_fit : float
-        Fit of its simulated output [%].
-    test : Hausman
-        Of the difference of the coefficients and the delay.
-    """
-
+    #: ``v = C(q)/D(q) e``, with the variance of e [output unit^2].
     noise: ArmaNoise
+    #: Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (P + Q, P + Q).
     covariance: Array = field(repr=False)
+    #: ``-2 ln L`` of the joint fit but for a constant: N times the logarithm of the variance of e.
     deviance: float
+    #: Whether BIC has chosen the orders.
     chosen: bool
+    #: Parameters of the output-error fit, in the order of the joint fit, and their errors for coloured noise, shape (p,).
     output_error: Array = field(repr=False)
     output_error_errors: Array = field(repr=False)
+    #: Fit of its simulated output [%].
     output_error_fit: float
-    test: Hausman = Hausman(0.0, 0, np.nan)
+    #: Of the difference of the coefficients and the delay.
+    test: Hausman = UNTESTED
 
     @property
     def orders(self) -> Orders:

@@ -190,7 +190,11 @@ UNSAFE = 0.5
 
 
 def shifts_of_ends(
-    model: Parametric, law: Uncertainty, records: Sequence[Record], used: Sequence[BoolArray], psi: Sequence[Array],
+    model: Parametric,
+    law: Uncertainty,
+    records: Sequence[Record],
+    used: Sequence[BoolArray],
+    psi: Sequence[Array],
     noises: Sequence[SampledNoise] = (),
 ) -> Array:
     r"""By how much either end of each parameter's interval would move, in half-widths; NaN of held ones, shape (p,).

@@ -186,7 +186,11 @@ def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None) 
         **picked(estimate.noise, ("numerator", "denominator", "innovation_variance")),
         **picked(estimate, ("covariance", "deviance", "chosen")),
         "prediction_fits": {str(k): fit.prediction_fit(k) for k in (1, *([ahead] if ahead else []))},
-        "output_error": {"values": estimate.output_error, "standard_errors": errors, "fit_percent": estimate.output_error_fit},
+        "output_error": {
+            "values": estimate.output_error,
+            "standard_errors": errors,
+            "fit_percent": estimate.output_error_fit,
+        },
         "hausman": estimate.test._asdict(),
     }
 

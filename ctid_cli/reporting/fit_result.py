@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
@@ -159,11 +160,12 @@ class FitResult(Result):
             yield "validation", text
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
         yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
+        per = "cost" if fit.noise is None else "var e"
         sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
-        yield "AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}"
+        yield "AIC", f"{number(criteria.aic)} = N ln {per} + 2 p with {sizes}"
         yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
-        yield "BIC", f"{number(criteria.bic)} = N ln cost + p ln N"
-        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)"
+        yield "BIC", f"{number(criteria.bic)} = N ln {per} + p ln N"
+        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = {per} (N + p) / (N - p)"
         yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
         yield "condition number", number(fit.condition_number, 3)
         if fit.starts is not None:
@@ -187,7 +189,9 @@ class FitResult(Result):
         return fit_content(self.fitted, self.records, self.ahead)
 
 
-def _noise_lines(fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None, units: Units) -> Iterator[tuple[str, str]]:
+def _noise_lines(
+    fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None, units: Units
+) -> Iterator[tuple[str, str]]:
     """Return the noise model, how well it predicts, and the output-error fit beside it."""
     noise, (p, q) = estimate.noise, estimate.orders
     errors = np.sqrt(np.diag(estimate.covariance))
