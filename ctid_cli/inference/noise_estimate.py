@@ -99,7 +99,7 @@ class NoiseEstimate:
     deviance: float
     #: Whether BIC has chosen the orders.
     chosen: bool
-    #: Parameters of the output-error fit, in the order of the joint fit, and their errors for coloured noise, shape (p,).
+    #: Parameters of the output-error fit, as those of the joint fit, and their errors for coloured noise, shape (p,).
     output_error: Array = field(repr=False)
     output_error_errors: Array = field(repr=False)
     #: Fit of its simulated output [%].
