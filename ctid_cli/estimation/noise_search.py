@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import LONG, Optimum
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
 
 #: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
@@ -23,8 +23,22 @@ class JointOptimum(NamedTuple):
     noise: NoiseFit
 
 
-def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
-    """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC."""
+def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None, nested: bool) -> JointOptimum:
+    """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC.
+
+    If nested, plants are searched once more as the innovations under that noise see them, smaller ones included.
+    """
+    joint = _near(measured, found, orders)
+    if not nested or not sum(joint.noise.orders) or sum(e.size for e in measured.outputs) > LONG:
+        return joint
+    other = measured.whitened_by(joint.noise.noise).best([(found.denominator, found.delay)], nested)
+    if other.denominator.size != found.denominator.size:
+        return joint
+    return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)
+
+
+def _near(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
+    """Plant and noise in the basin of an output-error optimum."""
     steps = [steps_of(use) for use in measured.used()]
     if orders is not None:
         return _settled(measured, JointOptimum(found, fit_arma(_errors(measured, found), steps, orders)))

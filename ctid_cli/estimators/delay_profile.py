@@ -376,7 +376,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                     found = measured.best(starts, self.nested)
                     fit = fitted(measured, found, profile, None)
                     if self.noise_model != "white":
-                        fit = _with_noise(measured, fit, found, self.noise_model)
+                        fit = _with_noise(measured, fit, found, self)
                 else:
                     robust = robust_fit(measured, self.loss, starts, self.nested)
                     fit = fitted(measured, robust.found, profile, robust)
@@ -465,9 +465,9 @@ def fitted(
     )
 
 
-def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, noise_model: str) -> MeasuredFit:
+def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, options: DelayProfile) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
-    joint = joint_optimum(measured, found, orders_of(noise_model))
+    joint = joint_optimum(measured, found, orders_of(options.noise_model), options.nested)
     search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
     fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
     law = beside.uncertainty("robust")
@@ -478,7 +478,7 @@ def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, 
         noise=joint.noise.noise,
         covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
         deviance=joint.noise.deviance,
-        chosen=noise_model == "auto",
+        chosen=options.noise_model == "auto",
         output_error=beside.theta,
         output_error_errors=errors,
         output_error_fit=beside.fit_percent,

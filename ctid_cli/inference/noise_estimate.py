@@ -27,6 +27,8 @@ LEVEL = 0.01
 NO_GAIN = 0.05
 #: Directions of the noise's coefficients below this share of the greatest one cannot be told apart.
 RANK = 1e-6
+#: Eigenvalues of a correlation matrix below this share of the greatest one are rounding.
+ROUNDING = 1e-10
 
 
 def orders_of(noise_model: str) -> Orders | None:
@@ -38,11 +40,6 @@ def orders_of(noise_model: str) -> Orders | None:
         allowed = f"white, auto or arma:P,Q with P poles and Q zeros, 0 to {MOST_GIVEN}, for example arma:2,1"
         raise OptionError("noise_model", f"noise_model must be {allowed}; got {noise_model!r}")
     return orders
-
-
-def check_noise_model(noise_model: str) -> None:
-    """Refuse, with an OptionError, what is no noise model."""
-    orders_of(noise_model)
 
 
 class Hausman(NamedTuple):
@@ -69,11 +66,14 @@ def hausman(difference: Array, robust: Array, efficient: Array, degrees_of_freed
 
     if not (np.isfinite(robust).all() and np.isfinite(efficient).all() and difference.size):
         return UNTESTED
-    factor = np.linalg.cholesky(efficient)
-    relative = np.linalg.solve(factor, np.linalg.solve(factor, robust).T)
-    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
+    # In units of the efficient standard errors, whatever those of the parameters are.
+    scale = 1.0 / np.sqrt(np.diag(efficient))
+    lengths, axes = np.linalg.eigh(efficient * np.outer(scale, scale))
+    kept = lengths > ROUNDING * lengths[-1]
+    basis = scale[:, None] * axes[:, kept] / np.sqrt(lengths[kept])
+    values, vectors = np.linalg.eigh(basis.T @ robust @ basis)
     gained = values > 1.0 + NO_GAIN
-    along = vectors.T @ np.linalg.solve(factor, difference)
+    along = vectors.T @ basis.T @ difference
     freedom = int(gained.sum())
     if not freedom:
         return UNTESTED
