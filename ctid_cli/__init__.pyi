@@ -26,6 +26,7 @@ from .filtering.loop import simulate_loop as simulate_loop
 # Estimators of systems: options with ``fit(record, start)``
 from .estimation.common import Start as Start
 from .estimators.svf import Svf as Svf
+from .estimators.rivc import Rivc as Rivc
 from .estimators.srivc import Srivc as Srivc
 from .estimators.td_srivc import TdSrivc as TdSrivc
 from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy

@@ -39,6 +39,7 @@ KINDS: dict[str, dict[str, str]] = {
         "td_srivc": "ctid_cli.estimators.td_srivc:TdSrivc",
         "useful_redundancy": "ctid_cli.estimators.useful_redundancy:UsefulRedundancy",
         "delay_profile": "ctid_cli.estimators.delay_profile:DelayProfile",
+        "rivc": "ctid_cli.estimators.rivc:Rivc",
         "additive_srivc": "ctid_cli.estimators.additive_srivc:AdditiveSrivc",
     },
     "frequency_estimator": {

@@ -71,6 +71,9 @@ def fit(
         Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record.")
     ] = None,
     bootstrap: Annotated[int | None, typer.Option("--bootstrap", metavar="DRAWS", help="Bootstrap intervals.")] = None,
+    predict: Annotated[
+        int | None, typer.Option("--predict", metavar="K", help="Fit of predictions K samples ahead, with --noise.")
+    ] = None,
 ) -> None:
     """Fit a transfer function with a delay to measured records.
 
@@ -81,6 +84,7 @@ def fit(
     from ctid_cli.reporting.fit_result import FitResult
 
     _check_draws(bootstrap)
+    _check_predicted(predict, treatment.noise)
     loop.check()
     asked = Asked(model, treatment, loop.counts)
     options = options_of(asked)
@@ -89,7 +93,7 @@ def fit(
     records = _records(files, validate, loop, columns, treatment)
     found = _identified(options, records, bootstrap)
     other = None if found.validation is None else found.validation.record
-    result = FitResult(found, records.with_data(found.records, other))
+    result = FitResult(found, records.with_data(found.records, other), predict)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting([*files, *([validate] if validate else [])], contents)
     write_files(contents)
@@ -101,6 +105,13 @@ def _check_draws(bootstrap: int | None) -> None:
 
     if bootstrap is not None and bootstrap < LEAST_DRAWS:
         raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
+
+
+def _check_predicted(ahead: int | None, noise: str) -> None:
+    if ahead is not None and ahead < 1:
+        raise UsageError(f"--predict must be at least 1 sample, for example 10; got {ahead}")
+    if ahead is not None and noise == "white":
+        raise UsageError("--predict needs a noise model: white noise cannot be predicted; add --noise auto")
 
 
 def _records(

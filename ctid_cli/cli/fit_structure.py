@@ -144,6 +144,9 @@ class FitOptions(TreatmentOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
     loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares"
+    noise: Annotated[
+        str, typer.Option("--noise", metavar="white|arma:P,Q|auto", help="Noise that is estimated with the model.")
+    ] = "white"
     hold: HoldOption = "auto"
 
 
@@ -178,7 +181,7 @@ def as_usage_errors() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise UsageError(re.sub(r"^fixed\b", "--fix", str(error))) from None
+        raise UsageError(re.sub(r"^fixed\b", "--fix", re.sub(r"^noise_model\b", "--noise", str(error)))) from None
 
 
 def options_of(asked: Asked) -> MeasuredSubmodels | Given:
@@ -215,7 +218,7 @@ def _given(asked: Asked) -> Given:
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if fixed and model.zeros is None else model.zeros
     given = given_of(model, treatment, treatment.hold)
-    return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed)
+    return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed, noise_model=treatment.noise)
 
 
 def _submodels(asked: Asked) -> MeasuredSubmodels:
@@ -287,6 +290,8 @@ def _refuse_unable(asked: Asked) -> None:
         raise UsageError(f"--input-before is not there for {what}; use --initial-state estimate")
     if asked.treatment.loss != "squares":
         raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
+    if asked.treatment.noise != "white":
+        raise UsageError(f"--noise {asked.treatment.noise} is not there for {what}; drop --noise")
     if asked.treatment.offset in ("estimate", "drift"):
         raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
     if asked.loop and asked.treatment.hold not in ("auto", "zoh"):

@@ -18,6 +18,7 @@ from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.covariance import condition_number, white_noise_covariance
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import Fit, IterationRecord, Status
+from ctid_cli.inference.noise_estimate import orders_of
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Uncertainty, estimate_uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
@@ -170,7 +171,7 @@ def _require_fraction(name: str, value: float) -> None:
 
 
 #: Checks of the options that several estimators share, by name; None stands for an option that was not given.
-CHECKS: Mapping[str, Callable[[str, Any], None]] = {
+CHECKS: Mapping[str, Callable[[str, Any], object]] = {
     "integrators": lambda name, value: require_integer(name, value, 0, MOST_INTEGRATORS),
     "zeros": lambda name, value: require_integer(name, value, 0),
     "delay": lambda name, value: require_not_negative(name, value, "s"),
@@ -182,6 +183,7 @@ CHECKS: Mapping[str, Callable[[str, Any], None]] = {
     "filters": lambda name, value: require_integer(name, value, 2),
     "order": lambda name, value: require_integer(name, value, 1, 20),
     "tolerance": _require_fraction,
+    "noise_model": lambda _, value: orders_of(value),
     "bootstrap_draws": lambda name, value: require_integer(name, value, LEAST_DRAWS),
 }
 

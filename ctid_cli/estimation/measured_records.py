@@ -27,12 +27,14 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
+from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
@@ -298,8 +300,18 @@ class MeasuredRecords:
         other.problem = self.problem._replace(records=tuple(records))
         return other
 
-    def near(self, errors: Sequence[Array], weighting: Weighting | None) -> "MeasuredRecords":
-        """The records whose least squares are, near the estimate, what its loss is."""
+    def whitened_by(self, noise: ArmaNoise) -> "MeasuredRecords":
+        """The same where errors count by their innovations under a noise."""
+        other = copy(self)
+        other.problem = self.problem._replace(noises=sampled(noise, self.used()))
+        return other
+
+    def near(
+        self, errors: Sequence[Array], weighting: Weighting | None, noise: ArmaNoise | None = None
+    ) -> "MeasuredRecords":
+        """The records whose least squares are, near the estimate, what its loss or likelihood is."""
+        if noise is not None:
+            return self.whitened_by(noise)
         if weighting is None:
             return self
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
@@ -353,7 +365,9 @@ class MeasuredRecords:
         found = sensitivities(self.problem, layout, theta, model.delay)
         for k, (psi, eps) in enumerate(found):
             own = slice(layout.first(k), layout.first(k) + layout.own)
-            theta[own] = np.linalg.lstsq(psi[:, own], eps)[0]
+            noises = self.problem.noises
+            weigh = noises[k].whitened if noises else np.asarray
+            theta[own] = np.linalg.lstsq(weigh(psi[:, own]), weigh(eps))[0]
             bridged = self.problem.records[k].y_used
             residuals.append(eps - psi[:, own] @ theta[own] + (self.outputs[k] - bridged))
         slopes = tuple(psi for psi, _ in found)

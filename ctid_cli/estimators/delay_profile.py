@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
+from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
@@ -17,12 +19,15 @@ from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.covariance import nearly_regular
+from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
+from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.noise import ArmaNoise
+from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
 
@@ -81,6 +86,8 @@ class MeasuredFit(DeferredFields, Fit):
         Whether lags counted in samples are lags in time, up to jitter.
     known : tuple of str
         Names of the parameters that were fixed.
+    noise : NoiseEstimate or None
+        The noise model that was estimated with the plant; None of an output-error fit.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -101,6 +108,7 @@ class MeasuredFit(DeferredFields, Fit):
     tangent: Array = field(default_factory=lambda: np.zeros((0, 0)))
     regular: bool = True
     known: tuple[str, ...] = ()
+    noise: NoiseEstimate | None = None
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -134,13 +142,47 @@ class MeasuredFit(DeferredFields, Fit):
 
     @property
     def linear(self) -> "MeasuredFit":
-        """The fit by least squares that has the same law: itself, or with the pseudo-errors of its loss."""
+        """The fit by least squares that has the same law: itself, or with pseudo-errors of its loss, or innovations."""
+        if self.noise is not None:
+            return self._of_innovations
         if self.weighting is None:
             return self
         law = FittedSamples(self.residuals, self.sensitivities, self.used, self.weighting).linear
         count = sum(eps.size for eps in law.residuals)
         cost = sum(float(eps @ eps) for eps in law.residuals) / count
         return replace(self, **law._asdict(), count=count, cost=cost)
+
+    @property
+    def arma(self) -> ArmaNoise | None:
+        """The noise that was estimated with the plant."""
+        return None if self.noise is None else self.noise.noise
+
+    @cached_property
+    def _of_innovations(self) -> "MeasuredFit":
+        assert self.noise is not None
+        psi, innovations = self.noise.whitened(self.sensitivities, self.residuals, self.used)
+        cost = sum(float(e @ e) for e in innovations) / self.count
+        return replace(self, sensitivities=psi, residuals=innovations, cost=cost, noise=None)
+
+    def prediction_fit(self, ahead: int) -> float:
+        """Fit of predictions of the outputs; without a noise model that of the simulated ones.
+
+        Parameters
+        ----------
+        ahead : int
+            How many samples old the latest output is that a prediction uses [-].
+
+        Returns
+        -------
+        float
+            ``100 (1 - ||y - p|| / ||y - mean y||)`` of the predictions p [%].
+        """
+        if self.noise is None:
+            return self.fit_percent
+        errors = self.noise.prediction_errors(self.residuals, self.used, ahead)
+        mean_square = sum(float(e @ e) for e in errors) / self.count
+        simulated = sum(float(e @ e) for e in self.residuals) / self.count
+        return percent_from_r_squared(1.0 - (1.0 - self.r2) * mean_square / simulated)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -215,6 +257,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     input_before : float or "first", optional
         Constant input before the first sample [input unit], with which the system is at rest, or "first" for the first
         value of each record; None is zero. It is subtracted from the input.
+    noise_model : str, default "white"
+        ``arma:P,Q``, or ``auto`` for the orders up to 3 of least BIC, estimates the output noise ``C(q)/D(q) e`` with
+        P coefficients of D and Q of C together with the plant, by maximum likelihood; all records share it.
 
     Raises
     ------
@@ -258,9 +303,14 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     fixed: tuple[Fixed, ...] | None = None
     integrators: int = 0
     input_before: InputBefore = None
+    noise_model: str = "white"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.noise_model != "white" and self.loss != "squares":
+            raise OptionError(
+                "noise_model", f"noise_model goes with loss squares, not {self.loss}: outliers have no ARMA model"
+            )
         if self.integrators and self.offset == "remove":
             raise OptionError(
                 "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
@@ -299,6 +349,8 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
         low, high = self.delay_bounds
+        if self.noise_model != "white":
+            _check_clocks([records] if isinstance(records, Record) else records)
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         return MeasuredRecords(
             [records] if isinstance(records, Record) else list(records),
@@ -321,7 +373,10 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
                 if self.loss == "squares":
-                    fit = fitted(measured, measured.best(starts, self.nested), profile, None)
+                    found = measured.best(starts, self.nested)
+                    fit = fitted(measured, found, profile, None)
+                    if self.noise_model != "white":
+                        fit = _with_noise(measured, fit, found, self)
                 else:
                     robust = robust_fit(measured, self.loss, starts, self.nested)
                     fit = fitted(measured, robust.found, profile, robust)
@@ -358,7 +413,8 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
-        found: AppliedModel = measured.errors_of(fit.model)
+        weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
+        found: AppliedModel = weighed.errors_of(fit.model)
         return found
 
 
@@ -409,6 +465,33 @@ def fitted(
     )
 
 
+def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, options: DelayProfile) -> MeasuredFit:
+    """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
+    joint = joint_optimum(measured, found, orders_of(options.noise_model), options.nested)
+    search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
+    fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
+    law = beside.uncertainty("robust")
+    robust = law.covariance
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.diag(robust))
+    estimate = NoiseEstimate(
+        noise=joint.noise.noise,
+        covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
+        deviance=joint.noise.deviance,
+        chosen=options.noise_model == "auto",
+        output_error=beside.theta,
+        output_error_errors=errors,
+        output_error_fit=beside.fit_percent,
+    )
+    fit = replace(fit, noise=estimate)
+    efficient = fit.uncertainty("white").covariance
+    shared = measured.layout_of(fit.model.order, measured.structure.delay).structure.size
+    own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
+    pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
+    test = hausman((beside.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
+    return replace(fit, noise=replace(estimate, test=test))
+
+
 def samples_at(
     measured: MeasuredRecords, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
 ) -> FittedSamples:
@@ -442,6 +525,16 @@ def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
         return np.eye(layout.size)[:, ~fixed]
     moving = np.pad(found.pole_slopes, ((0, layout.size - len(found.pole_slopes)), (0, 0)))
     return np.column_stack((moving, np.eye(layout.size)[:, n:][:, ~fixed[n:]]))
+
+
+def _check_clocks(records: Sequence[Record]) -> None:
+    """Refuse clocks on which an ARMA noise has no meaning."""
+    for record in records:
+        if record.interval is None:
+            raise DataError(
+                f"{named(record)}the clock is irregular, and a noise model from sample to sample needs a regular one; "
+                "take noise_model white (--noise white), or resample the record"
+            )
 
 
 def _check_stable(known: Mapping[int, float], poles: int) -> None:

@@ -19,12 +19,14 @@ from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.derived import derived_parameters
 from ctid_cli.inference.fit import DeferredFields, Status
 from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
+from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 from ctid_cli.text import Shown
 
@@ -112,6 +114,37 @@ class Identification(DeferredFields, FittedModel, Shown):
         assert self.fit.law is not None
         return self.fit.law
 
+    def predict(self, record: Record, ahead: int = 1) -> Array:
+        """Predict the output of a record from its input and from outputs that are some samples old.
+
+        Parameters
+        ----------
+        record : Record
+            A record of the same system, on a regular clock where the fit has a noise model.
+        ahead : int, default 1
+            How many samples old the latest output is that a prediction uses [-].
+
+        Returns
+        -------
+        ndarray, shape (N,)
+            Predictions [output unit]; NaN at samples that the fit does not use. They are the simulated output, with the
+            initial state and the offset that fit this record best, plus the prediction of the noise: zero without a
+            noise model, and the less the farther ahead.
+
+        Raises
+        ------
+        DataError
+            If the record cannot be used.
+        OptionError
+            If ``ahead`` is not a positive integer.
+        """
+        require_integer("ahead", ahead, 1)
+        applied = self.options._applied(self.fit, self.options.prepare(record).laid_out)
+        (use,), errors, found = applied.used, applied.residuals, np.full(record.n_samples, np.nan)
+        left = errors if self.fit.noise is None else self.fit.noise.prediction_errors(errors, applied.used, ahead)
+        found[use] = record.y[use] - left[0]
+        return found
+
     def _estimated(self) -> Estimated:
         """The model with what its reported errors and intervals are from."""
         law = self.uncertainty if self._determined else self.uncertainty.undefined
@@ -147,12 +180,15 @@ def identify(
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
     linear, laid_out = fit.linear, prepared.laid_out
     if isinstance(laid_out, MeasuredRecords):
-        laid_out = laid_out.near(fit.residuals, fit.weighting)
+        laid_out = laid_out.near(fit.residuals, fit.weighting, fit.arma)
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answering = [options._acting(record) for record in prepared.laid_out.records]
     answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
+    size = fit.theta.size - len(fit.known)
+    if fit.noise is not None:
+        squared_error, size = fit.count * np.exp(fit.noise.deviance / fit.count), size + sum(fit.noise.orders)
     tests = tests_of(options, linear, records)
     # What the data determine can be told even where no standard error can be given.
     biased = uncertainty.kind == "biased"
@@ -177,7 +213,7 @@ def identify(
         delay_interval=interval,
         derived=_derived(fit, uncertainty, answer.seen and not singular),
         tests=tests,
-        criteria=criteria_of.information_criteria(squared_error, fit.count, fit.theta.size - len(fit.known)),
+        criteria=criteria_of.information_criteria(squared_error, fit.count, size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
         r_t_squared=criteria_of.r_t_squared(residuals, output),
         warnings=(),
@@ -223,7 +259,8 @@ def unsafe_intervals(found: Identification) -> list[str]:
         return []
     records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
     model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear
-    shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities)
+    noises = () if fit.arma is None else sampled(fit.arma, fit.used)
+    shifts = shifts_of_ends(model, found.uncertainty, records, linear.used, linear.sensitivities, noises)
     return [name for name, shift in zip(fit.parameter_names, shifts, strict=True) if name in shown and shift > UNSAFE]
 
 
@@ -288,7 +325,9 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
     if not isinstance(laid_out, MeasuredRecords):
         return None
     profile, reach, _ = _cost_of_delay(
-        laid_out.near(result.fit.residuals, result.fit.weighting), fit, result.uncertainty
+        laid_out.near(result.fit.residuals, result.fit.weighting, result.fit.arma),
+        fit,
+        result.uncertainty,
     )
     half = DRAWN_INTERVALS * max(item.high - item.estimate, item.estimate - item.low)
     low, high = max(item.estimate - half, profile.bounds[0]), min(item.estimate + half, profile.bounds[1])

@@ -15,6 +15,7 @@ from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
+from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
@@ -37,7 +38,7 @@ class SubmodelsFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     additive : AdditiveModel or None
         The submodels; None where one transfer function was asked for.
@@ -253,5 +254,5 @@ def _padded(b: Array, size: int) -> Array:
 
 
 #: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | MeasuredSubmodels
+Options = DelayProfile | Rivc | MeasuredSubmodels
 LaidOut = MeasuredRecords | LaidOutSubmodels

@@ -36,6 +36,8 @@ class Given:
         What output errors count in the fit; the choice is made with their squares.
     fixed : tuple of Fixed, optional
         Known parameters of the fit.
+    noise_model : str, default "white"
+        Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
     """
 
     poles: int | tuple[int, int] | None = None
@@ -48,6 +50,7 @@ class Given:
     hold: AskedHold = "auto"
     loss: LossKind = "squares"
     fixed: tuple[Fixed, ...] | None = None
+    noise_model: str = "white"
 
     @property
     def span(self) -> Span:
@@ -76,6 +79,7 @@ class Given:
             fixed=self.fixed,
             integrators=self.integrators or 0,
             input_before=self.input_before,
+            noise_model=self.noise_model,
         )
 
 

@@ -108,6 +108,7 @@ class _Choosing:
             ranking = self._grid(setting, delays)
         best = ranking.best
         options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
+        options = replace(options, noise_model=self.given.noise_model)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)

@@ -58,7 +58,10 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
     seen = found.answer.seen
     suspicious = fit.fit_percent < LOW_FIT or fit.status is not Status.CONVERGED or len(found.tests) < len(records)
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
-    tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
+    # Changes are compared as output-error fits are.
+    tried = Trials([], [])
+    if fit.noise is None:
+        tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
     named = [FitWarning(_observed(remedy, found), remedy) for remedy in tried.remedies]
     mended = {remedy.kind for remedy in tried.remedies}
     if not seen:
@@ -67,7 +70,7 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
     others = list(_of_residuals(found, mended))
     if not named:
         # Of an estimate that will change, neither its search nor its errors need to be known.
-        others += [*_of_fit(fit, tried), *_of_search(fit), *_of_uncertainty(found)]
+        others += [*_of_noise(fit), *_of_fit(fit, tried), *_of_search(fit), *_of_uncertainty(found)]
     failed = list(_of_validation(found))
     return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
 
@@ -156,12 +159,13 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
         yield f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value, as at a limit"
-    fit = found.fit.linear
+    fit, noisy = found.fit.linear, found.fit.noise is not None
     # Of residuals with outliers nothing else is told.
     for k, (record, use) in enumerate(_used(found) if not outliers else ()):
         e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
         acting = found.options._acting(record)
-        seen = input_dependence(e, record.y[use] - e, psi, t, acting, fit.model.delay)
+        x = record.y[use] - (found.fit.residuals[k] if noisy else e)
+        seen = input_dependence(e, x, psi, t, acting, fit.model.delay)
         if seen is None or seen.feedback_share < FEEDBACK_SHARE:
             continue
         # Dynamics that are missed may leave something for later inputs to tell.
@@ -172,9 +176,17 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
 
 def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
     """That a fit is low, and what did not raise it; with outliers it always is."""
-    if fit.fit_percent < LOW_FIT and fit.weighting is None:
+    if fit.fit_percent < LOW_FIT and fit.weighting is None and fit.noise is None:
         what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
         yield f"{what}; tried without gain: {', '.join(tried.without_gain)}" if tried.without_gain else what
+
+
+def _of_noise(fit: MeasuredFit) -> Iterator[str]:
+    """That the estimate depends on how the noise is modelled."""
+    if fit.noise is not None and fit.noise.differs:
+        what = "The output-error fit and the fit with the noise model differ by more than chance gives"
+        found = f"(Hausman's test, p = {fit.noise.test.p_value:.2g})"
+        yield f"{what} {found}: the model of the plant or of the noise is too small"
 
 
 def _of_search(fit: MeasuredFit) -> Iterator[str]:

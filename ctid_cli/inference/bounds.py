@@ -15,13 +15,14 @@ from ctid_cli.errors import BiasedError, DataError
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
 from ctid_cli.filtering.simulate import sampled_model
 from ctid_cli.inference.covariance import sandwich, unit_inverse
+from ctid_cli.inference.innovations import SampledNoise, steps_of
 from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.noise import Noise
+from ctid_cli.signals.noise import ArmaNoise, Noise
 from ctid_cli.signals.record import Enters, Record
 
 
@@ -79,6 +80,8 @@ class EstimatedForm:
     #: Samples before this time [s] are not used; None where the delay is known.
     delay_from: float | None
     instruments: Instruments
+    #: Whether the noise is modelled too, so that the errors are weighed by it.
+    weighed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +145,9 @@ def accuracy_of_records(
     # Instruments other than the input itself are not the best there are.
     best = form.instruments == "open_loop"
     start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
-    if noise.coloured:
+    if form.weighed and noise.coloured:
+        start = "the Cramér-Rao bound (psi' R^-1 psi)^-1, R the covariance matrix of the noise"
+    elif noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
     sets = len(records)
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
@@ -162,6 +167,12 @@ def _record_covariance(
     psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
     if form.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + form.delay_from]
+    if form.weighed and noise.coloured:
+        variance = noise.innovation_variance_of(record.noise_free)
+        law = ArmaNoise(*noise.filter, innovation_variance=variance)
+        # psi' R^-1 psi is that of the innovations.
+        white = SampledNoise(law, steps_of(np.ones(len(psi), dtype=bool))).whitened(psi)
+        return finite_record_covariance(white, variance)
     lags = np.arange(psi.shape[0] if noise.coloured else 1)
     return finite_record_covariance(psi, noise.autocovariance(lags, record.noise_free))
 

@@ -9,6 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.inference.covariance import robust_covariance, white_noise_covariance
+from ctid_cli.inference.innovations import SampledNoise
 from ctid_cli.inference.intervals import student_quantile
 from ctid_cli.inference.noise_model import NoiseModel
 from ctid_cli.inference.residual_tests import all_white
@@ -189,7 +190,12 @@ UNSAFE = 0.5
 
 
 def shifts_of_ends(
-    model: Parametric, law: Uncertainty, records: Sequence[Record], used: Sequence[BoolArray], psi: Sequence[Array]
+    model: Parametric,
+    law: Uncertainty,
+    records: Sequence[Record],
+    used: Sequence[BoolArray],
+    psi: Sequence[Array],
+    noises: Sequence[SampledNoise] = (),
 ) -> Array:
     r"""By how much either end of each parameter's interval would move, in half-widths; NaN of held ones, shape (p,).
 
@@ -229,6 +235,7 @@ def shifts_of_ends(
                         moved.simulated(r.input, r.t)[use] - x - slopes @ step
                         for r, use, (x, slopes) in zip(records, used, here, strict=True)
                     ]
+                    left = [noise.whitened(e) for noise, e in zip(noises, left, strict=True)] if noises else left
                     taken = law.tangent @ np.linalg.lstsq(free, np.concatenate(left))[0]
                 ends.append(abs(float(taken[k])) / (reach[k] * errors[k]))
             except (DataError, np.linalg.LinAlgError):

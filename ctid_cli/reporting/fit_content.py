@@ -14,6 +14,7 @@ from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.intervals import BIASED, UncertainValue
+from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.estimate import Units, parameter_object
 from ctid_cli.reporting.layout import picked
@@ -25,7 +26,7 @@ DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "re
 TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
 
-def fit_content(fitted: Identification, records: Records) -> dict[str, Any]:
+def fit_content(fitted: Identification, records: Records, ahead: int | None = None) -> dict[str, Any]:
     """Return the fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
     profile, validation, additive = fit.profile, fitted.validation, additive_of(fit)
@@ -41,6 +42,7 @@ def fit_content(fitted: Identification, records: Records) -> dict[str, Any]:
         "parameters": [parameter_object(item) for item in parameters_of(fitted, units)],
         **picked(fit, ("fit_percent", "r2", "cost")),
         "loss": _loss_object(fit, records.data),
+        "noise_model": fit.noise and _noise_object(fit, fit.noise, ahead),
         "status": fit.status.name,
         "message": fit.status.value,
         "starts": fit.starts and fit.starts._asdict(),
@@ -174,6 +176,22 @@ def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
         "stop": float(record.t[-1]),
         "regular": record.interval is not None,
         "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+    }
+
+
+def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None) -> dict[str, Any]:
+    """Return the noise model for JSON, and the output-error fit beside it."""
+    errors = estimate.output_error_errors
+    return {
+        **picked(estimate.noise, ("numerator", "denominator", "innovation_variance")),
+        **picked(estimate, ("covariance", "deviance", "chosen")),
+        "prediction_fits": {str(k): fit.prediction_fit(k) for k in (1, *([ahead] if ahead else []))},
+        "output_error": {
+            "values": estimate.output_error,
+            "standard_errors": errors,
+            "fit_percent": estimate.output_error_fit,
+        },
+        "hausman": estimate.test._asdict(),
     }
 
 

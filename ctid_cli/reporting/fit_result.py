@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
@@ -18,6 +19,7 @@ from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import BIASED
+from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.reporting.document import Result, Section, pairs
@@ -66,6 +68,8 @@ class FitResult(Result):
 
     fitted: Identification
     records: Records
+    #: How many samples ahead predictions are judged besides.
+    ahead: int | None = None
 
     @classmethod
     def of(cls, fitted: Identification) -> FitResult:
@@ -148,17 +152,20 @@ class FitResult(Result):
         yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
         yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
         yield "", "y measured, x simulated, over the samples used"
+        if fit.noise is not None:
+            yield from _noise_lines(fit, fit.noise, self.ahead, units)
         if validation is not None:
             text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
             text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
             yield "validation", text
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
         yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
+        per = "cost" if fit.noise is None else "var e"
         sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
-        yield "AIC", f"{number(criteria.aic)} = N ln cost + 2 p with {sizes}"
+        yield "AIC", f"{number(criteria.aic)} = N ln {per} + 2 p with {sizes}"
         yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
-        yield "BIC", f"{number(criteria.bic)} = N ln cost + p ln N"
-        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = cost (N + p) / (N - p)"
+        yield "BIC", f"{number(criteria.bic)} = N ln {per} + p ln N"
+        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = {per} (N + p) / (N - p)"
         yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
         yield "condition number", number(fit.condition_number, 3)
         if fit.starts is not None:
@@ -169,7 +176,8 @@ class FitResult(Result):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"
                 yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
         for k, test in enumerate(self.fitted.tests, start=1):
-            yield "residuals" if len(fit.residuals) == 1 else f"residuals {k}", _tested(test)
+            what = "residuals" if fit.noise is None else "innovations"
+            yield what if len(fit.residuals) == 1 else f"{what} {k}", _tested(test)
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
         """Return the text of ``fit.json`` in a folder, from which the records are named."""
@@ -178,7 +186,39 @@ class FitResult(Result):
 
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
-        return fit_content(self.fitted, self.records)
+        return fit_content(self.fitted, self.records, self.ahead)
+
+
+def _noise_lines(
+    fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None, units: Units
+) -> Iterator[tuple[str, str]]:
+    """Return the noise model, how well it predicts, and the output-error fit beside it."""
+    noise, (p, q) = estimate.noise, estimate.orders
+    errors = np.sqrt(np.diag(estimate.covariance))
+    d, c = _polynomial(noise.denominator, errors[:p]), _polynomial(noise.numerator, errors[p:])
+    chosen = ", orders of least BIC" * estimate.chosen
+    variance = f"variance of e {number(noise.innovation_variance or 0.0)} ({units.output})^2"
+    yield "noise", f"ARMA({p},{q}){chosen}: v = C/D e, D = {d}, C = {c}; {variance}"
+    for k in dict.fromkeys((1, *([ahead] if ahead else []))):
+        old = count(k, "sample")
+        yield f"fit {k} ahead", f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {old} old"
+    with np.errstate(invalid="ignore"):
+        ratios = estimate.output_error_errors / np.sqrt(np.diag(fit.covariance))
+    each = [
+        f"{name} {number(ratio, 3)}"
+        for name, ratio in zip(fit.parameter_names, ratios.tolist(), strict=True)
+        if np.isfinite(ratio)
+    ]
+    text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {', '.join(each)}"
+    test = f"Hausman's test of the difference: p = {number(estimate.test.p_value, 2)}"
+    yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
+
+
+def _polynomial(coefficients: Sequence[float], errors: Array) -> str:
+    """Return a polynomial in q^-1 with the standard errors of its coefficients."""
+    each = zip(coefficients[1:], errors.tolist(), strict=True)
+    terms = (f" {'-' if c < 0 else '+'} {abs(c):.4g}({e:.1g}) q^-{k}" for k, (c, e) in enumerate(each, start=1))
+    return "1" + "".join(terms)
 
 
 def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
@@ -260,15 +300,16 @@ def _offset(result: Identification, units: Units) -> str:
 def _covariance_line(result: Identification) -> str:
     """What the standard errors hold for."""
     found, asked = result.uncertainty, all(test.white for test in result.tests)
-    text = "Standard errors are those for white residuals"
+    what = "residuals" if result.fit.noise is None else "innovations"
+    text = f"Standard errors are those for white {what}"
     if not result.answer.seen:
         return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
     if found.kind == "biased":
         return f"{BIASED} {_form(result.fit)}"
     if found.kind != "white":
-        text = "Standard errors are those for coloured noise" + ", because the residuals are not white" * (not asked)
+        text = f"Standard errors are those for coloured noise{f', because the {what} are not white' * (not asked)}"
     elif result.tests:
-        text += ", as the residuals pass the test"
+        text += f", as the {what} pass the test"
     if found.bootstrap is None:
         text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
         text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"

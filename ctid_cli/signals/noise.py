@@ -123,11 +123,11 @@ class Noise(Checked):
             Covariance [output unit^2].
         """
         distances = np.abs(np.asarray(lags, dtype=int))
-        transition, gain, direct = self._state_space
+        transition, gain, direct = self.state_space
         covariances = np.zeros(int(distances.max(initial=0)) + 1)
         covariances[0] = self._unit_variance
         if gain.size:
-            state = transition @ self._state_covariance[:, 0] + gain * direct
+            state = transition @ self.state_covariance[:, 0] + gain * direct
             for k in range(1, covariances.size):
                 covariances[k] = state[0]
                 state = transition @ state
@@ -162,7 +162,7 @@ class Noise(Checked):
         return float(np.sqrt(self.innovation_variance_of(noise_free))) * shape
 
     @cached_property
-    def _state_space(self) -> tuple[Array, Array, float]:
+    def state_space(self) -> tuple[Array, Array, float]:
         """Transposed direct form, whose state is that of ``scipy.signal.lfilter``: F, G and h_0."""
         states = max(map(len, self.filter)) - 1
         leading = self.filter[1][0]
@@ -172,10 +172,11 @@ class Noise(Checked):
         return transition, numerator[1:] - denominator[1:] * numerator[0], float(numerator[0])
 
     @cached_property
-    def _state_covariance(self) -> Array:
+    def state_covariance(self) -> Array:
+        """Covariance of the state in the long run, for unit innovations."""
         from scipy.linalg import solve_discrete_lyapunov
 
-        transition, gain, _ = self._state_space
+        transition, gain, _ = self.state_space
         if not gain.size:
             return np.zeros((0, 0))
         covariance: Array = solve_discrete_lyapunov(transition, np.outer(gain, gain))
@@ -184,14 +185,14 @@ class Noise(Checked):
     @cached_property
     def _state_root(self) -> Array:
         """Symmetric root of the state's covariance, which may be singular: common zeros of C and D, or an empty G."""
-        values, vectors = np.linalg.eigh(self._state_covariance)
+        values, vectors = np.linalg.eigh(self.state_covariance)
         return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=float)
 
     @cached_property
     def _unit_variance(self) -> float:
         """Variance for unit innovations."""
-        direct = self._state_space[2]
-        return direct**2 + (float(self._state_covariance[0, 0]) if self._state_covariance.size else 0.0)
+        direct = self.state_space[2]
+        return direct**2 + (float(self.state_covariance[0, 0]) if self.state_covariance.size else 0.0)
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,8 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> Esti
         raise BiasedError(f"the model has {has}: it cannot hold the system")
     if estimator.poles > fraction.order:
         raise DataError(f"the model has {has}: no data determine the poles in excess")
-    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments)
+    weighed = getattr(estimator, "noise_model", "white") != "white"
+    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed)
 
 
 def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
@@ -151,6 +152,8 @@ def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
         return "the delay is estimated too"
     if not isinstance(sampling, RegularSampling):
         return "the clock is irregular"
+    if estimated.weighed:
+        return "the noise is estimated too"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
         return f"the {name} is not white Gaussian noise held from sample to sample"
     if sampling.samples < LONG:

@@ -233,9 +233,13 @@ def _array(content: Any, dtype: Any, place: str) -> Any:
 
 def _instance(content: Any, kind: type, place: str) -> Any:
     hints = _hints(kind)
-    if not isinstance(content, Mapping) or set(content) != {"type", *hints} or content["type"] != kind.__name__:
+    defaults = {each.name: each.default for each in dataclasses.fields(kind)}
+    # Files of earlier versions lack what has been added since.
+    later = {name for name in hints if defaults[name] is not dataclasses.MISSING}
+    known = isinstance(content, Mapping) and content.get("type") == kind.__name__
+    if not known or not {*hints} - later <= {*content} - {"type"} <= {*hints}:
         _refuse_part(place)
-    values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items()}
+    values = {name: decoded(content[name], hint, f"{place}.{name}") for name, hint in hints.items() if name in content}
     late = dict.fromkeys(kind.deferred, ()) if issubclass(kind, DeferredFields) else {}
     return kind(**values, **late)
 

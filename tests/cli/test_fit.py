@@ -6,8 +6,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from ctid_cli import Record, load_fit
 from ctid_cli.cli import _progress
 from ctid_cli.cli.fit_structure import delay_bounds
 from ctid_cli.errors import UsageError
@@ -65,6 +68,24 @@ def test_every_option_reaches_the_fit(ctid, tmp_path):
     assert content["offset"]["output"][0] == pytest.approx(5.0, abs=0.1)
 
 
+def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
+    values = rows()
+    values[:, 2] += lfilter([0.1], [1.0, -0.8], np.random.default_rng(1).standard_normal(len(values)))
+    file = write(tmp_path / "noisy.csv", values)
+    arguments = ("fit", file, "--poles", 2, "--delay", "0:3", "--noise", "arma:1,1", "--predict", 5, "--out", tmp_path)
+    text = " ".join(ctid(*arguments).stdout.split())
+    for part in ("ARMA(1,1): v = C/D e", "fit 1 ahead", "fit 5 ahead", "Hausman's test", "innovations white (p ="):
+        assert part in text
+    content = json.loads(ctid(*arguments, "--json").stdout)
+    check_model(content["model"], 0.1)
+    noise = content["noise_model"]
+    assert noise["denominator"][1] == pytest.approx(-0.8, abs=4 * noise["covariance"][0][0] ** 0.5)
+    assert noise["prediction_fits"]["1"] > noise["prediction_fits"]["5"] > content["fit_percent"]
+    again, record = load_fit(tmp_path / "fit.json"), Record.from_arrays(*values.T)
+    assert again.fit.prediction_fit(5) == pytest.approx(noise["prediction_fits"]["5"], rel=1e-9)
+    assert np.isfinite(again.predict(record, 5)).all()
+
+
 def test_several_files_and_a_validation_record(ctid, record, tmp_path):
     second = write(tmp_path / "second.csv", rows(seed=1))
     third = write(tmp_path / "third.csv", rows(seed=2))
@@ -112,6 +133,11 @@ def refused(ctid, tmp_path, *arguments):
         (("--poles", 2, "--output", "z"), ["record.csv", "'z'"]),
         (("--poles", 2, "--validate", "nowhere.csv"), ["nowhere.csv"]),
         (("--poles", 2, "--bootstrap", 5), ["--bootstrap", "at least 40", "5"]),
+        (("--poles", 2, "--noise", "ar:2"), ["--noise", "white, auto or arma:P,Q", "'ar:2'"]),
+        (("--poles", 2, "--noise", "auto", "--loss", "tukey"), ["--noise", "loss squares"]),
+        (("--poles", 2, "--predict", 5), ["--predict", "add --noise auto"]),
+        (("--poles", 2, "--noise", "auto", "--predict", 0), ["--predict", "at least 1"]),
+        (("--model", "additive", "--terms", "2/0", "--noise", "auto"), ["--noise auto", "a sum of submodels"]),
     ],
 )
 def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_path):

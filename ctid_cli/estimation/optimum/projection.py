@@ -13,7 +13,7 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 49-57. doi:10.1007/BF01932995
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, order_of, polynomial
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.inference.innovations import SampledNoise
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-11
@@ -44,6 +45,13 @@ class Problem(NamedTuple):
     numerator: Array = np.zeros(0)
     #: Poles at 0 that the model has besides. The lowest powers of time are then part of a free response.
     integrators: int = 0
+    #: The noise by whose innovations errors count, of each record; empty where that is white.
+    noises: tuple[SampledNoise, ...] = ()
+
+    @property
+    def laid_out(self) -> Iterator[tuple[FilterData, float, SampledNoise | None]]:
+        """Each record, its period and its noise."""
+        return zip(self.records, self.periods, self.noises or (None,) * len(self.records), strict=True)
 
     @property
     def length(self) -> float:
@@ -207,8 +215,7 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
         own = modal[first : first + at_once]
         group = [form for k in own if isinstance(form := forms[k], Modal)]
         columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.trend)
-        each = zip(problem.records, problem.periods, strict=True)
-        rows = np.stack([triangles_of(group, columns, delay, *record) for record in each], axis=1)
+        rows = np.stack([triangles_of(group, columns, delay, *record) for record in problem.laid_out], axis=1)
         phi, y = _columns(problem, columns, rows, np.stack([form.states for form in group])[:, None])
         whole = np.concatenate((phi, y[:, :, None]), axis=2)
         lengths = np.linalg.norm(whole, axis=1, keepdims=True)
@@ -221,8 +228,8 @@ def _triangles(problem: Problem, forms: Sequence[Form], delay: Delay, second: bo
     """Return the triangles of all records, each in its form."""
     n = forms[0].states.shape[0]
     columns = Columns.of(n, second, problem.free_response, problem.trend)
-    each = zip(forms, problem.records, problem.periods, strict=True)
-    rows = np.stack([triangle_of(form, columns, delay, data, period) for form, data, period in each])
+    each = zip(forms, problem.laid_out, strict=True)
+    rows = np.stack([triangle_of(form, columns, delay, *record) for form, record in each])
     return Triangles(forms[0], columns, delay, rows)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
 from ctid_cli.filtering.filter_data import FilterData, split_delay
+from ctid_cli.inference.innovations import SampledNoise, Whitener
 
 
 class Delay(NamedTuple):
@@ -73,9 +74,15 @@ class Columns(NamedTuple):
 
 
 def rows_of(
-    form: Fractions | Chain, columns: Columns, delay: Delay, data: FilterData, period: float
+    form: Fractions | Chain,
+    columns: Columns,
+    delay: Delay,
+    data: FilterData,
+    period: float,
+    noise: SampledNoise | None = None,
 ) -> Iterator[Array]:
-    """Yield the rows of the used samples, transposed, piece by piece."""
+    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given."""
+    whitener = None if noise is None else Whitener(noise.noise, columns.size)
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
     for forced in form.forced(record, second):
@@ -88,6 +95,8 @@ def rows_of(
             rows[columns.free_states] = form.free(elapsed[done : done + len(forced)] - elapsed[0], second)
         for row, power in zip(rows[columns.powers], columns.trend, strict=True):
             row[:] = (elapsed[done : done + len(forced)] - data.t[0]) ** power if power else 1.0
+        if noise is not None and whitener is not None:
+            whitener(rows, noise.steps[done : done + len(forced)])
         done += len(forced)
         yield rows
 
@@ -104,17 +113,26 @@ def _reduced(triangle: Array | None, rows: Array) -> Array:
     return result
 
 
-def triangle_of(form: Form, columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
+def triangle_of(
+    form: Form, columns: Columns, delay: Delay, data: FilterData, period: float, noise: SampledNoise | None = None
+) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     # Memory is that of one piece, however long the record.
     triangle: Array | None = None
-    for rows in rows_of(form, columns, delay, data, period):
+    for rows in rows_of(form, columns, delay, data, period, noise):
         triangle = _reduced(triangle, rows)
     assert triangle is not None
     return triangle
 
 
-def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: FilterData, period: float) -> Array:
+def triangles_of(
+    forms: list[Modal],
+    columns: Columns,
+    delay: Delay,
+    data: FilterData,
+    period: float,
+    noise: SampledNoise | None = None,
+) -> Array:
     """Return the triangles of several forms of one order without w, from one pass of all their modes: (K, q, q)."""
     poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
     widths = np.where(poles.imag > 0.0, 2, 1)
@@ -129,7 +147,7 @@ def triangles_of(forms: list[Modal], columns: Columns, delay: Delay, data: Filte
     chosen += [np.tile(others[whole.powers], (len(forms), 1))]
     rows_of_forms = np.hstack(chosen)
     triangles: list[Array | None] = [None] * len(forms)
-    for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period):
+    for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period, noise):
         triangles = [_reduced(*pair) for pair in zip(triangles, rows[rows_of_forms], strict=True)]
     return np.array(triangles)
 

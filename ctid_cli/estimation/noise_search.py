@@ -1,0 +1,70 @@
+r"""Plant and ARMA noise of the greatest joint likelihood, from the least output error.
+
+Given the noise, the least squares of the innovations have the plant; given the plant, the output errors have the noise.
+Either step raises the likelihood, and where neither does any more its slope by all parameters is zero. In open loop
+the information on both is block-diagonal, so that a few rounds do.
+"""
+
+from typing import NamedTuple
+
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import LONG, Optimum
+from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
+
+#: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
+SETTLED, MOST_ROUNDS = 1e-6, 40
+
+
+class JointOptimum(NamedTuple):
+    """The greatest likelihood that was found."""
+
+    found: Optimum
+    noise: NoiseFit
+
+
+def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None, nested: bool) -> JointOptimum:
+    """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC.
+
+    If nested, plants are searched once more as the innovations under that noise see them, smaller ones included.
+    """
+    joint = _near(measured, found, orders)
+    if not nested or not sum(joint.noise.orders) or sum(e.size for e in measured.outputs) > LONG:
+        return joint
+    other = measured.whitened_by(joint.noise.noise).best([(found.denominator, found.delay)], nested)
+    if other.denominator.size != found.denominator.size:
+        return joint
+    return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)
+
+
+def _near(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
+    """Plant and noise in the basin of an output-error optimum."""
+    steps = [steps_of(use) for use in measured.used()]
+    if orders is not None:
+        return _settled(measured, JointOptimum(found, fit_arma(_errors(measured, found), steps, orders)))
+    fits: dict[Orders, NoiseFit] = {}
+    tried: dict[Orders, JointOptimum] = {}
+    while True:
+        # The output-error fit has taken a part of the noise with it: once more from the joint one.
+        fits = all_arma(_errors(measured, found), steps, fits)
+        chosen = min(fits.values(), key=lambda fit: fit.bic)
+        if chosen.orders in tried:
+            return min(tried.values(), key=lambda joint: joint.noise.bic)
+        joint = tried[chosen.orders] = _settled(measured, JointOptimum(found, chosen))
+        found = joint.found
+
+
+def _errors(measured: MeasuredRecords, found: Optimum) -> list[Array]:
+    return [y - x for y, x in zip(measured.outputs, measured.simulated(found), strict=True)]
+
+
+def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
+    """Plant and noise in turn, until the likelihood rises no further."""
+    (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
+    for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
+        found = measured.whitened_by(noise.noise).local((found.denominator, found.delay))
+        following = fit_arma(_errors(measured, found), steps, noise.orders, noise)
+        settled, noise = noise.deviance - following.deviance < SETTLED, following
+        if settled:
+            break
+    return JointOptimum(found, noise)

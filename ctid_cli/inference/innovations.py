@@ -1,0 +1,285 @@
+r"""ARMA models of output noise by exact maximum likelihood, their innovations and predictions.
+
+With ``v = C(q)/D(q) e`` in the state space of :class:`~ctid_cli.signals.noise.ArmaNoise`, ``z+ = F z + G e`` and
+``v = z_1 + e``, a Kalman filter that starts from the stationary covariance gives the innovations i_t of a record and
+their variances ``s^2 f_t``, the first sample included; where samples are missing it goes on without them. So
+
+.. math:: v'V^{-1}v = \sum_t i_t^2 / f_t, \qquad \ln|V| = \sum_t \ln f_t,
+
+and minimising ``-2 ln L = N ln(v'V^-1 v/N) + ln|V|`` is least squares of ``|V|^(1/2N) i_t / f_t^(1/2)`` [1]_.
+
+References
+----------
+.. [1] A. C. Harvey and G. D. A. Phillips, "Maximum likelihood estimation of regression models with
+   autoregressive-moving average disturbances", *Biometrika* 66 (1979) 49-58. doi:10.1093/biomet/66.1.49
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.inference.noise_model import levinson
+from ctid_cli.signals.noise import ArmaNoise
+
+#: Numbers of coefficients of D and of C.
+Orders = tuple[int, int]
+#: Greatest orders among which BIC chooses, and greatest ones that can be given.
+MOST_CHOSEN, MOST_GIVEN = 3, 8
+#: Greatest inverse hyperbolic tangent of a partial correlation, which is then 1 - 1.7e-6.
+FARTHEST = 7.0
+#: Lags of the autoregression whose residuals start Hannan and Rissanen's regression, for each coefficient, and at
+#: least this number of samples for each lag.
+LONG_LAGS, SAMPLES_PER_LAG = 10, 10
+#: Relative falls of the scaled squares at which a fit has ended, the rough ones where orders are compared; evaluations.
+EXACT, ROUGH, EVALUATIONS = 1e-12, 1e-6, 40
+#: Step of differences by the transformed partial correlations.
+DIFFERENCE = 1e-5
+
+
+@njit(cache=True, nogil=True)
+def filter_innovations(
+    rows: Array, steps: IntArray, denominator: Array, gain: Array, states: Array, covariance: Array, after: Array
+) -> float:
+    """Make innovations over their standard deviations of each row, in place; states and covariance go on.
+
+    ``steps`` are the intervals of the clock from the sample before to each sample, 0 or 1 at the first one. F shifts,
+    and has minus the denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of the
+    variances; ``after`` gets the predicted states of the first row, if there is room.
+    """
+    r, logarithms, known = gain.size, 0.0, False
+    # A column and a row of zeros save questions at the ends.
+    moved, feedback, old = np.zeros((r + 1, r + 1)), gain.copy(), np.zeros(r + 1)
+    for t in range(steps.size):
+        # An interval without a sample, any number of times, then one with it, which ends in the prediction of the next.
+        for left in range(max(steps[t], 1) - 1, -1, -1):
+            variance = 1.0
+            if not known or left:
+                if r:
+                    variance += covariance[0, 0]
+                for i in range(r):
+                    for j in range(r):
+                        moved[i, j] = covariance[i, j]
+                for i in range(r):
+                    feedback[i] = (moved[i + 1, 0] - denominator[i] * moved[0, 0] + gain[i]) / variance
+                largest = 0.0
+                for i in range(r):
+                    for j in range(r):
+                        value = (
+                            moved[i + 1, j + 1] - denominator[j] * moved[i + 1, 0] - denominator[i] * moved[0, j + 1]
+                        )
+                        value += denominator[i] * denominator[j] * moved[0, 0] + gain[i] * gain[j]
+                        if not left:
+                            value -= variance * feedback[i] * feedback[j]
+                        covariance[i, j] = value
+                        largest = max(largest, abs(value))
+                # Once the state is known it stays known, while no sample is missing.
+                known = not left and largest < 1e-14
+            for k in range(rows.shape[0]):
+                for i in range(r):
+                    old[i] = states[i, k]
+                innovation = 0.0 if left else rows[k, t] - old[0]
+                for i in range(r):
+                    states[i, k] = old[i + 1] - denominator[i] * old[0] + feedback[i] * innovation
+                if not left:
+                    rows[k, t] = innovation / variance**0.5
+        logarithms += np.log(variance)
+        for i in range(after.shape[1] if after.size else 0):
+            after[t, i] = states[i, 0]
+    return logarithms
+
+
+class Whitener:
+    """The filter of one record on its way over the samples, for any number of rows."""
+
+    def __init__(self, noise: ArmaNoise, rows: int) -> None:
+        self.transition, self.gain, _ = noise.state_space
+        self.states, self.covariance = np.zeros((self.gain.size, rows)), noise.state_covariance.copy()
+        #: ``ln|V|`` of the samples so far, for innovations of variance one.
+        self.logarithm = 0.0
+
+    def __call__(self, rows: Array, steps: IntArray, after: Array | None = None) -> Array:
+        """Whiten further samples of all rows in place, shape (rows, count)."""
+        after = np.zeros((0, self.gain.size)) if after is None else after
+        own = -self.transition[:, 0] if self.gain.size else self.gain, self.gain, self.states, self.covariance
+        self.logarithm += filter_innovations(rows, steps, *own, after)
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class SampledNoise:
+    """The noise of one record at its used samples."""
+
+    noise: ArmaNoise
+    #: Intervals of the clock from each used sample to the next; 0 at the first one, shape (count,).
+    steps: IntArray
+
+    def whitened(self, columns: Array) -> Array:
+        """Innovations, over their standard deviations, of a signal or of columns of them."""
+        rows = np.array(np.atleast_2d(columns.T), dtype=float, order="C")
+        return np.asarray(Whitener(self.noise, len(rows))(rows, self.steps).T.reshape(columns.shape))
+
+    def predicted(self, errors: Array, ahead: int) -> Array:
+        """Prediction of the noise from samples that are at least so many intervals old; zero without any."""
+        states = np.zeros((errors.size, self.steps.size and Whitener(self.noise, 1).gain.size))
+        whitener, places = Whitener(self.noise, 1), np.cumsum(self.steps)
+        whitener(errors[None].copy(), self.steps, states)
+        last = np.searchsorted(places, places - ahead, side="right") - 1
+        found = np.zeros(errors.size)
+        for later in np.unique((places - places[last])[last >= 0]).tolist() if states.size else ():
+            of = (last >= 0) & (places - places[last] == later)
+            found[of] = states[last[of]] @ np.linalg.matrix_power(whitener.transition, later - 1)[0]
+        return found
+
+
+def steps_of(used: BoolArray) -> IntArray:
+    """Intervals of a regular clock from each used sample to the next, 0 at the first one."""
+    places = np.flatnonzero(used)
+    return np.diff(places, prepend=places[:1])
+
+
+def sampled(noise: ArmaNoise, used: Sequence[BoolArray]) -> tuple[SampledNoise, ...]:
+    """The noise at the used samples of records with regular clocks."""
+    return tuple(SampledNoise(noise, steps_of(use)) for use in used)
+
+
+class NoiseFit(NamedTuple):
+    """ARMA noise of the greatest likelihood."""
+
+    noise: ArmaNoise
+    #: ``-2 ln L`` but for a constant.
+    deviance: float
+    samples: int
+
+    @property
+    def orders(self) -> Orders:
+        """Numbers of coefficients of D and C."""
+        return len(self.noise.denominator) - 1, len(self.noise.numerator) - 1
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, the coefficients of the noise alone being counted."""
+        return self.deviance + sum(self.orders) * float(np.log(self.samples))
+
+
+class _Likelihood:
+    """Least squares that have the likelihood, by the transformed partial correlations z of D and C."""
+
+    def __init__(self, errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders) -> None:
+        self.errors, self.steps, self.orders = errors, steps, orders
+        self.count = sum(e.size for e in errors)
+
+    def noise(self, z: Array, variance: float = 1.0) -> ArmaNoise:
+        """The model with some innovation variance."""
+        d, c = (levinson(part)[0].tolist() for part in np.split(np.tanh(z), [self.orders[0]]))
+        return ArmaNoise(tuple(c), tuple(d), innovation_variance=variance)
+
+    def innovations(self, z: Array) -> tuple[Array, float]:
+        """Innovations over their standard deviations, and ``ln|V|``."""
+        noise, parts, logarithm = self.noise(z), [], 0.0
+        for e, steps in zip(self.errors, self.steps, strict=True):
+            whitener = Whitener(noise, 1)
+            parts.append(whitener(e[None].copy(), steps)[0])
+            logarithm += whitener.logarithm
+        return np.concatenate(parts), logarithm
+
+    def scaled(self, z: Array) -> Array:
+        """The same times ``|V|^(1/2N)``."""
+        white, logarithm = self.innovations(z)
+        return np.asarray(white * np.exp(logarithm / (2 * self.count)))
+
+    def found(self, z: Array, tolerance: float) -> NoiseFit:
+        """The minimum that a start leads to."""
+        if z.size:
+            from scipy.optimize import least_squares  # slow to import
+
+            start, bounds = np.clip(z, -0.99 * FARTHEST, 0.99 * FARTHEST), (-FARTHEST, FARTHEST)
+            limits = {"ftol": tolerance, "xtol": 1e-8, "gtol": 1e-12, "max_nfev": EVALUATIONS}
+            z = least_squares(self.scaled, start, bounds=bounds, x_scale="jac", **limits).x
+        white, logarithm = self.innovations(z)
+        variance = float(white @ white) / self.count
+        return NoiseFit(self.noise(z, variance), self.count * float(np.log(variance)) + logarithm, self.count)
+
+
+def fit_arma(
+    errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders, *near: NoiseFit, tolerance: float = EXACT
+) -> NoiseFit:
+    """ARMA noise of given orders with the greatest likelihood, from Hannan and Rissanen's and from nearby models."""
+    starts = [_transformed(*_padded(fit.noise, orders)) for fit in near]
+    if not any(fit.orders == orders for fit in near):
+        starts.append(_transformed(*_hannan_rissanen(errors, orders)))
+    likelihood = _Likelihood(errors, steps, orders)
+    return min((likelihood.found(start, tolerance) for start in starts), key=lambda fit: fit.deviance)
+
+
+def all_arma(
+    errors: Sequence[Array], steps: Sequence[IntArray], near: Mapping[Orders, NoiseFit]
+) -> dict[Orders, NoiseFit]:
+    """ARMA noises up to ARMA(3,3), each from a nearby one of its orders, or else also from those that it contains."""
+    fits: dict[Orders, NoiseFit] = {}
+    for p, q in sorted(product(range(MOST_CHOSEN + 1), repeat=2), key=sum):
+        inner = [near[p, q]] if near else [fits[each] for each in ((p - 1, q), (p, q - 1)) if each in fits]
+        fits[p, q] = fit_arma(errors, steps, (p, q), *inner, tolerance=ROUGH)
+    return fits
+
+
+def coefficient_slopes(noise: ArmaNoise, errors: Sequence[Array], steps: Sequence[IntArray]) -> Array:
+    """Derivatives of the scaled innovations by the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (N, P + Q)."""
+    orders = len(noise.denominator) - 1, len(noise.numerator) - 1
+    if not sum(orders):
+        return np.zeros((sum(e.size for e in errors), 0))
+    likelihood = _Likelihood(errors, steps, orders)
+    z = _transformed(np.array(noise.denominator), np.array(noise.numerator))
+    each = DIFFERENCE * np.eye(z.size)
+    by_z = [(likelihood.scaled(z + h) - likelihood.scaled(z - h)) / (2 * DIFFERENCE) for h in each]
+    partial, p, slopes = np.tanh(z), orders[0], np.zeros((z.size, z.size))
+    slopes[:p, :p], slopes[p:, p:] = (levinson(part)[1][:, 1:] for part in np.split(partial, [p]))
+    return np.column_stack(by_z) @ np.linalg.inv(slopes * (1.0 - partial**2)[:, None]).T
+
+
+def _padded(noise: ArmaNoise, orders: Orders) -> tuple[Array, Array]:
+    """D and C with coefficients that are zero."""
+    d, c = np.array(noise.denominator), np.array(noise.numerator)
+    return np.pad(d, (0, orders[0] + 1 - d.size)), np.pad(c, (0, orders[1] + 1 - c.size))
+
+
+def _transformed(*polynomials: Array) -> Array:
+    """Inverse hyperbolic tangents of the partial correlations, of unstable polynomials those of the mirrored ones."""
+    found = []
+    for polynomial in polynomials:
+        roots = np.roots(polynomial)
+        outside = np.abs(roots) > 1.0
+        roots[outside] = 1.0 / roots[outside].conj()
+        c = np.pad(np.atleast_1d(np.poly(roots)).real, (0, polynomial.size - 1 - roots.size))
+        partial = np.zeros(c.size - 1)
+        for k in range(partial.size, 0, -1):
+            # Levinson's recursion backwards.
+            value = partial[k - 1] = np.clip(c[k], -np.tanh(FARTHEST), np.tanh(FARTHEST))
+            c = (c[:k] - value * c[k:0:-1]) / (1.0 - value**2)
+        found.append(np.arctanh(partial))
+    return np.concatenate(found)
+
+
+def _hannan_rissanen(errors: Sequence[Array], orders: Orders) -> tuple[Array, Array]:
+    """D and C by regression on the noise before and on the residuals of a long autoregression; gaps are not seen."""
+    (p, q), count = orders, sum(e.size for e in errors)
+    lags = max(min(LONG_LAGS * (p + q), count // SAMPLES_PER_LAG), p, q)
+    blocks = [_lagged(e, lags) for e in errors]
+    past = np.concatenate([block[lags:] for block in blocks])
+    long = np.linalg.lstsq(past[:, 1:], past[:, 0])[0]
+    whites = [_lagged(block[:, 0] - block[:, 1:] @ long, q)[:, 1:] for block in blocks]
+    rows = [np.column_stack((-block[:, 1 : p + 1], white)) for block, white in zip(blocks, whites, strict=True)]
+    now = np.concatenate([e[lags + q :] for e in errors])
+    found = np.linalg.lstsq(np.concatenate([each[lags + q :] for each in rows]), now)[0]
+    return np.concatenate(([1.0], found[:p])), np.concatenate(([1.0], found[p:]))
+
+
+def _lagged(e: Array, lags: int) -> Array:
+    """A signal and its past, zero before the first sample, shape (N, lags + 1)."""
+    return np.column_stack(
+        [np.concatenate((np.zeros(min(k, e.size)), e[: max(e.size - k, 0)])) for k in range(lags + 1)]
+    )

@@ -1,0 +1,129 @@
+"""Plant and noise by maximum likelihood: against white noise, dense covariance matrices and a general optimiser."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import cholesky, solve_triangular, toeplitz
+from scipy.optimize import least_squares
+
+from ctid_cli import DelayProfile, HeldSignal, Record, Rivc, TransferFunction, identify, simulate
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.inference.covariance import condition_number
+from ctid_cli.inference.fit import Status
+from ctid_cli.signals.noise import ArmaNoise
+
+SYSTEM = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537)
+KNOWN = {"poles": 2, "zeros": 0, "delay_bounds": (0.537, 0.537)}
+SLOW = ((1.0, 0.2679), (1.0, -1.98, 0.9802))
+FAST = ((1.0, 0.9), (1.0, -1.0, 0.2))
+
+
+def record_of(noise=FAST, seed=0, n=300, *, missing=0, offset=0.0):
+    rng = np.random.default_rng(seed)
+    t = 0.1 * np.arange(n)
+    signal = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], n // 5), 5))
+    x = simulate(SYSTEM, signal, t)
+    y = x + offset + ArmaNoise(*noise, snr_db=15.0).generate(x, rng)
+    y[rng.choice(n, missing, replace=False)] = np.nan
+    return Record(t, y, signal)
+
+
+@pytest.mark.parametrize("known_delay", [True, False])
+def test_arma_of_no_order_is_white_noise(known_delay):
+    options = DelayProfile(**KNOWN) if known_delay else DelayProfile(2, 0, (0.0, 2.0))
+    record = record_of(((1.0,), (1.0,)))
+    white, arma = options.fit(record), replace(options, noise_model="arma:0,0").fit(record)
+    np.testing.assert_allclose(arma.theta, white.theta, rtol=1e-12)
+    np.testing.assert_allclose(arma.covariance, white.covariance, rtol=1e-9)
+    assert arma.noise.noise.innovation_variance == pytest.approx(white.cost, rel=1e-12)
+    assert arma.prediction_fit(1) == pytest.approx(white.prediction_fit(1), rel=1e-12)
+    assert np.isnan(arma.noise.test.p_value)
+
+
+@pytest.mark.parametrize(("noise", "orders"), [(FAST, (2, 1)), (SLOW, (2, 1))], ids=["fast", "slow"])
+def test_a_general_optimiser_of_the_dense_likelihood_finds_nothing_better(noise, orders):
+    """Two records, samples missing, each with an offset; all parameters of plant and noise at once."""
+    records = [record_of(noise, seed, 120 + 30 * seed, missing=12, offset=seed) for seed in (1, 2)]
+    options = DelayProfile(**KNOWN, offset="estimate", noise_model="arma:{},{}".format(*orders))
+    fit = options.fit(records)
+    assert fit.status is Status.CONVERGED
+    count = sum(record.valid.sum() for record in records)
+
+    def scaled(theta):
+        plant, (a1, a2, b0), offsets = theta[:5], theta[:3], theta[3:5]
+        d, c = np.split(theta[plant.size :], [orders[0]])
+        law, parts, logarithm = ArmaNoise((1.0, *c), (1.0, *d), innovation_variance=1.0), [], 0.0
+        for record, offset in zip(records, offsets, strict=True):
+            use = record.valid
+            root = cholesky(toeplitz(law.autocovariance(np.arange(use.size)))[np.ix_(use, use)], lower=True)
+            x = simulate(TransferFunction([b0], [1.0, a1, a2], 0.537), record.input, record.t)
+            parts.append(solve_triangular(root, (record.y - x - offset)[use], lower=True))
+            logarithm += 2 * np.log(np.diag(root)).sum()
+        return np.concatenate(parts) * np.exp(logarithm / (2 * count))
+
+    arma = fit.noise.noise
+    theta = np.array([*fit.theta, *arma.denominator[1:], *arma.numerator[1:]])
+    own = scaled(theta)
+    assert fit.noise.deviance == pytest.approx(count * np.log(own @ own / count), abs=1e-6)
+    scale = np.sqrt([*np.diag(fit.covariance), *np.diag(fit.noise.covariance)])
+    found = least_squares(lambda z: scaled(theta + scale * z), np.zeros(theta.size), xtol=1e-12, ftol=1e-14)
+    assert count * np.log(2.0 * found.cost / count) > fit.noise.deviance - 1e-4
+    assert np.abs(found.x).max() < 0.02
+    # Standard errors are from the joint information of plant and noise.
+    slopes = np.column_stack([(scaled(theta + h) - scaled(theta - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
+    information = np.linalg.inv(slopes.T @ slopes)[:5, :5] * np.outer(scale[:5], scale[:5])
+    expected = np.sqrt(np.diag(information) * (own @ own) / (count - 5))
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("missing", [0, 30])
+def test_predictions_on_the_own_record_are_those_of_the_fit(missing):
+    record = record_of(missing=missing)
+    found = identify([record], Rivc(**KNOWN, offset="estimate", noise_model="arma:2,1"))
+    used, (errors,) = found.fit.used[0], found.fit.residuals
+    assert np.isnan(found.predict(record)[~used]).all()
+    for ahead in (1, 5):
+        left = record.y[used] - found.predict(record, ahead)[used]
+        spread = np.linalg.norm(record.y[used] - record.y[used].mean())
+        expected = 100.0 * (1.0 - np.linalg.norm(left) / spread)
+        assert found.fit.prediction_fit(ahead) == pytest.approx(expected, rel=1e-5)
+    # The innovations are the errors one sample ahead over their standard deviations, which settle at once.
+    (innovations,) = found.fit.linear.residuals
+    if not missing:
+        np.testing.assert_allclose((record.y - found.predict(record))[50:], innovations[50:], atol=1e-4)
+    # What is far enough is the simulated output.
+    np.testing.assert_allclose(found.predict(record, 200)[used][-50:], (record.y[used] - errors)[-50:], atol=1e-4)
+    with pytest.raises(OptionError, match="ahead"):
+        found.predict(record, 0)
+
+
+def test_the_noise_model_is_chosen_and_what_it_gives_is_seen():
+    found = identify([record_of(SLOW, n=600)], Rivc(2, 0, (0.0, 2.0)))
+    assert found.fit.noise.chosen
+    assert found.fit.noise.orders == (2, 1)
+    errors = np.array([*SYSTEM.denominator[1:], *SYSTEM.numerator, SYSTEM.delay]) - found.fit.theta
+    assert np.abs(errors / np.sqrt(np.diag(found.fit.covariance))).max() < 4
+    assert (found.fit.noise.output_error_errors / np.sqrt(np.diag(found.fit.covariance)) > 5).all()
+    assert found.tests[0].white
+    assert found.fit.prediction_fit(1) > found.fit.prediction_fit(10) > found.fit.fit_percent
+    assert found.criteria.parameters == 7
+    assert condition_number(np.linalg.inv(found.uncertainty.covariance)) < 1e6
+
+
+def test_a_plant_of_too_few_poles_is_detected():
+    (warning,) = (
+        text
+        for text in identify([record_of(n=600)], Rivc(1, 0, (0.0, 2.0), noise_model="arma:2,1")).warnings
+        if "Hausman" in text
+    )
+    assert "the model of the plant or of the noise is too small" in warning
+
+
+def test_what_a_noise_model_does_not_go_with():
+    record = record_of()
+    shifted = Record(record.t + 0.03 * np.sin(np.arange(300)), record.y, record.input)
+    with pytest.raises(DataError, match=r"irregular.*--noise white"):
+        Rivc(**KNOWN).fit(shifted)
+    with pytest.raises(OptionError, match="loss squares, not tukey"):
+        DelayProfile(**KNOWN, loss="tukey", noise_model="auto")
