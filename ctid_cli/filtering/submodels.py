@@ -36,7 +36,7 @@ from ctid_cli.filtering.bank import (
     to_steady_state,
 )
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
-from ctid_cli.filtering.loop import NO_RELAY, law_of
+from ctid_cli.filtering.loop import law_of, loop_pass
 from ctid_cli.filtering.simulate import sampled_chains
 from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import DiscreteController
@@ -234,8 +234,7 @@ class SubmodelFilter:
             direct = float(model.direct.sum())
             return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop))
         plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
-        signals = reference, np.zeros(reference.size), float(self.loop.at_controller)
-        return np.asarray(kernels.loop_signals((*plant,), law, NO_RELAY, *signals)[0])
+        return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
 
     def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
         """Return the record with its input late by whole intervals, the delay left, and states that come back."""
