@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -168,6 +168,8 @@ class ContinuousController:
     >>> ContinuousController([1.0, 2.0], [2.0, 0.0]).numerator
     array([0.5, 1. ])
     """
+
+    continuous: ClassVar[bool] = True
 
     numerator: Array
     denominator: Array
