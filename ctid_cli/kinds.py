@@ -40,6 +40,7 @@ KINDS: dict[str, dict[str, str]] = {
         "useful_redundancy": "ctid_cli.estimators.useful_redundancy:UsefulRedundancy",
         "delay_profile": "ctid_cli.estimators.delay_profile:DelayProfile",
         "additive_srivc": "ctid_cli.estimators.additive_srivc:AdditiveSrivc",
+        "loop_output_error": "ctid_cli.estimators.loop_output_error:LoopOutputError",
     },
     "frequency_estimator": {
         "drem_gradient": "ctid_cli.frequency.drem:DremGradient",

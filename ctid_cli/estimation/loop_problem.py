@@ -61,6 +61,12 @@ class Columns(NamedTuple):
         kept = s > RANK * s[0]
         return U[:, kept], (Vt[kept] / s[kept, None]).T / lengths[:, None]
 
+    @property
+    def own(self) -> Array:
+        """The best state and offset."""
+        Q, combined = self.basis
+        return np.asarray(combined @ (Q.T @ self.left))
+
 
 @dataclass(frozen=True, eq=False)
 class LoopProblem:
@@ -70,6 +76,8 @@ class LoopProblem:
     data: FilterData
     response: LoopResponse
     offset: bool
+    #: Whether the state at the first sample is estimated, and not that of rest.
+    free_state: bool
     #: Bounds of the delay [s]; equal where it is known.
     delays: tuple[float, float]
     #: Sampling interval that the delay is in, None where it is not moved.
@@ -104,6 +112,11 @@ class LoopProblem:
         h = self.data.interval
         return max(self.delays[0], self.cell * h), min(self.delays[1], (self.cell + 1) * h)
 
+    def cell_of(self, delay: float) -> int:
+        """Return the sampling interval that a delay is in, the last one if it is the greatest."""
+        h = self.data.interval
+        return min(int(delay / h), int(np.ceil(self.delays[1] / h)) - 1)
+
     def admissible(self, theta: Array) -> Array:
         """Parameters with the delay moved into its bounds; poles may be anywhere."""
         moved = theta.copy()
@@ -112,14 +125,23 @@ class LoopProblem:
         return moved
 
     def columns(self, theta: Array, count: int | None = None) -> Columns | None:
-        """Return what parameters say of the samples; None where the response is not finite."""
+        """Return what parameters say of the samples with the best state and offset; None where it is not finite."""
+        count, use = self.free if count is None else count, self.data.use
+        linear, state = np.ones((self.samples, int(self.offset))), None
         with np.errstate(all="ignore"):
-            rows = self.response.rows(theta, self.free if count is None else count, self.cell)
-        if not all(np.isfinite(part).all() for part in rows):
+            if self.free_state:
+                left = (self.data.y - self.response.rows(theta, 0, self.cell).output)[use]
+                linear = np.column_stack((self.response.free(theta, self.cell)[use], linear))
+                if not (np.isfinite(linear).all() and np.isfinite(left).all()):
+                    return None
+                state = Columns(np.zeros((0, 0)), linear, left).own[: linear.shape[1] - int(self.offset)]
+            rows = self.response.rows(theta, count, self.cell, state)
+        if not (np.isfinite(rows.output).all() and np.isfinite(rows.slopes).all()):
             return None
-        use = self.data.use
-        linear = np.column_stack((rows.free[use], np.ones((self.samples, int(self.offset)))))
-        return Columns(rows.slopes[use], linear, (self.data.y - rows.output)[use])
+        left = (self.data.y - rows.output)[use]
+        if state is not None:
+            left += linear[:, : state.size] @ state
+        return Columns(rows.slopes[use], linear, left)
 
     def rows(self, theta: Array) -> tuple[Array, Array] | None:
         """Sensitivities and output error at the used samples, of the best state and offset."""
@@ -247,9 +269,7 @@ class LoopProblem:
         if low == high:
             result = iterate(self, theta, STEPS)
             return None if result is None else LoopEstimate(self, result)
-        h = self.data.interval
-        last = int(np.ceil(high / h)) - 1
-        cell, found = min(int(theta[-1] / h), last), None
+        cell, found = self.cell_of(theta[-1]), None
         for _ in range(MOST_CELLS):
             problem = replace(self, cell=cell)
             result = iterate(problem, theta, STEPS)

@@ -15,6 +15,7 @@ from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
+from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
@@ -253,5 +254,5 @@ def _padded(b: Array, size: int) -> Array:
 
 
 #: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | MeasuredSubmodels
-LaidOut = MeasuredRecords | LaidOutSubmodels
+Options = DelayProfile | MeasuredSubmodels | LoopOutputError
+LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop

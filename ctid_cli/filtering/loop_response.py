@@ -11,7 +11,7 @@ derivatives ``dz`` of the signals are those of the same loop without reference, 
 ``dc z + dd u`` added to the output.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -31,13 +31,10 @@ TINY = 1e-30
 
 
 class LoopRows(NamedTuple):
-    """Output at all samples, and its derivatives."""
+    """Output at all samples, and its derivatives by the parameters, shape (N, p)."""
 
     output: Array
-    #: By the parameters, shape (N, p).
     slopes: Array
-    #: By the states of plant and controller and the inputs on their way at the first sample, shape (N, f).
-    free: Array
 
 
 class _Plant(NamedTuple):
@@ -60,8 +57,6 @@ class LoopResponse:
     poles: int
     zeros: int
     integrators: int = 0
-    #: Whether the state at the first sample is any, and not that of rest.
-    free_state: bool = False
 
     @property
     def continuous(self) -> bool:
@@ -69,12 +64,20 @@ class LoopResponse:
         return isinstance(self.controller, ContinuousController)
 
     def rows(self, theta: Array, count: int, cell: int | None = None, state: Array | None = None) -> LoopRows:
-        """Return the output and its derivatives by the first ``count`` parameters.
+        """Return the output from a state, by default of rest, and its derivatives by the first ``count`` parameters.
 
-        ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink.
+        ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink. A state is
+        that of the plant, of the controller, and the inputs on their way at the first sample.
         """
-        found = self._continuous(theta, count) if self.continuous else self._discrete(theta, count, cell)
-        return found if state is None else found._replace(output=found.output + found.free @ state)
+        return self._continuous(theta, count, state) if self.continuous else self._discrete(theta, count, cell, state)
+
+    def free(self, theta: Array, cell: int | None = None) -> Array:
+        """Return the responses to each part of the state without reference, shape (N, f)."""
+        still = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
+        size = self.poles + self.integrators + self.controller.denominator.size - 1
+        if not self.continuous:
+            size += self._sampled(theta, cell).shift
+        return np.column_stack([still.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
 
     def radius(self, theta: Array) -> float:
         """Largest magnitude of the poles of the loop, over one sampling interval; it is stable below 1."""
@@ -121,11 +124,14 @@ class LoopResponse:
         assert isinstance(self.controller, DiscreteController)
         return law_of(self.controller)
 
-    def _discrete(self, theta: Array, count: int, cell: int | None) -> LoopRows:
-        plant, r = _real(self._sampled(theta, cell)), self.data.u
-        none, nothing, law = np.zeros_like(r), np.zeros((r.size, 0)), self._law
-        u, y, z = loop_pass(plant, law, r, none, self.at_controller)
-        arriving = np.concatenate((np.zeros(min(plant.shift, r.size)), u[: max(r.size - plant.shift, 0)]))
+    def _discrete(self, theta: Array, count: int, cell: int | None, state: Array | None) -> LoopRows:
+        plant, r, law = _real(self._sampled(theta, cell)), self.data.u, self._law
+        n, none = plant.from_input.size, np.zeros_like(r)
+        state = np.zeros(n + law[1].size + plant.shift) if state is None else state
+        late = state[n + law[1].size :].copy()
+        start = state[:n].copy(), state[n : n + law[1].size].copy(), late
+        u, y, z = loop_pass(plant, law, r, none, self.at_controller, start=start)
+        arriving = np.concatenate((late, u))[: r.size]
         slopes = np.empty((r.size, count))
         for j in range(count):
             by = _slope(self._sampled(_stepped(theta, j), cell))
@@ -133,13 +139,7 @@ class LoopResponse:
             moved = by.transition.any() or by.from_input.any()
             push = z @ by.transition.T + np.outer(arriving, by.from_input) if moved else None
             slopes[:, j] = loop_pass(plant, law, none, added, self.at_controller, push=push)[1] + added
-        free = nothing
-        if self.free_state:
-            sizes = np.cumsum([plant.from_input.size, law[1].size])
-            units = np.eye(int(sizes[-1]) + plant.shift)
-            starts = [(unit[: sizes[0]], unit[sizes[0] : sizes[1]], unit[sizes[1] :]) for unit in units]
-            free = np.column_stack([loop_pass(plant, law, none, none, True, start=start)[1] for start in starts])
-        return LoopRows(y, slopes, free)
+        return LoopRows(y, slopes)
 
     # --- a controller in continuous time -----------------------------------------------------------
 
@@ -161,13 +161,13 @@ class LoopResponse:
         seen = (1.0 if self.at_controller else 0.0) - direct
         return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * seen)), y, direct
 
-    def _continuous(self, theta: Array, count: int) -> LoopRows:
+    def _continuous(self, theta: Array, count: int, state: Array | None) -> LoopRows:
         F, g, c, d = self._whole(theta)
-        size, data = g.size, self.data
+        size, data, start = g.size, self.data, np.zeros(g.size) if state is None else state
         # Passes take dynamics that are zero above their first superdiagonal: a real Schur form from below.
         Q = schur(F.T, output="real")[1]
-        F, g, c = np.tril(Q.T @ F @ Q, 1), Q.T @ g, c @ Q
-        states = chain_states(F, g, 1.0, data, 0.0)
+        F, g, c, start = np.tril(Q.T @ F @ Q, 1), Q.T @ g, c @ Q, Q.T @ start
+        states = chain_states(F, g, 1.0, data, 0.0, start)
         X, r = states[:, :size], states[:, size]
         slopes = np.empty((data.t.size, count))
         for j in range(count):
@@ -175,13 +175,9 @@ class LoopResponse:
             slopes[:, j] = X @ (by_c @ Q) + by_d * r
             if by_F.any() or by_g.any():
                 double = np.block([[F, np.zeros_like(F)], [Q.T @ by_F @ Q, F]])
-                both = chain_states(double, np.concatenate((g, Q.T @ by_g)), 1.0, data, 0.0)
-                slopes[:, j] += both[:, size:-1] @ c
-        free = np.zeros((data.t.size, 0))
-        if self.free_state:
-            still = data._replace(u=np.zeros_like(data.u))
-            free = np.column_stack([chain_states(F, g, 1.0, still, 0.0, unit)[:, :size] @ c for unit in Q.T])
-        return LoopRows(X @ c + d * r, slopes, free)
+                gain, begin = np.concatenate((g, Q.T @ by_g)), np.concatenate((start, np.zeros(size)))
+                slopes[:, j] += chain_states(double, gain, 1.0, data, 0.0, begin)[:, size:-1] @ c
+        return LoopRows(X @ c + d * r, slopes)
 
 
 def _held(plant: _Plant, step: Any) -> tuple[Any, Any]:
