@@ -220,7 +220,7 @@ def unsafe_intervals(found: Identification) -> list[str]:
     """Parameters whose intervals reach as far as the output is not linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
-    if not shown or getattr(options, "instruments", "open_loop") == "closed_loop":
+    if not shown or getattr(options, "instruments", "open_loop") != "open_loop":
         return []
     records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
     model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear

@@ -177,8 +177,9 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         if len(several) != 1:
             raise DataError("a loop is fitted to one record; give one file")
         loop, where = several[0].loop, named(several[0])
-        if loop is None:
-            raise DataError(f"{where}the loop needs the reference and the controller, and this record has neither")
+        if loop is None or loop.controller is None:
+            missing = "neither" if loop is None else "no controller"
+            raise DataError(f"{where}the loop needs the reference and the controller, and this record has {missing}")
         record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
         assert record.loop is not None
         if loop.continuous and self.delay_bounds[1] > 0:

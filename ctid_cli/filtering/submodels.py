@@ -54,6 +54,8 @@ class LoopData(NamedTuple):
     numerator: Array
     denominator: Array
     at_controller: bool
+    #: Whether the reference is the instruments' input itself, and the controller is not known.
+    direct: bool = False
 
     @property
     def closed(self) -> bool:
@@ -229,10 +231,12 @@ class SubmodelFilter:
     def _loop_input(self, model: Modes | Chains) -> Array:
         """Return the input of the noise-free loop of a model."""
         interval, reference = self.data.interval, self.loop.reference
+        if self.loop.direct:
+            return reference
         if isinstance(model, Modes):
             clock = (interval, *split_delay(self.delay, interval))
             direct = float(model.direct.sum())
-            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop))
+            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop[:4]))
         plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
         return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
 

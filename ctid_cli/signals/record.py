@@ -38,8 +38,8 @@ class Loop:
     ----------
     reference : ndarray, shape (N,)
         The reference r at the sampling instants.
-    controller : Controller
-        What made the input from reference and output.
+    controller : Controller or None
+        What made the input from reference and output; None where that is not known.
     enters : {"controller", "input"}, default "controller"
         Whether r enters before the controller, ``u = C (r - y)``, or behind it, ``u = r - C y``.
     hold : {"zoh", "foh"}, default "zoh"
@@ -54,7 +54,7 @@ class Loop:
     """
 
     reference: Array
-    controller: Controller
+    controller: Controller | None
     enters: Enters = "controller"
     hold: Hold = "zoh"
 
@@ -147,7 +147,7 @@ class Record:
     def _require_loop(self, loop: Loop, where: str) -> None:
         if loop.reference.size != self.t.size:
             raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")
-        if loop.continuous:
+        if loop.continuous or loop.controller is None:
             return
         if self.interval is None:
             why = "its controller is discrete and acts at every sample, and these are not equidistant"
