@@ -208,6 +208,8 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
     looked_at = np.array([re.fullmatch(r"(g\d+_)?[ab]\d+|delay", name) is not None for name in names])
+    if not fit.signs_known:
+        looked_at &= np.array(["a" not in name for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
     unclear[~fit.tangent.any(axis=1)] = False
     with np.errstate(invalid="ignore", divide="ignore"):
