@@ -9,6 +9,7 @@ State and offset c are eliminated: they are least squares for every theta (proje
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,18 +17,27 @@ import numpy as np
 from scipy.signal import butter
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, following
 from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
+from ctid_cli.estimation.modal_start import automatic_start
 from ctid_cli.estimation.sampled_problem import reflect_unstable
 from ctid_cli.filtering.bank import Equations, standard_rows
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.loop_response import LoopResponse
+from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData
 from ctid_cli.inference.fit import Status
+from ctid_cli.models.additive import Term
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.signals.record import Record
 
 #: Cut-offs of the filters of starts, spread from six over the length of the record to the Nyquist frequency over two;
 #: for each delay of a search every third does.
 CUTOFFS, OF_DELAY = 9, 3
 #: Times that the filter of a start is made from its own poles.
 ROUNDS = 4
+#: Up to this number of poles the reference alone leads to the minimum.
+FEW_POLES = 2
 #: Starts that are refined, and starts of a search over the delay.
 REFINED, MOST_DELAYS = 4, 60
 #: Steps of the refinement, and those at each delay of a search.
@@ -171,8 +181,9 @@ class LoopProblem:
         if columns is None:
             return np.inf
         Q, _ = columns.basis
-        left = columns.left - Q @ (Q.T @ columns.left)
-        return float(np.nan_to_num(left @ left, nan=np.inf))
+        with np.errstate(all="ignore"):
+            left = columns.left - Q @ (Q.T @ columns.left)
+            return float(np.nan_to_num(left @ left, nan=np.inf))
 
     # --- starts --------------------------------------------------------------------------------------
 
@@ -200,6 +211,22 @@ class LoopProblem:
                 slowest = 1.0 / (t[-1] - t[0])
                 E = reflect_unstable(np.real(np.poly(np.where(np.abs(poles) < slowest, -slowest, poles))))
 
+    def stable_start(self, record: Record, delay: float) -> Array | None:
+        """Return the estimate of a stable plant whose poles are found pair by pair, with the reference as instrument.
+
+        Filters that are one for all frequencies do not show a pair that is little damped beside a stronger one.
+        """
+        response, loop = self.response, OPEN_LOOP
+        if self.data.interval and not response.continuous:
+            loop = LoopData(following(response.data.u, self.data.u), np.ones(1), np.ones(1), True, direct=True)
+        problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
+        with suppress(DataError):
+            model = automatic_start(record, problem).model
+            found = unfactored(estimate_submodels(problem, model.theta, Steps(30, 1e-4, "relaxed")).model)
+            b = np.concatenate((np.zeros(response.zeros + 1 - found.numerator.size), found.numerator))
+            return np.concatenate((found.denominator[1 : response.poles + 1], b, [delay]))
+        return None
+
     def _two_stage(self, E: Array, instruments: Array, delay: float) -> Array | None:
         response, n = self.response, self.response.poles + self.response.integrators
         with np.errstate(all="ignore"):
@@ -221,9 +248,13 @@ class LoopProblem:
 
     # --- the least output error ----------------------------------------------------------------------
 
-    def best(self, theta: Array | None = None) -> "LoopEstimate | None":
-        """Return the least of the minima that starts lead to, or the minimum near given parameters."""
-        starts = self._delays() if theta is None else [theta]
+    def best(self, record: Record) -> "LoopEstimate | None":
+        """Return the least of the minima that starts lead to."""
+        starts = self._delays()
+        if self.response.poles > FEW_POLES:
+            delays = dict.fromkeys(float(theta[-1]) for theta in starts[:REFINED]) or [sum(self.delays) / 2]
+            more = [self.stable_start(record, delay) for delay in delays]
+            starts += [theta for theta in more if theta is not None]
         found = [self._local(start) for start in starts]
         results = [one for one in found if one is not None]
         if not results:

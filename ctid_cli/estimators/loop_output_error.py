@@ -199,7 +199,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return LaidOutLoop(record, problem, u0, y0)
 
     def _estimate(self, laid_out: LaidOutLoop, start: Start | None) -> LoopFit:
-        found = laid_out.problem.best()
+        found = laid_out.problem.best(laid_out.record)
         if found is None:
             raise DataError(
                 f"{named(laid_out.record)}no model that the reference as an instrument leads to makes a loop whose output "
