@@ -65,7 +65,9 @@ def six_loops(runs, samples, seed):
                 else:
                     others += bool(np.isfinite(errors).any())
             shares = " ".join(f"{100 * share:5.1f}" for share in np.mean(own, axis=0))
-            print(f"{loop!s:24} noise {noise:<5} {len(own):4} of {runs:3} {others:10}          {shares} {spent / runs:15.2f}")
+            print(
+                f"{loop!s:24} noise {noise:<5} {len(own):4} of {runs:3} {others:10}          {shares} {spent / runs:15.2f}"
+            )
             total, wrong, hits, time = total + len(own), wrong + others, hits + own, time + spent
     shares = " ".join(f"{100 * share:.1f}" for share in np.mean(hits, axis=0))
     print(f"all: {total} of {12 * runs} converged, {wrong} others with an error, {shares} % covered, {time:.0f} CPU s")
@@ -114,7 +116,9 @@ def paper_loop(runs, seed, coloured):
         errors = errors[np.isfinite(errors).all(axis=1)]
         bias, spread = errors.mean(axis=0), errors.std(axis=0)
         text = "  ".join(f"{b:9.5f} {s:8.5f}" for b, s in zip(bias, spread, strict=True))
-        print(f"{way:25} {converged[way]:4} of {runs} converged, {len(errors):4} with two pairs: {text}  {times[way] / runs:.2f} CPU s")
+        print(
+            f"{way:25} {converged[way]:4} of {runs} converged, {len(errors):4} with two pairs: {text}  {times[way] / runs:.2f} CPU s"
+        )
 
 
 if __name__ == "__main__":

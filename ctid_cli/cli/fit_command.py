@@ -121,7 +121,9 @@ def _records(
     return records
 
 
-def _identified(options: MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None) -> Identification:
+def _identified(
+    options: MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None
+) -> Identification:
     """Fit, with a bar of progress where it takes long."""
     from ctid_cli.identification.identify import identify
 

@@ -112,7 +112,9 @@ class LoopOptions:
 
     loop: Annotated[
         str | None,
-        typer.Option("--loop", metavar="FILE|unknown", help="YAML with the section loop of the record, if it is known."),
+        typer.Option(
+            "--loop", metavar="FILE|unknown", help="YAML with the section loop of the record, if it is known."
+        ),
     ] = None
     reference: Annotated[
         str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
@@ -135,7 +137,9 @@ class LoopOptions:
                 "--loop FILE needs the reference too; add --reference COLUMN, or --direct to fit without it"
             )
         if self.direct and self.loop is None:
-            raise UsageError("--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it")
+            raise UsageError(
+                "--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it"
+            )
 
     def applied(self, measured: Measurement) -> Measurement:
         """Return a measurement in its loop, or with a note on what the direct method asks for."""

@@ -234,7 +234,11 @@ class LoopProblem:
         u, y = rows[:, :n], rows[:, 2 * n + 1 : 3 * n + 1]
         highest = rows[:, 3 * n + 1] - y[:, ::-1] @ E[1:]
         by_a = -y[:, ::-1][:, : response.poles]
-        by_b = u[:, response.zeros :: -1] if response.zeros < n else np.column_stack((rows[:, n] - u[:, ::-1] @ E[1:], u[:, ::-1]))
+        by_b = (
+            u[:, response.zeros :: -1]
+            if response.zeros < n
+            else np.column_stack((rows[:, n] - u[:, ::-1] @ E[1:], u[:, ::-1]))
+        )
         regressors = np.column_stack((by_a, by_b, np.ones((self.samples, int(self.offset)))))
         seen = instruments.T @ regressors
         if not np.isfinite(seen).all():
@@ -291,7 +295,9 @@ class LoopProblem:
                     at_delay.append((result.equations.squared_error, result.theta))
             profile.append(min(at_delay, key=lambda each: each[0], default=(np.inf, np.zeros(0))))
         errors = np.array([np.inf, *(error for error, _ in profile), np.inf])
-        lowest = np.flatnonzero((errors[1:-1] <= errors[:-2]) & (errors[1:-1] <= errors[2:]) & np.isfinite(errors[1:-1]))
+        lowest = np.flatnonzero(
+            (errors[1:-1] <= errors[:-2]) & (errors[1:-1] <= errors[2:]) & np.isfinite(errors[1:-1])
+        )
         return [profile[k][1] for k in sorted(lowest, key=lambda k: errors[k + 1])[:REFINED]]
 
     def _local(self, theta: Array) -> "LoopEstimate | None":
