@@ -69,6 +69,10 @@ class LoopResponse:
         ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink. A state is
         that of the plant, of the controller, and the inputs on their way at the first sample.
         """
+        if state is not None:
+            # That of the plant is p^(n-1)/A u … 1/A u in seconds, whatever the time unit of its companion form.
+            n = self.poles + self.integrators
+            state = np.concatenate((state[:n] * self._scale(theta) ** np.arange(1.0, n + 1.0), state[n:]))
         return self._continuous(theta, count, state) if self.continuous else self._discrete(theta, count, cell, state)
 
     def free(self, theta: Array, cell: int | None = None) -> Array:

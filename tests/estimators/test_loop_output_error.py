@@ -18,7 +18,7 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
 
 UNSTABLE, STABLE = TransferFunction([4.0], [1.0, 0.0, -1.0]), TransferFunction([2.0], [1.0, 1.2, 1.0])
-PD, PI = DiscreteController([11.0, -10.0], [1.0, 0.0]), DiscreteController([0.8, -0.7], [1.0, -1.0])
+PD, PI = DiscreteController([11.0, -10.0], [1.0, 0.0]), DiscreteController([0.5, -0.48], [1.0, -1.0])
 NOTHING, LEAD = DiscreteController([0.0], [1.0]), ContinuousController([1.5, 3.0], [0.05, 1.0])
 
 
@@ -65,7 +65,9 @@ def continuous_loop(plant, law, r, t, fine, foh=False):
 @pytest.mark.parametrize("enters", ["controller", "input"])
 def test_output_of_a_loop_is_that_of_difference_equations(enters):
     one = record(UNSTABLE, PD, count=200, enters=enters)
-    F, g, c, _, _ = cont2discrete(([[0.0, 1.0], [1.0, 0.0]], [[1.0], [0.0]], [[0.0, 4.0]], [[0.0]]), 0.05)
+    F, g, c, _, _ = cont2discrete(
+        tuple(map(np.array, ([[0.0, 1.0], [1.0, 0.0]], [[1.0], [0.0]], [[0.0, 4.0]], [[0.0]]))), 0.05
+    )
     z, before, y = np.zeros(2), 0.0, np.zeros(200)
     for k, r in enumerate(one.loop.reference):
         y[k] = c[0] @ z
