@@ -19,6 +19,7 @@ from ctid_cli.reporting.document import Tool
 
 if TYPE_CHECKING:
     from ctid_cli.estimators.identification import Identification
+    from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
     from ctid_cli.reporting.fit_result import FitResult
@@ -86,9 +87,9 @@ def fit(
     _check_draws(bootstrap)
     _check_predicted(predict, treatment.noise)
     loop.check()
-    asked = Asked(model, treatment, loop.counts)
+    asked = Asked(model, treatment, loop.use)
     options = options_of(asked)
-    if asked.iterated and len(files) > 1:
+    if asked.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
     records = _records(files, validate, loop, columns, treatment)
     found = _identified(options, records, bootstrap)
@@ -131,7 +132,9 @@ def _records(
     return records
 
 
-def _identified(options: MeasuredSubmodels | Given, records: Records, bootstrap: int | None) -> Identification:
+def _identified(
+    options: MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None
+) -> Identification:
     """Fit, with a bar of progress where it takes long."""
     from ctid_cli.identification.identify import identify
 

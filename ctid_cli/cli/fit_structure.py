@@ -17,11 +17,20 @@ from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, Los
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
     from ctid_cli.models.additive import Term
     from ctid_cli.signals.measurement import Measurement
 
+#: What of a loop an estimate is made with: nothing, its reference as an instrument, or reference and controller.
+LoopUse = Literal["none", "reference", "controller"]
+#: A loop whose controller is not known.
+UNKNOWN = "unknown"
+DIRECT = (
+    "The model is fitted to the input as it was measured in the loop (direct method): that is right only if the noise "
+    "model is, here white noise of the output, and if there is a delay of a sample in the loop."
+)
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
 HoldOption = Annotated[AskedHold, typer.Option("--hold", help="The input between its samples; else chosen.")]
@@ -102,41 +111,49 @@ class LoopOptions:
     """The loop that a record was taken in."""
 
     loop: Annotated[
-        Path | None, typer.Option("--loop", metavar="FILE", help="YAML with the section loop of the record.")
+        str | None,
+        typer.Option(
+            "--loop", metavar="FILE|unknown", help="YAML with the section loop of the record, if it is known."
+        ),
     ] = None
     reference: Annotated[
         str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
     ] = None
-    ignore_loop: Annotated[bool, typer.Option("--ignore-loop", help="Fit as if there were no loop.")] = False
+    direct: Annotated[
+        bool, typer.Option("--direct", help="Fit to the input as if there were no loop: noise through it biases.")
+    ] = False
 
     @property
-    def counts(self) -> bool:
-        """Whether the loop is given and taken into account."""
-        return self.loop is not None and not self.ignore_loop
+    def use(self) -> LoopUse:
+        """What of the loop an estimate is made with."""
+        if self.direct or (self.loop in (None, UNKNOWN) and self.reference is None):
+            return "none"
+        return "reference" if self.loop in (None, UNKNOWN) else "controller"
 
     def check(self) -> None:
         """Refuse half of what a loop needs."""
-        if self.loop is None and self.reference is not None:
-            raise UsageError("--reference needs the controller too; add --loop FILE with a section loop")
-        if self.loop is not None and self.reference is None and not self.ignore_loop:
+        if self.loop not in (None, UNKNOWN) and self.reference is None and not self.direct:
             raise UsageError(
-                "--loop needs the reference too; add --reference COLUMN, or --ignore-loop to fit without it"
+                "--loop FILE needs the reference too; add --reference COLUMN, or --direct to fit without it"
             )
-        if self.ignore_loop and self.loop is None:
-            raise UsageError("--ignore-loop has no loop to ignore; drop it")
+        if self.direct and self.loop is None:
+            raise UsageError(
+                "--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it"
+            )
 
     def applied(self, measured: Measurement) -> Measurement:
-        """Return a measurement in its loop, or with a note that this is ignored."""
-        if self.loop is None:
+        """Return a measurement in its loop, or with a note on what the direct method asks for."""
+        if self.loop is None and self.reference is None:
             return measured
-        from ctid_cli.simulation.record_loop import in_loop
+        from ctid_cli.simulation.record_loop import in_loop, in_unknown_loop
         from ctid_cli.specification.load import load_loop
 
-        options = load_loop(self.loop)
-        if self.ignore_loop:
-            note = "The loop is ignored (--ignore-loop): noise that comes back through it biases the estimate."
-            return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, note))
-        return in_loop(measured, options)
+        options = None if self.loop in (None, UNKNOWN) else load_loop(Path(self.loop or ""))
+        if self.use == "controller" and options is not None:
+            return in_loop(measured, options)
+        if self.use == "reference":
+            return in_unknown_loop(measured)
+        return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, DIRECT))
 
 
 @dataclass(frozen=True)
@@ -156,13 +173,23 @@ class Asked:
 
     model: ModelOptions
     treatment: FitOptions
-    #: Whether the loop that the record was taken in is given, and counts.
-    loop: bool = False
+    #: What of the loop that the record was taken in counts.
+    loop: LoopUse = "none"
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the loop of one transfer function is simulated."""
+        return self.loop == "controller" and self.model.model == "fraction"
 
     @property
     def iterated(self) -> bool:
-        """Whether the estimator is that of submodels, which knows the delay and takes one record."""
-        return self.model.model == "additive" or self.loop
+        """Whether the estimator is that of submodels, which knows the delay."""
+        return self.model.model == "additive" or self.loop == "reference"
+
+    @property
+    def single(self) -> bool:
+        """Whether the estimator takes one record."""
+        return self.iterated or self.simulated
 
     @property
     def delay(self) -> tuple[float, float]:
@@ -184,9 +211,11 @@ def as_usage_errors() -> Iterator[None]:
         raise UsageError(re.sub(r"^fixed\b", "--fix", re.sub(r"^noise_model\b", "--noise", str(error)))) from None
 
 
-def options_of(asked: Asked) -> MeasuredSubmodels | Given:
+def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
     """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
     _refuse_other_form(asked)
+    if asked.simulated:
+        return _in_loop(asked)
     if not asked.iterated:
         return _given(asked)
     _refuse_unable(asked)
@@ -221,13 +250,31 @@ def _given(asked: Asked) -> Given:
     return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed, noise_model=treatment.noise)
 
 
+def _in_loop(asked: Asked) -> LoopOutputError:
+    from ctid_cli.estimators.loop_output_error import LoopOutputError
+
+    _refuse_of_loop(asked)
+    if asked.model.poles is None:
+        raise UsageError("--poles is missing: with --loop it must be given")
+    if asked.model.fix:
+        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
+    state, offset = asked.treatment.initial_state or "rest", asked.treatment.offset or "none"
+    if state == "periodic":
+        raise UsageError("--initial-state periodic is not there for a record in a loop; use rest or estimate")
+    if offset == "drift":
+        raise UsageError("--offset drift is not there for a record in a loop; use estimate, remove or none")
+    with as_usage_errors():
+        degrees = asked.model.poles, asked.model.zeros or 0
+        return LoopOutputError(*degrees, asked.delay, state, offset, asked.integrators)
+
+
 def _submodels(asked: Asked) -> MeasuredSubmodels:
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.models.additive import Term
 
     if asked.model.terms is None:
         if asked.model.poles is None:
-            raise UsageError("--poles is missing: with --loop it must be given")
+            raise UsageError("--poles is missing: with --reference it must be given")
         terms: tuple[Term, ...] = (Term(asked.model.poles, asked.model.zeros or 0, asked.integrators),)
     else:
         first, *others = _terms(asked.model.terms, asked.integrators)
@@ -235,7 +282,7 @@ def _submodels(asked: Asked) -> MeasuredSubmodels:
     return MeasuredSubmodels(
         terms,
         asked.delay[0],
-        "closed_loop" if asked.loop else "open_loop",
+        {"none": "open_loop", "reference": "reference", "controller": "closed_loop"}[asked.loop],
         asked.treatment.initial_state or "rest",
         asked.treatment.offset or "none",
         factored=asked.model.model == "additive" or asked.integrators > 0,
@@ -255,7 +302,7 @@ def _refuse_other_form(asked: Asked) -> None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
     elif asked.model.terms is not None:
         raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
-    instead = "--initial-state" if asked.iterated else "--offset"
+    instead = "--initial-state" if asked.single else "--offset"
     check_integrators(asked.integrators, asked.treatment.offset or "none", instead)
 
 
@@ -279,27 +326,33 @@ def check_integrators(integrators: int, offset: Offset, instead: str = "--offset
 
 def _refuse_unable(asked: Asked) -> None:
     """What refined instrumental variables at a known delay cannot do."""
-    what = "a record in a loop" if asked.loop else "a sum of submodels"
+    in_loop = asked.loop != "none"
+    what = "a record in a loop" if in_loop else "a sum of submodels"
     low, high = asked.delay
     if low < high:
-        why = "noise that comes back through the loop would move it" * asked.loop or "a known delay is needed"
+        why = "noise that comes back through the loop would move it" * in_loop or "a known delay is needed"
         raise UsageError(
             f"--delay {low:g}:{high:g} cannot be searched for {what}: {why}; give one value, --delay VALUE"
         )
+    _refuse_of_loop(asked, what)
+    if asked.treatment.offset in ("estimate", "drift"):
+        raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
+    if in_loop and asked.treatment.hold not in ("auto", "zoh"):
+        raise UsageError(
+            f"--hold {asked.treatment.hold} does not go with --reference: a discrete controller holds its input (zoh)"
+        )
+    if in_loop and asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
+        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
+
+
+def _refuse_of_loop(asked: Asked, what: str = "a record in a loop") -> None:
+    """What neither submodels nor simulated loops can do."""
     if asked.treatment.input_before is not None:
         raise UsageError(f"--input-before is not there for {what}; use --initial-state estimate")
     if asked.treatment.loss != "squares":
         raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
     if asked.treatment.noise != "white":
         raise UsageError(f"--noise {asked.treatment.noise} is not there for {what}; drop --noise")
-    if asked.treatment.offset in ("estimate", "drift"):
-        raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
-    if asked.loop and asked.treatment.hold not in ("auto", "zoh"):
-        raise UsageError(
-            f"--hold {asked.treatment.hold} does not go with --loop: a discrete controller holds its input (zoh)"
-        )
-    if asked.loop and asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
-        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
 
 
 def _terms(text: str, integrators: int) -> list[Term]:

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
@@ -29,14 +30,17 @@ from ctid_cli.signals.record import Record, named
 
 #: An unstable loop is simulated over a record unless it would grow beyond this factor.
 LARGEST_GROWTH = 1e20
+#: Lags of the response of an input to the reference, samples for each of them at least, and what keeps it determined.
+MOST_LAGS, SAMPLES_PER_LAG, RIDGE = 300, 10, 1e-9
 
-#: Where instruments come from: the measured input, or the noise-free loop of the model.
-Instruments = Literal["open_loop", "closed_loop"]
+#: Where instruments come from: the measured input, the noise-free loop of the model, or what of the input follows the
+#: reference through an unknown loop.
+Instruments = Literal["open_loop", "closed_loop", "reference"]
 
 
 def check_closed_loop(instruments: Instruments, variant: str) -> None:
     """Refuse to guard a cost that the solution does not minimise."""
-    if instruments == "closed_loop" and variant == "guarded":
+    if instruments != "open_loop" and variant == "guarded":
         reason = "in closed loop the solution is not the least output error"
         raise ValueError(f"variant guarded is for open-loop instruments: {reason}; use relaxed or plain")
 
@@ -45,18 +49,38 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
     """The feedback that instruments are simulated with."""
     if instruments == "open_loop":
         return OPEN_LOOP
-    if record.loop is None:
-        wanted = "the reference and the controller, and this record has neither"
-        raise DataError(
-            f"{named(record)}closed-loop instruments need {wanted}; give them, or use instruments 'open_loop'"
-        )
+    by_reference = instruments == "reference"
+    if record.loop is None or (record.loop.controller is None and not by_reference):
+        missing = "neither" if record.loop is None else "no controller"
+        wanted = f"the reference{' and the controller' * (not by_reference)}, and this record has {missing}"
+        what = "instruments of the reference" if by_reference else "closed-loop instruments"
+        raise DataError(f"{named(record)}{what} need {wanted}; give them, or use instruments 'open_loop'")
+    if record.loop.continuous and not by_reference:
+        why = "with a controller in continuous time closed-loop instruments are inconsistent on any sampling"
+        raise DataError(f"{named(record)}{why}; use loop_output_error")
     if not record.input_on_grid or record.input.hold != "zoh":
         wanted = "an input that is held from sample to sample of a regular clock"
-        raise DataError(f"{named(record)}closed-loop instruments need {wanted}: the controller is discrete")
+        raise DataError(f"{named(record)}instruments in a loop need {wanted}")
+    if by_reference:
+        return LoopData(following(record.loop.reference, record.input.values), np.ones(1), np.ones(1), True, True)
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
     numerator = np.pad(controller.numerator, (controller.denominator.size - controller.numerator.size, 0))
     reference, denominator = plain_array(record.loop.reference), plain_array(controller.denominator)
     return LoopData(reference, numerator, denominator, record.loop.enters == "controller")
+
+
+def following(reference: Array, u: Array) -> Array:
+    """Return what of an input follows the reference: its best prediction by a finite impulse response, from rest."""
+    r, moved = reference - reference.mean(), u - u.mean()
+    lags = min(MOST_LAGS, u.size // SAMPLES_PER_LAG + 1)
+    size = 2 * u.size
+    spectrum = np.fft.rfft(r, size)
+    own = np.fft.irfft(np.abs(spectrum) ** 2)[:lags]
+    shared = np.fft.irfft(np.conj(spectrum) * np.fft.rfft(moved, size))[:lags]
+    if not own[0] > 0.0:
+        raise DataError("the reference is constant: it is no instrument")
+    own[0] *= 1.0 + RIDGE
+    return np.asarray(np.convolve(r, solve_toeplitz(own, shared))[: u.size])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +198,7 @@ class AdditiveProblem:
     def loop_radius(self, model: AdditiveModel) -> float:
         """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
         loop, interval = self.loop, self.data.interval
-        if not loop.closed or interval == 0.0:
+        if not loop.closed or loop.direct or interval == 0.0:
             return math.nan
         return loop_radius(model, DiscreteController(loop.numerator, loop.denominator), interval)
 
@@ -250,8 +274,10 @@ class SubmodelEstimate(NamedTuple):
 
     def described(self, covariance: Covariance, draws: int, jacobian: Array) -> dict[str, Any]:
         """What a `Fit` says of parameters with these derivatives by those of the model."""
-        problem, diverged = self.problem, self.status is Status.DIVERGED
-        tangent = problem.tangent[:, :0] if diverged else problem.tangent
+        problem = self.problem
+        # In a loop what is no solution is far off, and says nothing of its error.
+        unsolved = problem.loop.closed and not self.status.succeeded
+        tangent = problem.tangent[:, :0] if unsolved or self.status is Status.DIVERGED else problem.tangent
         values = assessed(problem, self.theta, self.equations, self.status, covariance, draws, tangent)
         values |= {"iterations": self.history.steps, "history": self.history}
         law = values.get("law")
@@ -269,7 +295,7 @@ def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> 
     loop, if that does not help, goes on with guarded steps.
     """
     whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
-    radius = problem.loop_radius(problem.model(whole)) if problem.loop.closed else 0.0
+    radius = problem.loop_radius(problem.model(whole)) if problem.loop.closed and not problem.loop.direct else 0.0
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             "the start makes an unstable loop with the controller: its poles reach the magnitude "

@@ -98,9 +98,10 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         Degrees of the submodels; integrators in one of them at most.
     delay : float, default 0.0
         Known delay [s].
-    instruments : {"open_loop", "closed_loop"}, default "open_loop"
+    instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` simulates the instruments in the noise-free loop of the model with the record's controller and
-        reference: needed for unbiased estimates where feedback brings coloured noise into the input.
+        reference: needed for unbiased estimates where feedback brings coloured noise into the input. ``reference`` takes
+        in their place what of the input follows the reference, where the controller is not known.
     initial_state : {"rest", "periodic", "estimated"}, default "rest"
         State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
@@ -187,7 +188,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         check_closed_loop(self.instruments, self.variant)
         if self.initial_state == "periodic":
             text = "initial_state periodic needs open-loop instruments, and terms without integrators"
-            if self.instruments == "closed_loop" or any(term.integrators for term in self.terms):
+            if self.instruments != "open_loop" or any(term.integrators for term in self.terms):
                 raise OptionError("initial_state", f"{text}; use rest or estimated")
 
     def check_start(self, start: Start) -> None:

@@ -141,6 +141,11 @@ class MeasuredFit(DeferredFields, Fit):
         return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
 
     @property
+    def signs_known(self) -> bool:
+        """Whether no coefficient of the denominator may be zero: it may be in a plant that is not stable."""
+        return not (self.model.poles.real > 0).any()
+
+    @property
     def linear(self) -> "MeasuredFit":
         """The fit by least squares that has the same law: itself, or with pseudo-errors of its loss, or innovations."""
         if self.noise is not None:

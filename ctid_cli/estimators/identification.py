@@ -12,6 +12,7 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.loop_output_error import LoopFit
 from ctid_cli.estimators.measured_submodels import LaidOut, MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
@@ -60,9 +61,9 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     Parameters
     ----------
-    options : DelayProfile or MeasuredSubmodels
+    options : DelayProfile, MeasuredSubmodels or LoopOutputError
         What was asked for.
-    fit : MeasuredFit
+    fit : MeasuredFit, SubmodelsFit or LoopFit
         The estimate.
     answer : AnswerTest
         Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
@@ -91,7 +92,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
-    fit: MeasuredFit | SubmodelsFit
+    fit: MeasuredFit | SubmodelsFit | LoopFit
     answer: AnswerTest
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -174,7 +175,7 @@ def identify(
     checked = None if validation is None else laid_out_validation(options, validation)
     # Errors for coloured noise are computed once, below, where a bootstrap can tell how far it is.
     prepared = replace(options, covariance="white").prepare(records)
-    fit: MeasuredFit | SubmodelsFit = prepared.fit()
+    fit: MeasuredFit | SubmodelsFit | LoopFit = prepared.fit()
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     fit = replace(fit, covariance=uncertainty.covariance, law=uncertainty)
     # What the estimate is by least squares near it: pseudo-errors where the loss is another.
@@ -243,6 +244,8 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
     looked_at = np.array([re.fullmatch(r"(g\d+_)?[ab]\d+|delay", name) is not None for name in names])
+    if not fit.signs_known:
+        looked_at &= np.array(["a" not in name for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
     unclear[~fit.tangent.any(axis=1)] = False
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -255,7 +258,7 @@ def unsafe_intervals(found: Identification) -> list[str]:
     """Parameters whose intervals reach as far as the output is not linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
-    if not shown or (isinstance(options, MeasuredSubmodels) and options.closed):
+    if not shown or getattr(options, "instruments", "open_loop") != "open_loop":
         return []
     records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
     model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear

@@ -15,11 +15,12 @@ from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
+from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
 from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.inference.uncertainty import DRAWS, Covariance
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
@@ -52,6 +53,16 @@ class SubmodelsFit(MeasuredFit):
     start_method: str = ""
     loop_radius: float = float("nan")
 
+    #: Whether instruments come from the loop: what is no solution then has no standard errors.
+    in_loop: bool = False
+
+    def uncertainty(
+        self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
+    ) -> Uncertainty:
+        """Standard errors and intervals for a kind of noise."""
+        found = MeasuredFit.uncertainty(self, kind, draws, progress)
+        return found.undefined if self.in_loop and not self.status.succeeded else found
+
     @property
     def parametrised(self) -> TransferFunction | AdditiveModel:
         """The model in the form that has the parameters."""
@@ -82,8 +93,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         Degrees of the submodels.
     delay : float, default 0.0
         Known delay [s].
-    instruments : {"open_loop", "closed_loop"}, default "open_loop"
-        ``closed_loop`` for a record with the loop that it was taken in.
+    instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
+        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where the controller is not known.
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record.
     offset : {"none", "remove"}, default "none"
@@ -153,7 +164,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     @property
     def closed(self) -> bool:
         """Whether instruments come from the loop."""
-        return self.instruments == "closed_loop"
+        return self.instruments != "open_loop"
 
     def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutSubmodels:
         several = [records] if isinstance(records, Record) else list(records)
@@ -195,6 +206,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             additive=ordered if self.factored else None,
             start_method=method,
             loop_radius=problem.loop_radius(ordered),
+            in_loop=self.closed,
             **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples(fit, laid_out)
@@ -254,5 +266,5 @@ def _padded(b: Array, size: int) -> Array:
 
 
 #: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | Rivc | MeasuredSubmodels
-LaidOut = MeasuredRecords | LaidOutSubmodels
+Options = DelayProfile | Rivc | MeasuredSubmodels | LoopOutputError
+LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop

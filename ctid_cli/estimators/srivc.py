@@ -61,9 +61,10 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
         solution is not the minimum of that cost.
     hold_output : {"foh", "zoh"}, default "foh"
         Interpolation of the measured output between samples; changes the path, not the converged estimate.
-    instruments : {"open_loop", "closed_loop"}, default "open_loop"
+    instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` (CLSRIVC) simulates the instruments in the noise-free loop of the model with the record's
-        controller and reference: needed where feedback brings coloured noise into the input.
+        controller and reference: needed where feedback brings coloured noise into the input. ``reference`` takes in
+        their place what of the input follows the reference, where the controller is not known.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
         residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
@@ -138,7 +139,7 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)
-        if self.step_rule == "relaxed" or self.instruments == "closed_loop":
+        if self.step_rule == "relaxed" or self.instruments != "open_loop":
             # In closed loop (CLSRIVC) and where steps are relaxed it is additive SRIVC with a single submodel.
             terms = (Term(self.poles, self.zeros),)
             return AdditiveProblem(data, terms, self.delay, loop), record

@@ -735,26 +735,35 @@ def loop_signals(
     r: Array,
     v: Array,
     before: float,
-) -> tuple[Array, Array]:
-    """Input and noise-free output of a sampled plant ``F, g, c, direct, shift`` in a loop with ``A, B, C, D``.
+    push: Array,
+    start: tuple[Array, Array, Array],
+) -> tuple[Array, Array, Array]:
+    """Input, noise-free output and states of a sampled plant ``F, g, c, direct, shift`` in a loop with ``A, B, C, D``.
 
     The output of a relay of some amplitude, hysteresis and bias is added to that of the law; its amplitude is 0 where
-    there is none. ``before`` is the share of r that the controller sees, 1 or 0.
+    there is none. ``before`` is the share of r that the controller sees, 1 or 0. ``push``, shape (N, n) or (0, n), is
+    added to the plant's next states. The start is its state, the controller's, and the inputs before the first sample.
     """
     F, g, c, direct, shift = plant
     A, B, C, D = law
     amplitude, hysteresis, bias = relay
-    n, m = g.size, B.size
+    n, m, pushed = g.size, B.size, push.shape[0] > 0
     # Where plant and law both act at once the input acts on the output that it is made from: solve for it.
     own = direct if shift == 0 else 0.0
     closing = 1.0 / (1.0 + D * own)
-    u, x = np.empty(r.size), np.empty(r.size)
-    z, z_next = np.zeros(n), np.zeros(n)
-    s, s_next = np.zeros(m), np.zeros(m)
-    side, free, held = 1.0, 0.0, 0.0
+    u, x, states = np.empty(r.size), np.empty(r.size), np.empty((r.size, n))
+    z, z_next = start[0].copy(), np.zeros(n)
+    s, s_next = start[1].copy(), np.zeros(m)
+    side, free, held, late = 1.0, 0.0, 0.0, start[2]
+    for i in range(n):
+        free += c[i] * z[i]
+    for i in range(m):
+        held += C[i] * s[i]
     for k in range(r.size):
         # x as far as earlier inputs make it.
-        arriving = u[k - shift] if 0 < shift <= k else 0.0
+        arriving = 0.0
+        if shift > 0:
+            arriving = u[k - shift] if shift <= k else late[k]
         output = free + direct * arriving
         error = before * r[k] - v[k] - output
         # Within the hysteresis the relay stays as it is.
@@ -773,6 +782,9 @@ def loop_signals(
             total = g[i] * arriving
             for j in range(n):
                 total += F[i, j] * z[j]
+            if pushed:
+                total += push[k, i]
+            states[k, i] = z[i]
             z_next[i] = total
             free += c[i] * total
         for i in range(m):
@@ -783,7 +795,7 @@ def loop_signals(
             held += C[i] * total
         z, z_next = z_next, z
         s, s_next = s_next, s
-    return u, x
+    return u, x, states
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -27,6 +27,10 @@ NO_GAIN = 1e-12
 NOTHING, NO_RELAY = DiscreteController([0.0], [1.0]), (0.0, 0.0, 0.0)
 
 
+#: A controller as the kernel takes it.
+Law = tuple[Array, Array, Array, float]
+
+
 class LoopSignals(NamedTuple):
     """Signals of a closed loop at the sampling instants, each of shape (N,)."""
 
@@ -99,7 +103,7 @@ def simulate_loop(
         discrete = _realised(controller)
         _require_solvable(plant, discrete)
         law, relay = law_of(discrete), NO_RELAY
-    u, x = kernels.loop_signals((*plant,), law, relay, r, v, float(enters == "controller"))
+    u, x, _ = loop_pass(plant, law, r, v, enters == "controller", relay=relay)
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
         if isinstance(controller, Relay):
             raise DataError("the signals of the loop with the relay are not finite; check the system and the reference")
@@ -110,7 +114,28 @@ def simulate_loop(
     return LoopSignals(u, x)
 
 
-def law_of(controller: DiscreteController) -> tuple[Array, Array, Array, float]:
+def loop_pass(
+    plant: SampledModel,
+    law: Law,
+    r: Array,
+    v: Array,
+    at_controller: bool,
+    *,
+    push: Array | None = None,
+    start: tuple[Array, Array, Array] | None = None,
+    relay: tuple[float, float, float] = NO_RELAY,
+) -> tuple[Array, Array, Array]:
+    """Return input, noise-free output and plant states of a sampled loop; the kernel says what the arguments are."""
+    size = plant.from_input.size
+    push = np.zeros((0, size)) if push is None else push
+    start = (np.zeros(size), np.zeros(law[1].size), np.zeros(plant.shift)) if start is None else start
+    found: tuple[Array, Array, Array] = kernels.loop_signals(
+        (*plant,), law, relay, r, v, float(at_controller), push, start
+    )
+    return found
+
+
+def law_of(controller: DiscreteController) -> Law:
     """Return a controller as the kernel takes it."""
     A, B, C, D = controller.state_space()
     return plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
@@ -118,8 +143,11 @@ def law_of(controller: DiscreteController) -> tuple[Array, Array, Array, float]:
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
     """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
-    sampled = sampled_model(model, interval)
-    discrete = _realised(controller)
+    return sampled_radius(sampled_model(model, interval), _realised(controller))
+
+
+def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float:
+    """Largest magnitude of the poles of the loop of a sampled model."""
     _require_solvable(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()

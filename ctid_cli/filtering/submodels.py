@@ -36,7 +36,7 @@ from ctid_cli.filtering.bank import (
     to_steady_state,
 )
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
-from ctid_cli.filtering.loop import NO_RELAY, law_of
+from ctid_cli.filtering.loop import law_of, loop_pass
 from ctid_cli.filtering.simulate import sampled_chains
 from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import DiscreteController
@@ -54,6 +54,8 @@ class LoopData(NamedTuple):
     numerator: Array
     denominator: Array
     at_controller: bool
+    #: Whether the reference is the instruments' input itself, and the controller is not known.
+    direct: bool = False
 
     @property
     def closed(self) -> bool:
@@ -229,13 +231,14 @@ class SubmodelFilter:
     def _loop_input(self, model: Modes | Chains) -> Array:
         """Return the input of the noise-free loop of a model."""
         interval, reference = self.data.interval, self.loop.reference
+        if self.loop.direct:
+            return reference
         if isinstance(model, Modes):
             clock = (interval, *split_delay(self.delay, interval))
             direct = float(model.direct.sum())
-            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop))
+            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop[:4]))
         plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
-        signals = reference, np.zeros(reference.size), float(self.loop.at_controller)
-        return np.asarray(kernels.loop_signals((*plant,), law, NO_RELAY, *signals)[0])
+        return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
 
     def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
         """Return the record with its input late by whole intervals, the delay left, and states that come back."""

@@ -219,7 +219,8 @@ def _of_uncertainty(found: Identification) -> Iterator[str]:
         place = int(np.argmax(np.abs(column)))
         own = np.count_nonzero(column) == 1
         names.append(fit.parameter_names[place] if own else f"pole {len(names) + 1}")
-        values.append(fit.theta[place])
+        any_value = names[-1].startswith("a") and not fit.signs_known
+        values.append(np.inf if any_value else fit.theta[place])
     told = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
     yield from (each.removesuffix(".") for each in told)
     if uncertainty.short:

@@ -11,6 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.criterion import noise_of, penalised
@@ -147,6 +148,9 @@ def tried_remedies(
     extrapolates. Another loss is judged by the second alone. Where blocks are too short, or the input moves in too few
     of them, the criterion decides, if it falls by ten.
     """
+    if isinstance(options, LoopOutputError):
+        # Changes are judged by what the input explains, and here it is not what drives the loop.
+        return Trials([], [])
     submodels = isinstance(options, MeasuredSubmodels)
     # A record in a loop cannot be cut.
     most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)

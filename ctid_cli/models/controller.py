@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +12,15 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.models.transfer_function import monic, polynomials, sorted_roots
 from ctid_cli.signals.checks import freeze, require_choice, require_finite, require_not_negative, require_positive
+
+
+def companion(numerator: Array, denominator: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the companion realisation A, B, C, D of a proper fraction with a monic denominator."""
+    n, a = denominator.size - 1, denominator[1:]
+    b = np.concatenate((np.zeros(n + 1 - numerator.size), numerator))
+    A = np.eye(n, k=-1)
+    A[:1] -= a
+    return A, np.eye(n, 1), (b[1:] - b[0] * a)[None, :], b[None, :1].copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +116,7 @@ class DiscreteController:
         D : ndarray, shape (1, 1)
             Direct feedthrough.
         """
-        n = self.order
-        a = self.denominator[1:]
-        b = np.concatenate((np.zeros(n + 1 - self.numerator.size), self.numerator))
-        A = np.eye(n, k=-1)
-        A[:1] -= a
-        return A, np.eye(n, 1), (b[1:] - b[0] * a)[None, :], b[None, :1].copy()
+        return companion(self.numerator, self.denominator)
 
     def frequency_response(self, frequencies: ArrayLike, interval: float) -> ComplexArray:
         """``C(exp(j w h))``.
@@ -137,6 +141,49 @@ class DiscreteController:
         require_positive("the sampling interval", interval, "s")
         q = np.exp(1j * np.asarray(frequencies, dtype=float) * interval)
         return np.asarray(np.polyval(self.numerator, q) / np.polyval(self.denominator, q), dtype=complex)
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousController:
+    """``C(s) = numerator / denominator`` with coefficients in descending powers of s, in continuous time.
+
+    Parameters
+    ----------
+    numerator : array_like, shape (m + 1,)
+        Coefficients in descending powers; leading zeros are dropped.
+    denominator : array_like, shape (n + 1,)
+        Coefficients in descending powers; both polynomials are divided by the leading one.
+
+    Raises
+    ------
+    DataError
+        If a coefficient is not finite, the leading denominator coefficient is zero, or there are more zeros than poles.
+
+    Notes
+    -----
+    A derivative needs a filter: ``kd s`` by itself has more zeros than poles.
+
+    Examples
+    --------
+    >>> ContinuousController([1.0, 2.0], [2.0, 0.0]).numerator
+    array([0.5, 1. ])
+    """
+
+    continuous: ClassVar[bool] = True
+
+    numerator: Array
+    denominator: Array
+
+    def __init__(self, numerator: ArrayLike, denominator: ArrayLike) -> None:
+        b, a = monic(*polynomials(numerator, denominator, "the controller", "s"))
+        if b.size > a.size:
+            counts = f"more zeros ({b.size - 1}) than poles ({a.size - 1})"
+            raise DataError(f"a controller with {counts} would differentiate jumps; give its derivative a filter")
+        freeze(self, numerator=b, denominator=a)
+
+    def state_space(self) -> tuple[Array, Array, Array, Array]:
+        """Companion realisation ``s' = A s + B e``, ``C s + D e``, as of a `DiscreteController`."""
+        return companion(self.numerator, self.denominator)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from ctid_cli.canonical import plain
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
+from ctid_cli.estimators.loop_output_error import LoopFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.inference.noise_estimate import NoiseEstimate
@@ -83,7 +84,12 @@ def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     if additive is not None:
         return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
     poles, zeros = result.fit.model.order, result.options.zeros
-    return [replace(item, unit=units.of(item.name, poles, zeros)) for item in result.estimates]
+    # The states of a loop are those of plant and controller, in different units.
+    nameless = "x" if isinstance(result.fit, LoopFit) else "-"
+    named = [
+        (item, "" if item.name.startswith(nameless) else units.of(item.name, poles, zeros)) for item in result.estimates
+    ]
+    return [replace(item, unit=unit) for item, unit in named]
 
 
 def additive_of(fit: MeasuredFit) -> AdditiveModel | None:

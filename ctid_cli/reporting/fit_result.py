@@ -14,8 +14,9 @@ import pandas as pd
 from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import BIASED
@@ -135,8 +136,9 @@ class FitResult(Result):
         yield "model", f"{_structure(options)}; delay {searched}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
-        if isinstance(options, MeasuredSubmodels):
-            yield from _iteration(self.fitted, options, first)
+        yield from _loop(options, first)
+        if isinstance(fit, SubmodelsFit):
+            yield "start", fit.start_method
         yield (
             "initial state",
             f"{TREATMENTS[options.initial_state]}{_before(self.fitted)} (--initial-state {options.initial_state})",
@@ -234,8 +236,8 @@ def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> s
 
 def _structure(options: Options) -> str:
     """Poles and zeros, of each submodel if there are several."""
-    if isinstance(options, DelayProfile) or not options.factored:
-        integrators = options.integrators if isinstance(options, DelayProfile) else 0
+    if not isinstance(options, MeasuredSubmodels) or not options.factored:
+        integrators = getattr(options, "integrators", 0)
         besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
         return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}{besides}"
     parts = ", ".join(
@@ -246,21 +248,23 @@ def _structure(options: Options) -> str:
     return f"{what} poles/zeros {parts}"
 
 
-def _iteration(
-    result: Identification, options: MeasuredSubmodels, measurement: Measurement
-) -> Iterator[tuple[str, str]]:
-    """The loop of a record, and where the iterations started."""
-    loop = measurement.record.loop
-    if options.closed and loop is not None:
+def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str]]:
+    """The loop of a record, and what of it the estimate is made with."""
+    loop, instruments = measurement.record.loop, getattr(options, "instruments", "open_loop")
+    if instruments == "reference":
+        yield "loop", f"controller not known; what of the input follows r = {measurement.reference} as instrument"
+    elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
         b, a = (
             " ".join(f"{c:.6g}" for c in np.asarray(side))
             for side in (loop.controller.numerator, loop.controller.denominator)
         )
-        where = "u = C(q) (r - y)" if loop.enters == "controller" else "u = r - C(q) y"
-        text = f"{where}, r = {measurement.reference}, C = ({b})/({a}) in descending powers of q"
-        yield "loop", f"{text}; instruments from the noise-free loop"
-    if isinstance(result.fit, SubmodelsFit):
-        yield "start", result.fit.start_method
+        p = "s" if loop.continuous else "q"
+        where = f"u = C({p}) (r - y)" if loop.enters == "controller" else f"u = r - C({p}) y"
+        text = f"{where}, r = {measurement.reference}, C = ({b})/({a}) in descending powers of {p}"
+        how = "instruments from the noise-free loop"
+        if isinstance(options, LoopOutputError):
+            how = "output error of the simulated loop, y - T r"
+        yield "loop", f"{text}; {how}"
 
 
 def _box_text(box: Box, units: Units) -> str:

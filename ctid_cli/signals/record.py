@@ -19,15 +19,15 @@ Enters = Literal["controller", "input"]
 
 
 class Controller(Protocol):
-    """A discrete-time controller ``C(q)``, as far as a record needs to know it."""
+    """A controller ``C(q)``, or ``C(s)`` in continuous time, as far as a record needs to know it."""
 
     @property
     def numerator(self) -> ArrayLike:
-        """Coefficients in descending powers of q."""
+        """Coefficients in descending powers of q or s."""
 
     @property
     def denominator(self) -> ArrayLike:
-        """Coefficients in descending powers of q."""
+        """Coefficients in descending powers of q or s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,12 @@ class Loop:
     ----------
     reference : ndarray, shape (N,)
         The reference r at the sampling instants.
-    controller : Controller
-        What made the input from reference and output.
+    controller : Controller or None
+        What made the input from reference and output; None where that is not known.
     enters : {"controller", "input"}, default "controller"
-        Whether r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``.
+        Whether r enters before the controller, ``u = C (r - y)``, or behind it, ``u = r - C y``.
+    hold : {"zoh", "foh"}, default "zoh"
+        The reference between the samples, which matters to a controller in continuous time only.
 
     Raises
     ------
@@ -52,15 +54,22 @@ class Loop:
     """
 
     reference: Array
-    controller: Controller
+    controller: Controller | None
     enters: Enters = "controller"
+    hold: Hold = "zoh"
 
     def __post_init__(self) -> None:
         require_choice("enters", self.enters, get_args(Enters))
+        require_choice("hold", self.hold, ("zoh", "foh"))
         reference = np.array(self.reference, dtype=float)
         if reference.ndim != 1 or not np.isfinite(reference).all():
             raise DataError("the reference of a loop must be one finite number for each sample")
         freeze(self, reference=reference)
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the controller acts in continuous time."""
+        return bool(getattr(self.controller, "continuous", False))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +96,8 @@ class Record:
     Raises
     ------
     DataError
-        If the record is empty, its times do not increase strictly, or no output is finite; or if there is a loop, and
-        the clock is not regular or the input not held from one sample to the next.
+        If the record is empty, its times do not increase strictly, or no output is finite; or if there is a loop with a
+        discrete controller, and the clock is not regular or the input not held from one sample to the next.
 
     Notes
     -----
@@ -138,6 +147,8 @@ class Record:
     def _require_loop(self, loop: Loop, where: str) -> None:
         if loop.reference.size != self.t.size:
             raise DataError(f"{where}the reference has {loop.reference.size} values for {self.t.size} samples")
+        if loop.continuous or loop.controller is None:
+            return
         if self.interval is None:
             why = "its controller is discrete and acts at every sample, and these are not equidistant"
             raise DataError(f"{where}a closed loop needs a regular clock: {why}")

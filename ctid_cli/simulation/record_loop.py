@@ -6,7 +6,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.models.controller import DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.table import split_header
@@ -22,22 +22,42 @@ def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
     assert r is not None
     _check_units(measured, loop)
     why, controller = "", loop.at(record.interval or 1.0).controller
+    if isinstance(controller, ContinuousController):
+        if record.input.hold == "band-limited":
+            raise DataError(f"{record.name}: the reference between its samples must be held: --hold zoh or foh")
+        # Between its samples the input is not known, and it is not needed.
+        own = Loop(r, controller, loop.enters, record.input.hold)
+        return replace(measured, record=replace(record, loop=own))
     if isinstance(controller, Relay):
         why = "closed-loop instruments need a linear controller, no relay"
+    elif record.input.hold != "zoh":
+        why = "a discrete controller holds its input (--hold zoh)"
     elif record.interval is None:
         why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
     elif not (left := unexplained(record, r, controller, loop.enters)) <= UNEXPLAINED:
         made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
         why = (
             f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
-            "controller in continuous time, another sampling interval, sign or reference, or limits of the actuator "
-            "do that, and estimates with it would be wrong"
+            "controller with two degrees of freedom or in continuous time, another sampling interval, sign or "
+            "reference, or limits of the actuator do that, and estimates with it would be wrong"
         )
     if why:
-        cure = "correct --loop or --reference, or give --ignore-loop to fit as if there were no loop"
+        cure = "correct --loop or --reference, or give --loop unknown, which needs no controller"
         raise DataError(f"{record.name}: {why}; {cure}")
     closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
     return replace(measured, record=closed)
+
+
+def in_unknown_loop(measured: Measurement) -> Measurement:
+    """Return the measurement with its reference, in a loop whose controller is not known."""
+    record, r = measured.record, measured.reference_values
+    assert r is not None
+    if record.interval is None:
+        raise DataError(
+            f"{record.name}: the reference as an instrument needs a regular clock, and that of this record is irregular; "
+            "give the controller (--loop FILE), or --direct"
+        )
+    return replace(measured, record=replace(record, loop=Loop(r, None)))
 
 
 def unexplained(record: Record, r: Array, controller: DiscreteController, enters: str) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification, laid_out_validation
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import Measurement, read_measurement
 from ctid_cli.signals.record import Loop, Record
@@ -71,8 +71,11 @@ def _loop(measurement: Measurement) -> dict[str, Any]:
     loop = measurement.record.loop
     if loop is None:
         return {}
+    if loop.controller is None:
+        return {"loop": {"reference": measurement.reference}}
     sides = {name: np.asarray(getattr(loop.controller, name)).tolist() for name in ("numerator", "denominator")}
-    return {"loop": {"reference": measurement.reference, "enters": loop.enters, **sides}}
+    kind = {"continuous": loop.continuous, "hold": loop.hold}
+    return {"loop": {"reference": measurement.reference, "enters": loop.enters, **kind, **sides}}
 
 
 # --- reading ---------------------------------------------------------------------------------------
@@ -94,8 +97,11 @@ class RecordSource(Source):
         reference = None if loop is None else loop["reference"]
         found = read_measurement(self.place, **columns, hold=content["hold"], **window, reference=reference)
         if loop is not None and found.reference_values is not None:
-            controller = DiscreteController(loop["numerator"], loop["denominator"])
-            closed = Loop(found.reference_values, controller, loop["enters"])
+            closed = Loop(found.reference_values, None)
+            if "numerator" in loop:
+                kind = ContinuousController if loop.get("continuous") else DiscreteController
+                controller = kind(loop["numerator"], loop["denominator"])
+                closed = Loop(found.reference_values, controller, loop["enters"], loop.get("hold", "zoh"))
             found = replace(found, record=replace(found.record, loop=closed))
         return replace(found, record=replace(found.record, name=self.name))
 

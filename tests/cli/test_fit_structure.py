@@ -125,8 +125,8 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     assert stored.records[0].loop.controller.numerator.tolist() == [0.8, -0.7]
     assert np.mean(stored.fit.residuals[0] ** 2) == pytest.approx(content["cost"], rel=1e-12)
     assert not any("follows the output" in warning for warning in content["warnings"])
-    ignored = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--ignore-loop")
-    assert any("The loop is ignored" in note for note in ignored["notes"])
+    ignored = fitted(ctid, *options, "--loop", tmp_path / "loop.yaml", "--direct")
+    assert any("direct method" in note for note in ignored["notes"])
     direct = fitted(ctid, *options)
     estimates, plain = ({one["name"]: one["estimate"] for one in each["parameters"]} for each in (ignored, direct))
     assert estimates == plain
@@ -135,6 +135,7 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     assert "estimate is biased" in ignored["covariance"]["reason"]
 
 
+KNOWN_LOOP = ("--loop", "loop.yaml", "--reference", "r")
 ADDITIVE = ("--model", "additive", "--terms", "2/0")
 REFUSED = {
     "terms alone": (("--terms", "2/0"), "add --model additive"),
@@ -154,9 +155,20 @@ REFUSED = {
         "use --offset estimate",
     ),
     "nothing left": (("--poles", 1, "--fix", "a1=1", "--fix", "b0=1"), "nothing to estimate"),
-    "half a loop": (("--poles", 1, "--reference", "u"), "add --loop FILE"),
     "the other half": (("--poles", 1, "--loop", "loop.yaml"), "add --reference COLUMN"),
-    "no loop to ignore": (("--poles", 1, "--ignore-loop"), "drop it"),
+    "no loop": (("--poles", 1, "--direct"), "add --loop FILE or --loop unknown"),
+    "a delay to search without the controller": (
+        ("--poles", 1, "--reference", "r", "--delay", "0:1"),
+        "give one value",
+    ),
+    "a known coefficient in a loop": (("--poles", 1, *KNOWN_LOOP, "--fix", "a1=1"), "--model additive"),
+    "a loop that repeats": (("--poles", 1, *KNOWN_LOOP, "--initial-state", "periodic"), "use rest or estimate"),
+    "a drift in a loop": (("--poles", 1, *KNOWN_LOOP, "--offset", "drift"), "use estimate, remove or none"),
+    "a loss in a loop": (("--poles", 1, *KNOWN_LOOP, "--loss", "huber"), "drop --loss"),
+    "as many zeros as poles": (
+        ("--poles", 1, "--zeros", 1, *KNOWN_LOOP, "--delay", "0:1"),
+        "while the delay is estimated",
+    ),
 }
 
 

@@ -1,0 +1,131 @@
+"""Are plants found in their loops, unstable ones too, and do the errors hold? Simulated records, controller known.
+
+    python benchmarks/bench_loops.py [--runs 17] [--seed 1] [--samples 4000] [--paper 60] [--unknown 60]
+
+First 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output noise: ``runs``
+records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of their intervals
+hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A. González et al.,
+*Identification of additive continuous-time systems in open and closed loop*, Automatica 173 (2025) 112013, with a delay
+of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes' frequencies, beside CLSRIVC that is told the
+delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance, by what is known of the loop: reference and
+controller, the reference alone, or nothing (the direct method).
+"""
+
+import argparse
+
+from _timing import cpu
+
+import numpy as np
+
+from ctid_cli import DataError, DelayProfile, DiscreteController, HeldSignal, Loop, Record, Srivc, TransferFunction
+from ctid_cli import AdditiveModel, Status, Submodel, simulate_loop
+from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.models.factoring import unfactored
+
+LOOPS = ((0.05, 1, 0.5, 1), (0.1, 1, 0.3, 1), (0.05, 1, 0.5, 10), (0.01, 2, 0.3, 10), (0.05, 0.5, 0.6, 1))
+LOOPS += ((0.02, 1, 0.5, 10),)
+UNSTABLE = TransferFunction([4.0], [1.0, 0.0, -1.0])
+MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.12)
+PID, INTERVAL = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0]), 0.05
+
+
+def looped(plant, law, r, v, interval):
+    u, x = simulate_loop(plant, law, r, v, interval)
+    t = interval * np.arange(r.size)
+    return Record(t, x + v, HeldSignal(t, u), loop=Loop(r, law))
+
+
+def unstable_record(loop, noise, samples, rng):
+    h, kp, td, hold = loop
+    law = DiscreteController.from_pid(kp, 0.0, kp * td / h)
+    r = np.repeat(rng.standard_normal(samples // hold), hold)
+    return looped(UNSTABLE, law, r, noise * rng.standard_normal(r.size), h)
+
+
+def covered(fit, truth):
+    names = [name for name in truth if name in fit.parameters]
+    return [abs(fit.parameters[n] - truth[n]) <= fit.quantiles[n] * fit.standard_errors[n] for n in names]
+
+
+def six_loops(runs, samples, seed):
+    truth, estimator = {"a1": 0.0, "a2": -1.0, "b0": 4.0}, LoopOutputError(2, 0)
+    print("4/(p^2 - 1)                       converged  other with error  a1, a2, b0 covered [%]  CPU s a record")
+    total, wrong, hits, time = 0, 0, [], 0.0
+    for noise in (0.02, 0.1):
+        for k, loop in enumerate(LOOPS):
+            rng, own, others = np.random.default_rng([seed, k, int(1000 * noise)]), [], 0
+            spent = 0.0
+            for _ in range(runs):
+                record = unstable_record(loop, noise, samples, rng)
+                taken, fit = cpu(estimator.fit, record)
+                spent += taken
+                errors = np.array(list(fit.standard_errors.values()))
+                if fit.status is Status.CONVERGED and np.isfinite(errors).all():
+                    own.append(covered(fit, truth))
+                else:
+                    others += bool(np.isfinite(errors).any())
+            shares = " ".join(f"{100 * share:5.1f}" for share in np.mean(own, axis=0))
+            print(
+                f"{loop!s:24} noise {noise:<5} {len(own):4} of {runs:3} {others:10}          {shares} {spent / runs:15.2f}"
+            )
+            total, wrong, hits, time = total + len(own), wrong + others, hits + own, time + spent
+    shares = " ".join(f"{100 * share:.1f}" for share in np.mean(hits, axis=0))
+    print(f"all: {total} of {12 * runs} converged, {wrong} others with an error, {shares} % covered, {time:.0f} CPU s")
+
+
+def frequencies(model):
+    """Natural frequencies of the two pairs, or NaN where there are not two."""
+    upper = np.sort(np.abs([pole for pole in model.poles if pole.imag > 0]))
+    return upper if upper.size == 2 else np.full(2, np.nan)
+
+
+def paper_loop(runs, seed, coloured):
+    truth = np.array([MODES.delay, *frequencies(unfactored(MODES))])
+    ways = {
+        "loop, delay 0:.5": lambda record: LoopOutputError(4, 2, (0.0, 0.5)).fit(record),
+        "CLSRIVC, delay told": lambda record: Srivc(4, 2, MODES.delay, instruments="closed_loop").fit(record),
+    }
+    if coloured:
+        ways = {
+            "reference and controller": lambda record: LoopOutputError(4, 2, (MODES.delay,) * 2).fit(record),
+            "reference": lambda record: Srivc(4, 2, MODES.delay, instruments="reference").fit(record),
+            "nothing: direct": lambda record: DelayProfile(4, 2, (MODES.delay,) * 2).fit(record),
+        }
+    found, converged, times = {way: [] for way in ways}, dict.fromkeys(ways, 0), dict.fromkeys(ways, 0.0)
+    rng = np.random.default_rng([seed, coloured])
+    for _ in range(runs):
+        r, e = rng.standard_normal((2, 3140))
+        if coloured:
+            for k in range(1, e.size):
+                e[k] += 0.9 * e[k - 1]
+            e *= np.sqrt(1 - 0.81)
+        record = looped(MODES, PID, r, 0.1 * e, INTERVAL)
+        for way, fit in ways.items():
+            try:
+                taken, one = cpu(fit, record)
+            except DataError:
+                continue
+            times[way] += taken
+            if one.status is Status.CONVERGED:
+                converged[way] += 1
+                found[way].append([one.model.delay, *frequencies(one.model)])
+    title = "noise e/(1 - .9 q^-1)" if coloured else "white noise"
+    print(f"\nloop of section 6.2, {title}, N 3140: bias and deviation of the delay [s], both frequencies [rad/s]")
+    for way, values in found.items():
+        errors = np.array(values) - truth
+        errors = errors[np.isfinite(errors).all(axis=1)]
+        bias, spread = errors.mean(axis=0), errors.std(axis=0)
+        text = "  ".join(f"{b:9.5f} {s:8.5f}" for b, s in zip(bias, spread, strict=True))
+        print(
+            f"{way:25} {converged[way]:4} of {runs} converged, {len(errors):4} with two pairs: {text}  {times[way] / runs:.2f} CPU s"
+        )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    for name, value in (("runs", 17), ("seed", 1), ("samples", 4000), ("paper", 60), ("unknown", 60)):
+        parser.add_argument(f"--{name}", type=int, default=value)
+    given = parser.parse_args()
+    six_loops(given.runs, given.samples, given.seed)
+    paper_loop(given.paper, given.seed, False)
+    paper_loop(given.unknown, given.seed, True)

@@ -1,0 +1,355 @@
+r"""The output error of a loop: what is left of the output when the reference drives the simulated loop.
+
+.. math:: y(t_k) = T(\theta) r(t_k) + (\text{response to the first state}) + c + e_k
+
+T has the plant and the known controller. As r is independent of the noise, the least squares estimate is consistent
+whatever the noise, and for unstable plants too; e is the noise as the loop lets it through, and hardly ever white.
+State and offset c are eliminated: they are least squares for every theta (projection of the sensitivities, L. Kaufman,
+*A variable projection method for solving separable nonlinear least squares problems*, BIT 15 (1975) 49-57).
+"""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import butter
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError
+from ctid_cli.estimation.additive_problem import AdditiveProblem, estimate_submodels, following
+from ctid_cli.estimation.iteration import Iterated, Steps, inadmissible, iterate
+from ctid_cli.estimation.modal_start import automatic_start
+from ctid_cli.estimation.sampled_problem import reflect_unstable
+from ctid_cli.filtering.bank import Equations, standard_rows
+from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.loop_response import LoopResponse
+from ctid_cli.filtering.submodels import OPEN_LOOP, LoopData
+from ctid_cli.inference.fit import Status
+from ctid_cli.models.additive import Term
+from ctid_cli.models.factoring import unfactored
+from ctid_cli.signals.record import Record
+
+#: Cut-offs of the filters of starts, spread from six over the length of the record to the Nyquist frequency over two;
+#: for each delay of a search every third does.
+CUTOFFS, OF_DELAY = 9, 3
+#: Times that the filter of a start is made from its own poles.
+ROUNDS = 4
+#: Up to this number of poles the reference alone leads to the minimum.
+FEW_POLES = 2
+#: Starts that are refined, and starts of a search over the delay.
+REFINED, MOST_DELAYS = 4, 60
+#: Steps of the refinement, and those at each delay of a search.
+STEPS, FEW_STEPS = Steps(100, 1e-6, "guarded"), Steps(4, 1e-4, "guarded")
+#: Sampling intervals over which a delay may move to its minimum.
+MOST_CELLS = 30
+#: Directions of state and offset are told apart down to this fraction of the greatest.
+RANK = 1e-10
+#: Squared errors that differ by less than this fraction are those of one minimum.
+SAME = 1e-6
+
+
+class Columns(NamedTuple):
+    """What an estimate says of each used sample."""
+
+    #: Sensitivities to the parameters, shape (count, p).
+    slopes: Array
+    #: Responses to the first state, and ones where an offset is estimated, shape (count, f).
+    linear: Array
+    #: Measured output less the response to the reference, shape (count,).
+    left: Array
+
+    @property
+    def basis(self) -> tuple[Array, Array]:
+        """Orthonormal basis of the linear columns, and the combinations of them that it is."""
+        if not self.linear.shape[1]:
+            return self.linear, np.zeros((0, 0))
+        lengths = np.linalg.norm(self.linear, axis=0)
+        lengths[lengths == 0.0] = 1.0
+        U, s, Vt = np.linalg.svd(self.linear / lengths, full_matrices=False)
+        kept = s > RANK * s[0]
+        return U[:, kept], (Vt[kept] / s[kept, None]).T / lengths[:, None]
+
+    @property
+    def own(self) -> Array:
+        """The best state and offset."""
+        Q, combined = self.basis
+        return np.asarray(combined @ (Q.T @ self.left))
+
+
+@dataclass(frozen=True, eq=False)
+class LoopProblem:
+    """Parameters of a plant in a loop: ``theta = (a_1 … a_n, b_0 … b_m, tau)``."""
+
+    #: The record.
+    data: FilterData
+    response: LoopResponse
+    offset: bool
+    #: Whether the state at the first sample is estimated, and not that of rest.
+    free_state: bool
+    #: Bounds of the delay [s]; equal where it is known.
+    delays: tuple[float, float]
+    #: Sampling interval that the delay is in, None where it is not moved.
+    cell: int | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of parameters, the delay included."""
+        return self.response.poles + self.response.zeros + 2
+
+    @property
+    def free(self) -> int:
+        """Number of parameters to iterate on."""
+        return self.size - (self.cell is None)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in the sums."""
+        return self.data.count
+
+    def split(self, theta: Array) -> tuple[Array, Array, float]:
+        """Denominator, numerator and delay [s] of a parameter vector."""
+        n = self.response.poles
+        a = np.concatenate(([1.0], theta[:n], np.zeros(self.response.integrators)))
+        return a, theta[n:-1], float(theta[-1])
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the delay in its sampling interval [s]."""
+        if self.cell is None:
+            return self.delays
+        h = self.data.interval
+        return max(self.delays[0], self.cell * h), min(self.delays[1], (self.cell + 1) * h)
+
+    def cell_of(self, delay: float) -> int:
+        """Return the sampling interval that a delay is in, the last one if it is the greatest."""
+        h = self.data.interval
+        return min(int(delay / h), int(np.ceil(self.delays[1] / h)) - 1)
+
+    def admissible(self, theta: Array) -> Array:
+        """Parameters with the delay moved into its bounds; poles may be anywhere."""
+        moved = theta.copy()
+        if self.cell is not None:
+            moved[-1] = np.clip(theta[-1], *self.bounds)
+        return moved
+
+    def columns(self, theta: Array, count: int | None = None) -> Columns | None:
+        """Return what parameters say of the samples with the best state and offset; None where it is not finite."""
+        count, use = self.free if count is None else count, self.data.use
+        linear, state = np.ones((self.samples, int(self.offset))), None
+        with np.errstate(all="ignore"):
+            if self.free_state:
+                left = (self.data.y - self.response.rows(theta, 0, self.cell).output)[use]
+                linear = np.column_stack((self.response.free(theta, self.cell)[use], linear))
+                if not (np.isfinite(linear).all() and np.isfinite(left).all()):
+                    return None
+                state = Columns(np.zeros((0, 0)), linear, left).own[: linear.shape[1] - int(self.offset)]
+            rows = self.response.rows(theta, count, self.cell, state)
+        if not (np.isfinite(rows.output).all() and np.isfinite(rows.slopes).all()):
+            return None
+        left = (self.data.y - rows.output)[use]
+        if state is not None:
+            left += linear[:, : state.size] @ state
+        return Columns(rows.slopes[use], linear, left)
+
+    def rows(self, theta: Array) -> tuple[Array, Array] | None:
+        """Sensitivities and output error at the used samples, of the best state and offset."""
+        columns = self.columns(theta)
+        if columns is None:
+            return None
+        Q, _ = columns.basis
+        return columns.slopes - Q @ (Q.T @ columns.slopes), columns.left - Q @ (Q.T @ columns.left)
+
+    def equations(self, theta: Array) -> Equations:
+        """Second moments of the iteration, which is that of Gauss and Newton here."""
+        found = self.rows(theta) if np.isfinite(theta).all() else None
+        if found is None:
+            return inadmissible(theta.size)
+        psi, eps = found
+        with np.errstate(all="ignore"):
+            hessian, gradient = np.zeros((theta.size,) * 2), np.zeros(theta.size)
+            hessian[: self.free, : self.free], gradient[: self.free] = psi.T @ psi, psi.T @ eps
+            squared, output = float(eps @ eps), self.data.y_used - eps
+        if not (np.isfinite(hessian).all() and np.isfinite(squared)):
+            return inadmissible(theta.size)
+        return Equations(hessian, gradient, hessian, squared, float(output @ output))
+
+    def squared_error(self, theta: Array) -> float:
+        """Return the least squared error over state and offset; infinite where the response is not finite."""
+        columns = self.columns(theta, 0) if np.isfinite(theta).all() else None
+        if columns is None:
+            return np.inf
+        Q, _ = columns.basis
+        with np.errstate(all="ignore"):
+            left = columns.left - Q @ (Q.T @ columns.left)
+            return float(np.nan_to_num(left @ left, nan=np.inf))
+
+    # --- starts --------------------------------------------------------------------------------------
+
+    def starts(self, delay: float, every: int = 1, rounds: int = ROUNDS) -> Iterator[Array]:
+        """Yield estimates from the measured input by instrumental variables that the reference makes.
+
+        The model holds behind any filter ``1/E``: ``p^n/E y = -sum a_i p^(n-i)/E y + sum b_j p^(m-j)/E u``. Of the
+        right side only what follows the filtered reference counts (two-stage least squares), so that noise in the loop
+        leaves no bias. E is first that of a Butterworth filter, then the denominator with its unstable poles mirrored.
+        """
+        t, n = self.data.t, self.response.poles + self.response.integrators
+        cutoffs = np.geomspace(6.0 / (t[-1] - t[0]), 1.5 / float(np.median(np.diff(t))), CUTOFFS)
+        filters = [np.asarray(butter(n, cutoff, analog=True)[1], dtype=float) for cutoff in cutoffs]
+        reference = self.response.data
+        behind = [standard_rows(reference, E, np.zeros(1), delay)[:, :n] for E in filters[::2]]
+        instruments = np.column_stack((*behind, np.ones((self.samples, int(self.offset)))))
+        instruments, _ = np.linalg.qr(instruments / np.maximum(np.linalg.norm(instruments, axis=0), 1e-300))
+        for E in filters[::every]:
+            for _ in range(1 + rounds):
+                theta = self._two_stage(E, instruments, delay)
+                if theta is None:
+                    break
+                yield theta
+                poles = np.roots(self.split(theta)[0])
+                slowest = 1.0 / (t[-1] - t[0])
+                E = reflect_unstable(np.real(np.poly(np.where(np.abs(poles) < slowest, -slowest, poles))))
+
+    def stable_start(self, record: Record, delay: float) -> Array | None:
+        """Return the estimate of a stable plant whose poles are found pair by pair, with the reference as instrument.
+
+        Filters that are one for all frequencies do not show a pair that is little damped beside a stronger one.
+        """
+        response, loop = self.response, OPEN_LOOP
+        if self.data.interval and not response.continuous:
+            loop = LoopData(following(response.data.u, self.data.u), np.ones(1), np.ones(1), True, direct=True)
+        problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
+        with suppress(DataError):
+            model = automatic_start(record, problem).model
+            found = unfactored(estimate_submodels(problem, model.theta, Steps(30, 1e-4, "relaxed")).model)
+            b = np.concatenate((np.zeros(response.zeros + 1 - found.numerator.size), found.numerator))
+            return np.concatenate((found.denominator[1 : response.poles + 1], b, [delay]))
+        return None
+
+    def _two_stage(self, E: Array, instruments: Array, delay: float) -> Array | None:
+        response, n = self.response, self.response.poles + self.response.integrators
+        with np.errstate(all="ignore"):
+            rows = standard_rows(self.data, E, np.zeros(1), delay)
+        u, y = rows[:, :n], rows[:, 2 * n + 1 : 3 * n + 1]
+        highest = rows[:, 3 * n + 1] - y[:, ::-1] @ E[1:]
+        by_a = -y[:, ::-1][:, : response.poles]
+        by_b = (
+            u[:, response.zeros :: -1]
+            if response.zeros < n
+            else np.column_stack((rows[:, n] - u[:, ::-1] @ E[1:], u[:, ::-1]))
+        )
+        regressors = np.column_stack((by_a, by_b, np.ones((self.samples, int(self.offset)))))
+        seen = instruments.T @ regressors
+        if not np.isfinite(seen).all():
+            return None
+        lengths = np.linalg.norm(seen, axis=0)
+        if not lengths.all():
+            return None
+        found = np.linalg.lstsq(seen / lengths, instruments.T @ highest)[0] / lengths
+        theta = np.append(found[: self.size - 1], delay)
+        return theta if np.isfinite(theta).all() else None
+
+    # --- the least output error ----------------------------------------------------------------------
+
+    def best(self, record: Record) -> "LoopEstimate | None":
+        """Return the least of the minima that starts lead to."""
+        starts = self._delays()
+        if self.response.poles > FEW_POLES:
+            delays = dict.fromkeys(float(theta[-1]) for theta in starts[:REFINED]) or [sum(self.delays) / 2]
+            more = [self.stable_start(record, delay) for delay in delays]
+            starts += [theta for theta in more if theta is not None]
+        found = [self._local(start) for start in starts]
+        results = [one for one in found if one is not None]
+        if not results:
+            return None
+        least = min(results, key=lambda one: one.result.equations.squared_error)
+        level = least.result.equations.squared_error * (1.0 + SAME)
+        agree = sum(one.result.equations.squared_error <= level for one in results)
+        evaluations = sum(one.result.iterations for one in results)
+        return least._replace(tried=len(results), agree=agree, iterations=evaluations)
+
+    def _lowest(self, thetas: Iterator[Array], most: int) -> list[Array]:
+        """Return the parameters of the least squared errors, different ones."""
+        errors = sorted(((self.squared_error(theta), k, theta) for k, theta in enumerate(thetas)), key=lambda e: e[:2])
+        kept: list[tuple[float, Array]] = []
+        for error, _, theta in errors:
+            if np.isfinite(error) and all(abs(error - other) > SAME * other for other, _ in kept):
+                kept.append((error, theta))
+        return [theta for _, theta in kept[:most]]
+
+    def _delays(self) -> list[Array]:
+        """Return where to start: of a searched delay the lowest minima of its profile."""
+        low, high = self.delays
+        if low == high:
+            return self._lowest(self.starts(low), REFINED)
+        h = self.data.interval
+        # Within the sampling intervals, whose ends have kinks.
+        count = min(max(2 * int(np.ceil((high - low) / h)), 3), MOST_DELAYS)
+        profile = []
+        for delay in low + (np.arange(count) + 0.5) / count * (high - low):
+            at_delay: list[tuple[float, Array]] = []
+            for theta in self._lowest(self.starts(float(delay), OF_DELAY, 1), 2):
+                result = iterate(self, theta, FEW_STEPS)
+                if result is not None:
+                    at_delay.append((result.equations.squared_error, result.theta))
+            profile.append(min(at_delay, key=lambda each: each[0], default=(np.inf, np.zeros(0))))
+        errors = np.array([np.inf, *(error for error, _ in profile), np.inf])
+        lowest = np.flatnonzero(
+            (errors[1:-1] <= errors[:-2]) & (errors[1:-1] <= errors[2:]) & np.isfinite(errors[1:-1])
+        )
+        return [profile[k][1] for k in sorted(lowest, key=lambda k: errors[k + 1])[:REFINED]]
+
+    def _local(self, theta: Array) -> "LoopEstimate | None":
+        """Return the minimum that parameters lead to, from one sampling interval of the delay to the next."""
+        low, high = self.delays
+        if low == high:
+            result = iterate(self, theta, STEPS)
+            return None if result is None else LoopEstimate(self, result)
+        cell, found = self.cell_of(theta[-1]), None
+        for _ in range(MOST_CELLS):
+            problem = replace(self, cell=cell)
+            result = iterate(problem, theta, STEPS)
+            if result is None:
+                return found
+            theta, (first, end) = result.theta, problem.bounds
+            if first < theta[-1] < end:
+                return LoopEstimate(problem, result)
+            # At a sample, where the cost has a kink: the others' minimum there, and whether either side goes downhill.
+            side = 1 if theta[-1] == end else -1
+            held = iterate(self, theta, STEPS)
+            theta = theta if held is None else held.theta
+            found = LoopEstimate(problem, result if held is None else held, at_bound=theta[-1] in self.delays)
+            if problem.equations(theta).instrument_error[-1] * side < 0 and held is not None:
+                continue
+            if theta[-1] in self.delays:
+                return found
+            other = replace(self, cell=cell + side)
+            if not other.equations(theta).instrument_error[-1] * side > 0:
+                return found
+            cell += side
+        return found
+
+
+class LoopEstimate(NamedTuple):
+    """A minimum, and how it was found."""
+
+    problem: LoopProblem
+    result: Iterated
+    #: Whether the delay would leave its bounds.
+    at_bound: bool = False
+    tried: int = 1
+    agree: int = 1
+    iterations: int = 0
+
+    @property
+    def radius(self) -> float:
+        """Largest magnitude of the poles of the loop [-]."""
+        return self.problem.response.radius(self.result.theta)
+
+    @property
+    def status(self) -> Status:
+        """How the search ended; no model whose loop is unstable is a minimum."""
+        if not self.radius < 1.0:
+            return Status.DIVERGED
+        return Status.DELAY_AT_BOUND if self.at_bound and self.result.status is Status.CONVERGED else self.result.status

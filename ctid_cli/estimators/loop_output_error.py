@@ -1,0 +1,298 @@
+"""A transfer function in a loop with a known controller, by the output error of the simulated loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import (
+    Estimator,
+    Fixed,
+    Start,
+    check_greatest_delay,
+    check_record,
+    checked_bounds,
+    quality,
+)
+from ctid_cli.estimation.loop_problem import LoopEstimate, LoopProblem
+from ctid_cli.estimation.measured_records import AppliedModel, without_means
+from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit, Starts
+from ctid_cli.filtering.bank import Equations
+from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.filtering.loop_response import LoopResponse
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
+from ctid_cli.models.controller import ContinuousController, DiscreteController
+from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.treatment import LossKind
+
+#: What a loop can be at the first sample, and what offsets it can have.
+LoopState = Literal["rest", "estimate"]
+LoopOffset = Literal["none", "remove", "estimate"]
+#: Endings of which standard errors are given.
+DETERMINED = (Status.CONVERGED, Status.DELAY_AT_BOUND)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopFit(MeasuredFit):
+    """A fit to a record in its loop.
+
+    Parameters
+    ----------
+    model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    loop_radius : float
+        Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
+    """
+
+    loop_radius: float = float("nan")
+
+    def uncertainty(
+        self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
+    ) -> Uncertainty:
+        """Standard errors and intervals for a kind of noise.
+
+        ``auto`` is ``robust``: the loop colours the noise. There are none where no minimum was reached.
+        """
+        found = MeasuredFit.uncertainty(self, "robust" if kind == "auto" else kind, draws, progress)
+        return found if self.status in DETERMINED else found.undefined
+
+
+@dataclass(frozen=True, eq=False)
+class LaidOutLoop:
+    """A record in its loop laid out for estimation."""
+
+    record: Record
+    problem: LoopProblem
+    #: Means that were subtracted.
+    input_offset: float
+    offset: float
+
+    @property
+    def records(self) -> list[Record]:
+        """The record, without the means that were subtracted."""
+        return [self.record]
+
+
+@dataclass(frozen=True)
+class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
+    """Output error of a simulated loop: reference and controller are known, the plant need not be stable.
+
+    Parameters
+    ----------
+    poles : int
+        Degree of the denominator, 1 to 12.
+    zeros : int
+        Degree of the numerator, below ``poles``; equal to ``poles`` only where the delay is known.
+    delay_bounds : tuple of float, default (0.0, 0.0)
+        Least and greatest delay [s]; two equal numbers are a known delay. With a controller in continuous time it must
+        be known to be zero.
+    initial_state : {"rest", "estimate"}, default "rest"
+        State of plant and controller, and inputs on their way, at the first sample.
+    offset : {"none", "remove", "estimate"}, default "none"
+        Offset of the output: none, means of output, input and reference subtracted first, or a constant estimated with
+        the model.
+    integrators : int, default 0
+        Poles at the origin besides ``poles``, which may then be 0.
+    covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
+        Noise that the standard errors hold for; ``auto`` is ``robust``, for the loop colours the noise.
+    bootstrap_draws : int, default 500
+        Simulated noise sequences of a bootstrap [-].
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    Minimises ``sum (y - T(theta) r)^2``, T being the simulated loop. The reference is independent of the noise, so that
+    the estimate is consistent for noise of any colour; with white output noise, instruments (CLSRIVC) or the direct
+    method use the input besides and are more accurate where the feedback is strong. Starts are two-stage least squares
+    with filtered references as instruments. It is no estimate if the record's controller is not the one that is given.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import DiscreteController, HeldSignal, Loop, Record, TransferFunction, simulate_loop
+    >>> from ctid_cli.estimators.loop_output_error import LoopOutputError
+    >>> rng, law = np.random.default_rng(0), DiscreteController([11.0, -10.0], [1.0, 0.0])
+    >>> r, v, t = rng.standard_normal(2000), 0.02 * rng.standard_normal(2000), 0.05 * np.arange(2000)
+    >>> u, x = simulate_loop(TransferFunction([4.0], [1.0, 0.0, -1.0]), law, r, v, 0.05)
+    >>> record = Record(t, x + v, HeldSignal(t, u), loop=Loop(r, law))
+    >>> fit = LoopOutputError(poles=2, zeros=0).fit(record)
+    >>> fit.status.name, fit.model.poles.real.round(1)
+    ('CONVERGED', array([ 1., -1.]))
+    """
+
+    kind: ClassVar[str] = "loop_output_error"
+    loss: ClassVar[LossKind] = "squares"
+    #: As other estimators of records in loops have it.
+    instruments: ClassVar[str] = "closed_loop"
+    fixed: ClassVar[tuple[Fixed, ...] | None] = None
+
+    poles: int
+    zeros: int
+    delay_bounds: tuple[float, float] = (0.0, 0.0)
+    initial_state: LoopState = "rest"
+    offset: LoopOffset = "none"
+    integrators: int = 0
+    covariance: Covariance = "auto"
+    bootstrap_draws: int = DRAWS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
+        object.__setattr__(self, "delay_bounds", bounds)
+        allowed = self.order - (low < high)
+        if self.zeros > allowed:
+            reason = "" if low == high else " while the delay is estimated"
+            given = f"got {self.zeros} zeros and {self.order} poles, integrators included"
+            raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
+
+    @property
+    def order(self) -> int:
+        """Number of poles, integrators included."""
+        return self.poles + self.integrators
+
+    @property
+    def searched(self) -> bool:
+        """Whether the delay is a parameter."""
+        return self.delay_bounds[0] < self.delay_bounds[1]
+
+    def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutLoop:
+        several = [records] if isinstance(records, Record) else list(records)
+        if len(several) != 1:
+            raise DataError("a loop is fitted to one record; give one file")
+        loop, where = several[0].loop, named(several[0])
+        if loop is None or loop.controller is None:
+            missing = "neither" if loop is None else "no controller"
+            raise DataError(f"{where}the loop needs the reference and the controller, and this record has {missing}")
+        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
+        assert record.loop is not None
+        if loop.continuous and self.delay_bounds[1] > 0:
+            why = "a loop in continuous time with a delay in it has no finite state"
+            raise DataError(f"{where}{why}; the delay must be 0, or the controller discrete")
+        if self.delay_bounds[1] > 0:
+            check_greatest_delay(record, self.delay_bounds[1])
+        data = filter_data(record)
+        driven = filter_data(self._acting(record))
+        kind = ContinuousController if loop.continuous else DiscreteController
+        law = kind(loop.controller.numerator, loop.controller.denominator)
+        at_controller, free = loop.enters == "controller", self.initial_state == "estimate"
+        structure = self.poles, self.zeros, self.integrators
+        response = LoopResponse(driven, law, at_controller, *structure)
+        check_record(record, driven, self.poles + self.zeros + 2)
+        problem = LoopProblem(data, response, self.offset == "estimate", free, self.delay_bounds)
+        return LaidOutLoop(record, problem, u0, y0)
+
+    def _estimate(self, laid_out: LaidOutLoop, start: Start | None) -> LoopFit:
+        found = laid_out.problem.best(laid_out.record)
+        if found is None:
+            raise DataError(
+                f"{named(laid_out.record)}no model that the reference as an instrument leads to makes a loop whose output "
+                "is finite; use other poles and zeros, another delay, or a longer record"
+            )
+        return self._described(laid_out, found)._with_uncertainty(self.covariance, self.bootstrap_draws)
+
+    def _described(self, laid_out: LaidOutLoop, found: LoopEstimate) -> LoopFit:
+        """Return the fit, but for its covariance."""
+        problem, theta = found.problem, found.result.theta
+        own = self._own(problem, theta)
+        names = Structure(self.order, self.zeros, self.searched).names
+        states = own.size - int(problem.offset)
+        names += tuple(f"x{k}" for k in range(1, states + 1)) + ("offset",) * problem.offset
+        a, b, delay = problem.split(theta)
+        whole = np.concatenate((a[1:], b, [delay][: int(self.searched)], own))
+        held = [name for k, name in enumerate(names) if self.poles <= k < self.order]
+        model = TransferFunction(b, a, delay)
+        fit = LoopFit(
+            model=model,
+            parameter_names=names,
+            covariance=np.full((whole.size, whole.size), np.nan),
+            status=found.status,
+            iterations=found.iterations,
+            theta=whole,
+            initial_states=(own[:states],),
+            offsets=(float(own[-1]) if problem.offset else laid_out.offset,),
+            input_offsets=(laid_out.input_offset,),
+            starts=Starts(found.tried, found.agree),
+            regular=problem.data.interval > 0.0,
+            known=tuple(held),
+            loop_radius=found.radius,
+            **dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), np.nan),
+            count=problem.samples,
+        )
+        samples, tangent = self._judged(fit, problem)
+        psi, eps, y = samples.sensitivities[0] @ tangent, samples.residuals[0], problem.data.y_used
+        moments = Equations(psi.T @ psi, psi.T @ eps, psi.T @ psi, float(eps @ eps), 0.0)
+        fitness = quality(moments, float(np.sum((y - y.mean()) ** 2)), y.size)
+        return replace(fit, **samples._asdict(), tangent=tangent, **fitness)
+
+    def _own(self, problem: LoopProblem, theta: Array) -> Array:
+        """Return the best state and offset for parameters."""
+        columns = problem.columns(theta, 0)
+        if columns is None:
+            raise DataError("the loop of this model with the controller has no finite output on this record")
+        return columns.own
+
+    def _theta(self, fit: MeasuredFit) -> Array:
+        """Return the parameters of the problem."""
+        b = fit.model.numerator
+        b = np.concatenate((np.zeros(self.zeros + 1 - b.size), b))
+        return np.concatenate((fit.model.denominator[1 : self.poles + 1], b, [fit.model.delay]))
+
+    def _judged(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
+        """Return what a fit says of each used sample, and the directions in which its parameters are free."""
+        theta = self._theta(fit)
+        if self.searched and problem.cell is None:
+            problem = replace(problem, cell=problem.cell_of(theta[-1]))
+        columns = problem.columns(theta)
+        if columns is None:
+            raise DataError("the loop of this model with the controller has no finite output on this record")
+        own, size = fit.theta[fit.theta.size - columns.linear.shape[1] :], fit.theta.size
+        first, last = self.poles, size - own.size
+        psi = np.zeros((problem.samples, size))
+        places = [k for k in range(last) if not first <= k < self.order]
+        psi[:, places], psi[:, last:] = columns.slopes, columns.linear
+        if fit.status is Status.DELAY_AT_BOUND:
+            places = places[:-1]
+        Q, combined = columns.basis
+        tangent = np.zeros((size, len(places) + Q.shape[1]))
+        tangent[places, range(len(places))], tangent[last:, len(places) :] = 1.0, combined
+        samples = FittedSamples((columns.left - columns.linear @ own,), (psi,), (problem.data.use,), None)
+        return samples, tangent
+
+    # --- what a fit is judged by -----------------------------------------------------------------------
+
+    def _acting(self, record: Record) -> Record:
+        """The record with what acts on the output from outside: the reference, for noise moves the input."""
+        assert record.loop is not None
+        reference = HeldSignal(record.t, record.loop.reference, record.loop.hold)
+        return Record(record.t, record.y, reference, name=record.name)
+
+    def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
+        """What a fit says of each used sample, from its parameters."""
+        return self._judged(fit, laid_out.problem)[0]
+
+    def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
+        """The model in the loop of another record, with its own best state and offset there."""
+        problem = laid_out.problem
+        own = self._own(problem, self._theta(fit))
+        states = own.size - int(problem.offset)
+        moved = replace(fit, theta=np.concatenate((fit.theta[: fit.theta.size - own.size], own)))
+        samples = self._judged(moved, problem)[0]
+        offset = float(own[-1]) if problem.offset else laid_out.offset
+        return AppliedModel(samples.residuals, samples.used, (own[:states],), (offset,), samples.sensitivities)
