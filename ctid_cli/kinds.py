@@ -1,6 +1,6 @@
 """Which class each ``kind`` of a specification names: the one list of what there is to choose from.
 
-Names lead to classes of every floor, so that nothing is imported before it is asked for.
+The classes belong to several layers; each is imported when it is first used.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""How messages are put together, on every floor: enumerations, paragraphs, hints at names that are nearly right."""
+"""How messages are put together, in every layer: enumerations, paragraphs, hints at names that are nearly right."""
 
 import difflib
 import textwrap

@@ -96,8 +96,8 @@ def test_permission(command, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_walk_through_shows_the_files_and_they_run(tmp_path):
-    page = (EXAMPLES.parent / "custom-study.md").read_text(encoding="utf-8")
+def test_the_whole_study_shows_its_files_and_they_run(tmp_path):
+    page = (EXAMPLES.parent / "custom-components.md").read_text(encoding="utf-8")
     for language, name in (("py", "projection.py"), ("yaml", "projection.yaml")):
         assert f"```{language}\n{(EXAMPLES / name).read_text(encoding='utf-8')}```\n" in page
     smaller = ["--runs", "1", "--set", "sampling.samples=100", "--set", "noise.snr_db=20", "--jobs", "1"]
