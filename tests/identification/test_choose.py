@@ -1,10 +1,13 @@
 """What is chosen where nothing is given, on records whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.identification.criterion import ranked
 
 SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
 DRIVE = TransferFunction([1.5], [1.0, 0.5, 0.0], 0.4)
@@ -68,6 +71,25 @@ def test_a_record_that_begins_with_its_step_needs_the_level_before():
     choice = choose(record, Given(input_before=0.0))
     assert choice.options.poles == 2
     assert choice.words()[-4:] == ["--input-before", "0", "--hold", "zoh"]
+
+
+def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
+    # The record rises to the end; a ramp of the output is what an integrator and a drift have in common.
+    t = 0.1 * np.arange(600)
+    record = record_of(SECOND, u=np.ones(600))
+    drifting = Record(record.t, record.y + 0.02 * t, record.input)
+    choice = choose(drifting, Given(input_before=0.0))
+    assert choice.options.integrators == 0
+    assert any(sentence.startswith("Integrators: not tried") for sentence in choice.sentences)
+    without_drift = choose(record_of(DRIVE, u=np.ones(600)), Given(input_before=0.0, offset="none"))
+    assert without_drift.options.integrators == 1
+
+
+def test_a_model_that_the_data_do_not_determine_comes_last():
+    best, other, *_ = choose(record_of(SECOND)).ranking.candidates
+    assert best.is_determined
+    undetermined = replace(best, fit=replace(best.fit, condition_number=1e15))
+    assert ranked([undetermined, other]).best.options == other.options
 
 
 def test_the_hold_is_compared_where_the_input_moves_continuously():
