@@ -122,8 +122,8 @@ COMPARABLE = 0.1
 #: Lines of one window closer than so many bins may be one tone that changes. Measured.
 RESOLVED = 1.7
 #: A window shows so many periods of a tone, and its amplitude is so many standard errors.
-PERIODS = 4.0
-SIGNIFICANT = 5.0
+PERIODS = 8.0
+SIGNIFICANT = 6.0
 #: A curvature of the frequency of more than so many of its standard errors adds to the error of the reading; one of
 #: more than so many is taken from the reading too.
 QUIET = 2.0
