@@ -1,11 +1,11 @@
 """Plant and noise by maximum likelihood, on simulated records, against the Cramér-Rao bound.
 
     python benchmarks/bench_noise.py [--records 500] [--samples 600] [--snr-db 15] [--noise slow] [--orders true|auto]
-        [--seed 1]
+        [--held 5] [--seed 1]
 
-The plant is ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s, under steps of random sign every .5 s; its delay
-is searched from 0 to 2 s and lies off the samples. The noise is ``C(q)/D(q) e`` of one of the pairs in NOISES. Errors
-count in standard deviations by the bound of each record, with its input and the true noise. For each parameter:
+The plant is ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s, under steps of random sign of some samples; its
+delay is searched from 0 to 2 s and lies off the samples. The noise is ``C(q)/D(q) e`` of one of the pairs in NOISES.
+Errors count in standard deviations by the bound of each record, with its input and the true noise. For each parameter:
 
 bias           mean error, and its Monte Carlo error
 scatter        standard deviation of the errors
@@ -26,17 +26,17 @@ from ctid_cli.inference.innovations import SampledNoise, steps_of
 from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.signals.noise import ArmaNoise, stream
 
-PLANT, INTERVAL, HELD, DELAYS = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537), 0.1, 5, (0.0, 2.0)
+PLANT, INTERVAL, DELAYS = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537), 0.1, (0.0, 2.0)
 TRUE = np.array([2.8, 4.0, 4.0, 0.537])
 #: C and D in rising powers of q^-1.
 NOISES = {"slow": ((1.0, 0.2679), (1.0, -1.98, 0.9802)), "fast": ((1.0, 0.9), (1.0, -1.0, 0.2))}
 
 
-def simulated(pair, samples, snr_db, seed, replicate):
+def simulated(pair, samples, held, snr_db, seed, replicate):
     """A record, and the standard deviations of the bound."""
     t = INTERVAL * np.arange(samples)
-    levels = stream(seed, "input", replicate).choice([-1.0, 1.0], samples // HELD + 1)
-    signal = HeldSignal(t, np.repeat(levels, HELD)[:samples])
+    levels = stream(seed, "input", replicate).choice([-1.0, 1.0], samples // held + 1)
+    signal = HeldSignal(t, np.repeat(levels, held)[:samples])
     x = simulate(PLANT, signal, t)
     law = ArmaNoise(*pair, snr_db=snr_db)
     record = Record(t, x + law.generate(x, stream(seed, "noise", replicate)), signal)
@@ -53,6 +53,7 @@ def main():
     parser.add_argument("--snr-db", type=float, default=15.0)
     parser.add_argument("--noise", choices=NOISES, default="slow")
     parser.add_argument("--orders", choices=("true", "auto"), default="true")
+    parser.add_argument("--held", type=int, default=5, help="samples of a step of the input")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     pair = NOISES[asked.noise]
@@ -60,7 +61,7 @@ def main():
     estimator = Rivc(2, 0, DELAYS, noise_model=given, covariance="white")
     errors, beside, covered, rejected, orders, seconds = [], [], [], 0, Counter(), 0.0
     for replicate in range(asked.records):
-        record, bound = simulated(pair, asked.samples, asked.snr_db, asked.seed, replicate)
+        record, bound = simulated(pair, asked.samples, asked.held, asked.snr_db, asked.seed, replicate)
         spent, fit = cpu(estimator.fit, record)
         seconds += spent
         errors.append((fit.theta - TRUE) / bound)
