@@ -54,6 +54,9 @@ class SubmodelsFit(MeasuredFit):
 
     #: Whether instruments come from the loop: what is no solution then has no standard errors.
     in_loop: bool = False
+    #: Margin of the condition for consistent estimates, and of the sampling rate over twice the fastest oscillation [-].
+    consistency: float = float("nan")
+    sampling: float = float("nan")
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -206,6 +209,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             start_method=method,
             loop_radius=problem.loop_radius(ordered),
             in_loop=self.closed,
+            consistency=problem.consistency_margin(found.theta),
+            sampling=_sampling_margin(ordered, problem.data.interval),
             **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples(fit, laid_out)
@@ -257,6 +262,14 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         used = used_samples(laid_out.problem.data, laid_out.record)
         sensitivities = np.column_stack((psi, free))
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
+
+
+def _sampling_margin(model: AdditiveModel, interval: float) -> float:
+    """Return the sampling frequency over twice the greatest imaginary part of a pole; NaN on an irregular clock."""
+    fastest = float(np.abs(model.poles.imag).max(initial=0.0))
+    if not interval > 0.0:
+        return float("nan")
+    return np.pi / (interval * fastest) if fastest > 0.0 else float("inf")
 
 
 def _padded(b: Array, size: int) -> Array:
