@@ -63,6 +63,7 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
         raise DataError(f"{named(record)}instruments in a loop need {wanted}")
     if by_reference:
         return LoopData(following(record.loop.reference, record.input.values), np.ones(1), np.ones(1), True, True)
+    assert record.loop.controller is not None
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
     numerator = np.pad(controller.numerator, (controller.denominator.size - controller.numerator.size, 0))
     reference, denominator = plain_array(record.loop.reference), plain_array(controller.denominator)

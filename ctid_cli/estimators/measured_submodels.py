@@ -54,7 +54,7 @@ class SubmodelsFit(MeasuredFit):
 
     #: Whether instruments come from the loop: what is no solution then has no standard errors.
     in_loop: bool = False
-    #: Margin of the condition for consistent estimates, and of the sampling rate over twice the fastest oscillation [-].
+    #: Margins of the condition for consistent estimates, and of the sampling rate over twice the fastest mode [-].
     consistency: float = float("nan")
     sampling: float = float("nan")
 
@@ -96,7 +96,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     delay : float, default 0.0
         Known delay [s].
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
-        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where the controller is not known.
+        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where its controller is not
+        known.
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record.
     offset : {"none", "remove"}, default "none"
