@@ -201,8 +201,8 @@ class AdditiveProblem:
 
         .. math:: \|E\,\hat\varphi\,\Delta'\|_2 < \sigma_{\min}(E\,\hat\varphi\,\tilde\varphi')
 
-        of González et al. (2025), (36) in open and (37) in closed loop, at the estimate in the place of the system, with
-        instruments of unit length. Delta is what the interpolation of the output between its samples makes of the
+        of González et al. (2025), (36) in open and (37) in closed loop, at the estimate in the place of the system,
+        with instruments of unit length. Delta is what the interpolation of the output between its samples makes of the
         regressors. NaN where state or clock are others than those that it was derived for.
         """
         source = None if self.filter.free or self.data.interval == 0.0 else self.filter.instrument_input(theta)

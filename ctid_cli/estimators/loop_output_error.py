@@ -126,8 +126,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli import DiscreteController, HeldSignal, Loop, Record, TransferFunction, simulate_loop
-    >>> from ctid_cli.estimators.loop_output_error import LoopOutputError
+    >>> from ctid_cli import DiscreteController, HeldSignal, Loop, LoopOutputError, Record, TransferFunction
+    >>> from ctid_cli import simulate_loop
     >>> rng, law = np.random.default_rng(0), DiscreteController([11.0, -10.0], [1.0, 0.0])
     >>> r, v, t = rng.standard_normal(2000), 0.02 * rng.standard_normal(2000), 0.05 * np.arange(2000)
     >>> u, x = simulate_loop(TransferFunction([4.0], [1.0, 0.0, -1.0]), law, r, v, 0.05)

@@ -6,9 +6,9 @@ controller in continuous time makes one linear system of the loop, which the hel
 
 The matrices of the plant, or of the whole loop in continuous time, are analytic in theta: their derivatives are the
 imaginary parts at ``theta + i step``, without cancellation (W. Squire and G. Trapp, *Using complex variables to
-estimate derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and input, the
-derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and with
-``dc z + dd u`` added to the output.
+estimate derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and
+input, the derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and
+with ``dc z + dd u`` added to the output.
 """
 
 from dataclasses import dataclass, replace
