@@ -24,6 +24,7 @@ from ctid_cli import (
     DiscreteController,
     HeldSignal,
     Loop,
+    LoopOutputError,
     Record,
     Srivc,
     Status,

@@ -46,15 +46,19 @@ class SubmodelsFit(MeasuredFit):
         How the start was found, in a sentence.
     loop_radius : float
         Largest magnitude of the poles of the sampled loop with the controller [-]; NaN in open loop.
+    in_loop : bool
+        Whether instruments come from the loop: what is no solution then has no standard errors.
+    consistency : float
+        Margin of the condition for consistent estimates, right side over left side [-]; NaN where it is not defined.
+    sampling : float
+        Sampling frequency over twice the greatest imaginary part of a pole [-]; NaN on an irregular clock.
     """
 
     additive: AdditiveModel | None = None
     start_method: str = ""
     loop_radius: float = float("nan")
 
-    #: Whether instruments come from the loop: what is no solution then has no standard errors.
     in_loop: bool = False
-    #: Margins of the condition for consistent estimates, and of the sampling rate over twice the fastest mode [-].
     consistency: float = float("nan")
     sampling: float = float("nan")
 
