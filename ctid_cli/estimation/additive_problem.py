@@ -57,7 +57,7 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
         raise DataError(f"{named(record)}{what} need {wanted}; give them, or use instruments 'open_loop'")
     if record.loop.continuous and not by_reference:
         why = "with a controller in continuous time closed-loop instruments are inconsistent on any sampling"
-        raise DataError(f"{named(record)}{why}; use loop_output_error")
+        raise DataError(f"{named(record)}{why}; fit one transfer function (loop_output_error)")
     if not record.input_on_grid or record.input.hold != "zoh":
         wanted = "an input that is held from sample to sample of a regular clock"
         raise DataError(f"{named(record)}instruments in a loop need {wanted}")

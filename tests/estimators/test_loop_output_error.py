@@ -192,7 +192,7 @@ REFUSED = {
     ),
     "a delay in continuous time": (LoopOutputError(1, 0, (0.1, 0.1)), CONTINUOUS, "the delay must be 0"),
     "two records": (LoopOutputError(1, 0), [record(STABLE, PI)] * 2, "one record"),
-    "instruments in continuous time": (Srivc(1, 0, instruments="closed_loop"), CONTINUOUS, "use loop_output_error"),
+    "instruments in continuous time": (Srivc(1, 0, instruments="closed_loop"), CONTINUOUS, "loop_output_error"),
 }
 
 
