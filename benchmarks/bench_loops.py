@@ -2,13 +2,13 @@
 
     python benchmarks/bench_loops.py [--runs 17] [--seed 1] [--samples 4000] [--paper 60] [--unknown 60]
 
-First 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output noise: ``runs``
-records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of their intervals
-hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A. González et al.,
-*Identification of additive continuous-time systems in open and closed loop*, Automatica 173 (2025) 112013, with a delay
-of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes' frequencies, beside CLSRIVC that is told the
-delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance, by what is known of the loop: reference and
-controller, the reference alone, or nothing (the direct method).
+First 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output noise:
+``runs`` records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of their
+intervals hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A. González et
+al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025), arXiv:2401.01263,
+with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes' frequencies, beside CLSRIVC
+that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance, by what is known of the
+loop: reference and controller, the reference alone, or nothing (the direct method).
 """
 
 import argparse
@@ -17,9 +17,21 @@ from _timing import cpu
 
 import numpy as np
 
-from ctid_cli import DataError, DelayProfile, DiscreteController, HeldSignal, Loop, Record, Srivc, TransferFunction
-from ctid_cli import AdditiveModel, Status, Submodel, simulate_loop
-from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli import (
+    AdditiveModel,
+    DataError,
+    DelayProfile,
+    DiscreteController,
+    HeldSignal,
+    Loop,
+    LoopOutputError,
+    Record,
+    Srivc,
+    Status,
+    Submodel,
+    TransferFunction,
+    simulate_loop,
+)
 from ctid_cli.models.factoring import unfactored
 
 LOOPS = ((0.05, 1, 0.5, 1), (0.1, 1, 0.3, 1), (0.05, 1, 0.5, 10), (0.01, 2, 0.3, 10), (0.05, 0.5, 0.6, 1))
@@ -65,9 +77,8 @@ def six_loops(runs, samples, seed):
                 else:
                     others += bool(np.isfinite(errors).any())
             shares = " ".join(f"{100 * share:5.1f}" for share in np.mean(own, axis=0))
-            print(
-                f"{loop!s:24} noise {noise:<5} {len(own):4} of {runs:3} {others:10}          {shares} {spent / runs:15.2f}"
-            )
+            counts = f"{len(own):4} of {runs:3} {others:10}"
+            print(f"{loop!s:24} noise {noise:<5} {counts}          {shares} {spent / runs:15.2f}")
             total, wrong, hits, time = total + len(own), wrong + others, hits + own, time + spent
     shares = " ".join(f"{100 * share:.1f}" for share in np.mean(hits, axis=0))
     print(f"all: {total} of {12 * runs} converged, {wrong} others with an error, {shares} % covered, {time:.0f} CPU s")
@@ -116,9 +127,8 @@ def paper_loop(runs, seed, coloured):
         errors = errors[np.isfinite(errors).all(axis=1)]
         bias, spread = errors.mean(axis=0), errors.std(axis=0)
         text = "  ".join(f"{b:9.5f} {s:8.5f}" for b, s in zip(bias, spread, strict=True))
-        print(
-            f"{way:25} {converged[way]:4} of {runs} converged, {len(errors):4} with two pairs: {text}  {times[way] / runs:.2f} CPU s"
-        )
+        counts = f"{converged[way]:4} of {runs} converged, {len(errors):4} with two pairs"
+        print(f"{way:25} {counts}: {text}  {times[way] / runs:.2f} CPU s")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from .signals.noise import ArmaNoise as ArmaNoise, WhiteNoise as WhiteNoise
 # Models
 from .models.transfer_function import TransferFunction as TransferFunction
 from .models.additive import AdditiveModel as AdditiveModel, Submodel as Submodel, Term as Term
+from .models.controller import ContinuousController as ContinuousController
 from .models.controller import DiscreteController as DiscreteController
 
 # Exact simulation
@@ -32,6 +33,7 @@ from .estimators.td_srivc import TdSrivc as TdSrivc
 from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
 from .estimators.delay_profile import DelayProfile as DelayProfile
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
+from .estimators.loop_output_error import LoopOutputError as LoopOutputError
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
 from .estimation.common import Fixed as Fixed
 from .estimators.identification import Identification as Identification
@@ -47,6 +49,7 @@ from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand 
 from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit
+from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.criteria import fit_percent as fit_percent

@@ -16,6 +16,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
 
 if TYPE_CHECKING:
+    from ctid_cli.estimation.additive_problem import Instruments
     from ctid_cli.estimation.common import Fixed
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
@@ -279,10 +280,12 @@ def _submodels(asked: Asked) -> MeasuredSubmodels:
     else:
         first, *others = _terms(asked.model.terms, asked.integrators)
         terms = (first, *others)
+    instruments: Instruments = "closed_loop" if asked.loop == "controller" else "open_loop"
+    instruments = "reference" if asked.loop == "reference" else instruments
     return MeasuredSubmodels(
         terms,
         asked.delay[0],
-        {"none": "open_loop", "reference": "reference", "controller": "closed_loop"}[asked.loop],
+        instruments,
         asked.treatment.initial_state or "rest",
         asked.treatment.offset or "none",
         factored=asked.model.model == "additive" or asked.integrators > 0,

@@ -57,12 +57,13 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
         raise DataError(f"{named(record)}{what} need {wanted}; give them, or use instruments 'open_loop'")
     if record.loop.continuous and not by_reference:
         why = "with a controller in continuous time closed-loop instruments are inconsistent on any sampling"
-        raise DataError(f"{named(record)}{why}; use loop_output_error")
+        raise DataError(f"{named(record)}{why}; fit one transfer function (loop_output_error)")
     if not record.input_on_grid or record.input.hold != "zoh":
         wanted = "an input that is held from sample to sample of a regular clock"
         raise DataError(f"{named(record)}instruments in a loop need {wanted}")
     if by_reference:
         return LoopData(following(record.loop.reference, record.input.values), np.ones(1), np.ones(1), True, True)
+    assert record.loop.controller is not None
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
     numerator = np.pad(controller.numerator, (controller.denominator.size - controller.numerator.size, 0))
     reference, denominator = plain_array(record.loop.reference), plain_array(controller.denominator)
@@ -194,6 +195,31 @@ class AdditiveProblem:
         """Sensitivities and output error at the used samples; in closed loop instruments in place of the former."""
         rows = self.filter.rows(theta)
         return None if rows is None else (rows[0], rows[2])
+
+    def consistency_margin(self, theta: Array) -> float:
+        r"""Margin of the condition for consistent estimates: right side over left side; it holds above 1.
+
+        .. math:: \|E\,\hat\varphi\,\Delta'\|_2 < \sigma_{\min}(E\,\hat\varphi\,\tilde\varphi')
+
+        of González et al. (2025), (36) in open and (37) in closed loop, at the estimate in the place of the system,
+        with instruments of unit length. Delta is what the interpolation of the output between its samples makes of the
+        regressors. NaN where state or clock are others than those that it was derived for.
+        """
+        source = None if self.filter.free or self.data.interval == 0.0 else self.filter.instrument_input(theta)
+        if source is None or self.initial_state != "rest":
+            return math.nan
+        whole = self.data._replace(u=plain_array(source), use=np.ones_like(self.data.use))
+        still = replace(self, data=whole, loop=OPEN_LOOP)
+        rows = still.filter.rows(theta)
+        if rows is None:
+            return math.nan
+        # Without noise: the output of the model, known at its samples.
+        rows = replace(still, data=whole._replace(y=plain_array(rows[3]), use=self.data.use)).filter.rows(theta)
+        if rows is None:
+            return math.nan
+        psi, phi = (part / np.linalg.norm(rows[0], axis=0) for part in rows[:2])
+        least, greatest = np.linalg.svd(psi.T @ psi)[1][-1], np.linalg.norm(psi.T @ (phi - psi), 2)
+        return float(least / greatest) if greatest > 0.0 else math.inf
 
     def loop_radius(self, model: AdditiveModel) -> float:
         """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""

@@ -100,8 +100,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         Known delay [s].
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` simulates the instruments in the noise-free loop of the model with the record's controller and
-        reference: needed for unbiased estimates where feedback brings coloured noise into the input. ``reference`` takes
-        in their place what of the input follows the reference, where the controller is not known.
+        reference: needed for unbiased estimates where feedback brings coloured noise into the input. ``reference``
+        takes in their place what of the input follows the reference, where the controller is not known.
     initial_state : {"rest", "periodic", "estimated"}, default "rest"
         State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"

@@ -13,7 +13,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
 from ctid_cli.estimators.loop_output_error import LoopFit
-from ctid_cli.estimators.measured_submodels import LaidOut, MeasuredSubmodels, Options, SubmodelsFit
+from ctid_cli.estimators.measured_submodels import LaidOut, Options, SubmodelsFit
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared

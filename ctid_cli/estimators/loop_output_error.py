@@ -126,8 +126,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
     Examples
     --------
     >>> import numpy as np
-    >>> from ctid_cli import DiscreteController, HeldSignal, Loop, Record, TransferFunction, simulate_loop
-    >>> from ctid_cli.estimators.loop_output_error import LoopOutputError
+    >>> from ctid_cli import DiscreteController, HeldSignal, Loop, LoopOutputError, Record, TransferFunction
+    >>> from ctid_cli import simulate_loop
     >>> rng, law = np.random.default_rng(0), DiscreteController([11.0, -10.0], [1.0, 0.0])
     >>> r, v, t = rng.standard_normal(2000), 0.02 * rng.standard_normal(2000), 0.05 * np.arange(2000)
     >>> u, x = simulate_loop(TransferFunction([4.0], [1.0, 0.0, -1.0]), law, r, v, 0.05)
@@ -202,8 +202,8 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         found = laid_out.problem.best(laid_out.record)
         if found is None:
             raise DataError(
-                f"{named(laid_out.record)}no model that the reference as an instrument leads to makes a loop whose output "
-                "is finite; use other poles and zeros, another delay, or a longer record"
+                f"{named(laid_out.record)}no model that the reference as an instrument leads to makes a loop whose "
+                "output is finite; use other poles and zeros, another delay, or a longer record"
             )
         return self._described(laid_out, found)._with_uncertainty(self.covariance, self.bootstrap_draws)
 
@@ -232,7 +232,10 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             regular=problem.data.interval > 0.0,
             known=tuple(held),
             loop_radius=found.radius,
-            **dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), np.nan),
+            cost=np.nan,
+            fit_percent=np.nan,
+            r2=np.nan,
+            condition_number=np.nan,
             count=problem.samples,
         )
         samples, tangent = self._judged(fit, problem)

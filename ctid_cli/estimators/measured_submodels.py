@@ -47,14 +47,21 @@ class SubmodelsFit(MeasuredFit):
         How the start was found, in a sentence.
     loop_radius : float
         Largest magnitude of the poles of the sampled loop with the controller [-]; NaN in open loop.
+    in_loop : bool
+        Whether instruments come from the loop: what is no solution then has no standard errors.
+    consistency : float
+        Margin of the condition for consistent estimates, right side over left side [-]; NaN where it is not defined.
+    sampling : float
+        Sampling frequency over twice the greatest imaginary part of a pole [-]; NaN on an irregular clock.
     """
 
     additive: AdditiveModel | None = None
     start_method: str = ""
     loop_radius: float = float("nan")
 
-    #: Whether instruments come from the loop: what is no solution then has no standard errors.
     in_loop: bool = False
+    consistency: float = float("nan")
+    sampling: float = float("nan")
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -94,7 +101,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     delay : float, default 0.0
         Known delay [s].
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
-        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where the controller is not known.
+        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where its controller is not
+        known.
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record.
     offset : {"none", "remove"}, default "none"
@@ -207,6 +215,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             start_method=method,
             loop_radius=problem.loop_radius(ordered),
             in_loop=self.closed,
+            consistency=problem.consistency_margin(found.theta),
+            sampling=_sampling_margin(ordered, problem.data.interval),
             **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples(fit, laid_out)
@@ -258,6 +268,14 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         used = used_samples(laid_out.problem.data, laid_out.record)
         sensitivities = np.column_stack((psi, free))
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
+
+
+def _sampling_margin(model: AdditiveModel, interval: float) -> float:
+    """Return the sampling frequency over twice the greatest imaginary part of a pole; NaN on an irregular clock."""
+    fastest = float(np.abs(model.poles.imag).max(initial=0.0))
+    if not interval > 0.0:
+        return float("nan")
+    return np.pi / (interval * fastest) if fastest > 0.0 else float("inf")
 
 
 def _padded(b: Array, size: int) -> Array:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
 from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
@@ -133,7 +134,8 @@ def _applied(fit: FittedModel, record: Record, initial_state: InitialState | Non
     if delay >= span:
         text = f"the record ends {span:.6g} after its first input, before the model's delay of {delay:.6g} has passed"
         raise DataError(f"{named(record)}{text}")
-    if (state, shift) == ("rest", "none"):
+    in_loop = isinstance(fit, Identification) and isinstance(fit.options, LoopOutputError)
+    if (state, shift) == ("rest", "none") and not in_loop:
         use: BoolArray = record.valid & (record.t >= record.input.t[0])
         residuals = (record.y - parametric.simulated(record.input, record.t))[use]
         return _Applied(state, shift, use, residuals, parametric.output_slopes(record.input, record.t)[use])
@@ -171,7 +173,8 @@ def _treated(
     """The model with its best initial state and offset: as its own estimator has them, or as one fraction."""
     if isinstance(fit, Identification):
         try:
-            options = replace(fit.options, initial_state=state, offset=shift)
+            treated: dict[str, Any] = {"initial_state": state, "offset": shift}
+            options = replace(fit.options, **treated)
         except ValueError as error:
             raise UsageError(str(error)) from None
         return options._applied(fit.fit, options.prepare(record).laid_out)

@@ -5,10 +5,10 @@ if the loop is. A discrete controller acts on what it is fed at the samples, and
 controller in continuous time makes one linear system of the loop, which the held reference drives on any clock.
 
 The matrices of the plant, or of the whole loop in continuous time, are analytic in theta: their derivatives are the
-imaginary parts at ``theta + i step``, without cancellation (W. Squire and G. Trapp, *Using complex variables to estimate
-derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and input, the
-derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and with
-``dc z + dd u`` added to the output.
+imaginary parts at ``theta + i step``, without cancellation (W. Squire and G. Trapp, *Using complex variables to
+estimate derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and
+input, the derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and
+with ``dc z + dd u`` added to the output.
 """
 
 from dataclasses import dataclass, replace
@@ -66,8 +66,8 @@ class LoopResponse:
     def rows(self, theta: Array, count: int, cell: int | None = None, state: Array | None = None) -> LoopRows:
         """Return the output from a state, by default of rest, and its derivatives by the first ``count`` parameters.
 
-        ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink. A state is
-        that of the plant, of the controller, and the inputs on their way at the first sample.
+        ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink. A state
+        is that of the plant, of the controller, and the inputs on their way at the first sample.
         """
         if state is not None:
             # That of the plant is p^(n-1)/A u … 1/A u in seconds, whatever the time unit of its companion form.
@@ -201,11 +201,11 @@ def _stepped(theta: Array, place: int) -> Any:
 
 def _real(plant: SampledModel) -> SampledModel:
     """Return a sampled plant as the kernel takes it."""
-    parts = (np.ascontiguousarray(np.real(part)) for part in plant[:3])
-    return SampledModel(*parts, float(np.real(plant.direct)), plant.shift)
+    F, g, c = (np.ascontiguousarray(np.real(part)) for part in plant[:3])
+    return SampledModel(F, g, c, float(np.real(plant.direct)), plant.shift)
 
 
 def _slope(plant: SampledModel) -> SampledModel:
     """Return the derivatives of a sampled plant from one at stepped parameters."""
-    parts = (np.imag(part) / TINY for part in plant[:3])
-    return SampledModel(*parts, float(np.imag(plant.direct)) / TINY, plant.shift)
+    F, g, c = (np.imag(part) / TINY for part in plant[:3])
+    return SampledModel(F, g, c, float(np.imag(plant.direct)) / TINY, plant.shift)

@@ -228,6 +228,13 @@ class SubmodelFilter:
             data, delay, states = self._in_steady_state(data, model)
         return modal_pass(data, model, delay, rows=rows, leading=leading, states=states, instruments=instruments)
 
+    def instrument_input(self, theta: Array) -> Array | None:
+        """Return what drives the instruments: the input, or that of the noise-free loop."""
+        if not self.loop.closed:
+            return self.data.u
+        pooled = self._pooled(theta)
+        return None if pooled is None else self._loop_input(pooled.model)
+
     def _loop_input(self, model: Modes | Chains) -> Array:
         """Return the input of the noise-free loop of a model."""
         interval, reference = self.data.interval, self.loop.reference

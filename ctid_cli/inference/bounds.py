@@ -160,9 +160,9 @@ def _record_covariance(
 ) -> Array:
     """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
     signal = record.input
-    if form.instruments == "closed_loop" and record.loop is not None:
-        loop, interval = record.loop, record.interval or 0.0
-        u = simulate_loop(system, loop.controller, loop.reference, 0.0, interval, loop.enters).u
+    if form.instruments == "closed_loop" and record.loop is not None and record.loop.controller is not None:
+        loop, law, interval = record.loop, record.loop.controller, record.interval or 0.0
+        u = simulate_loop(system, law, loop.reference, 0.0, interval, loop.enters).u
         signal = HeldSignal(record.t, u)
     psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
     if form.delay_from is not None:

@@ -170,6 +170,8 @@ class FitResult(Result):
         yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = {per} (N + p) / (N - p)"
         yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
         yield "condition number", number(fit.condition_number, 3)
+        if isinstance(fit, SubmodelsFit):
+            yield from _conditions(fit)
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
@@ -265,6 +267,17 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
         if isinstance(options, LoopOutputError):
             how = "output error of the simulated loop, y - T r"
         yield "loop", f"{text}; {how}"
+
+
+def _conditions(fit: SubmodelsFit) -> Iterator[tuple[str, str]]:
+    """Conditions for consistent estimates (González et al. 2025), at the estimate."""
+    lines = (
+        (f"condition ({37 if fit.in_loop else 36})", fit.consistency, "right side over left side, for consistency"),
+        ("assumption 4", fit.sampling, "sampling frequency over twice the greatest imaginary part of a pole"),
+    )
+    for label, margin, text in lines:
+        if not np.isnan(margin):
+            yield label, f"{'holds' if margin > 1.0 else 'is violated'} with the margin {margin:.3g} = {text}"
 
 
 def _box_text(box: Box, units: Units) -> str:

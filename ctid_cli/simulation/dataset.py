@@ -18,7 +18,7 @@ from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Term
-from ctid_cli.models.controller import ContinuousPid, Relay
+from ctid_cli.models.controller import ContinuousController, ContinuousPid, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
@@ -331,7 +331,8 @@ class MeasuredSource:
     def __post_init__(self) -> None:
         if self.estimation_samples is not None:
             require_integer("estimation_samples", self.estimation_samples, 2)
-        if self.reference is not None and self.hold != "zoh":
+        known = self.loop is None or not isinstance(self.loop.controller, ContinuousController)
+        if self.reference is not None and self.hold != "zoh" and known:
             raise OptionError("hold", "must be zoh in a loop: a discrete controller holds the input")
 
     def dataset(self, replicate: int) -> DataSet:
@@ -360,7 +361,7 @@ class MeasuredSource:
                 mean = r.mean() if self.offset == "remove" else 0.0
                 # A record of a loop is refused where its clock is not regular.
                 controller = self.loop.at(regular_interval(t[:count]) or 1.0).controller
-                loop = Loop(r - mean, controller, self.loop.enters)
+                loop = Loop(r - mean, controller, self.loop.enters, "foh" if self.hold == "foh" else "zoh")
         if self.offset == "remove":
             # The remaining samples must not have a say in what the model is made of.
             u = u - u[:count].mean()

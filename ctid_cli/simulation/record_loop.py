@@ -54,8 +54,8 @@ def in_unknown_loop(measured: Measurement) -> Measurement:
     assert r is not None
     if record.interval is None:
         raise DataError(
-            f"{record.name}: the reference as an instrument needs a regular clock, and that of this record is irregular; "
-            "give the controller (--loop FILE), or --direct"
+            f"{record.name}: the reference as an instrument needs a regular clock, and that of this record is "
+            "irregular; give the controller (--loop FILE), or leave --reference out"
         )
     return replace(measured, record=replace(record, loop=Loop(r, None)))
 

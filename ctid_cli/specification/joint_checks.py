@@ -13,7 +13,7 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
-from ctid_cli.models.controller import Relay
+from ctid_cli.models.controller import ContinuousController, Relay
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.components import is_custom
@@ -175,7 +175,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     random = [k for k, point in enumerate(delays) if isinstance(point, UniformStart)]
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
-    relay = spec.loop is not None and hasattr(spec.loop.controller, "relay")
+    relay = spec.loop is not None and any(hasattr(spec.loop.controller, form) for form in ("relay", "unknown"))
     # To estimators a record in a loop with a relay is one in open loop.
     if spec.signal is None and (spec.loop is None or relay) and not broken & {"loop", "data", "excitation"}:
         give = "give loop, or data.reference and loop.controller for a measured record"
@@ -252,6 +252,11 @@ def _of_ratio(loop: Any, noise: Any) -> Iterator[Complaint]:
 def _of_relay(loop: Any, data: Any) -> Iterator[Complaint]:
     if isinstance(loop.controller, Relay):
         yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
+
+
+def _of_continuous(loop: Any, system: Any) -> Iterator[Complaint]:
+    if isinstance(loop.controller, ContinuousController):
+        yield ("loop", "controller"), "a controller in continuous time is for measured records; give continuous_pid"
 
 
 def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
@@ -371,7 +376,7 @@ def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complain
 
 
 CHECKS = (
-    *(_of_delay, _of_greatest_delay, _of_clock_periods, _of_ratio, _of_relay, _of_custom_system),
+    *(_of_delay, _of_greatest_delay, _of_clock_periods, _of_ratio, _of_relay, _of_continuous, _of_custom_system),
     *(_of_start, _of_relative_start, _of_unknown_parameters, _of_unknown_structure),
     *(_of_relative_errors, _of_unknown_values, _of_one_record, _of_error_of_a_signal, _of_error),
     *(_of_frequencies, _of_steps, _of_times, _of_tones, _of_options),

@@ -95,6 +95,7 @@ def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of specifications, for editors."""
     schema = Spec.model_json_schema()
     ways = ("data", "system excitation sampling", "system loop sampling", "signal sampling")
+    schema["properties"]["loop"] = {"anyOf": [schema["properties"]["loop"], {"const": "unknown"}]}
     schema["anyOf"] = [{"required": way.split()} for way in ways]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
 
@@ -238,11 +239,14 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
         yield from (((name,), message) for name, message in required.items() if name not in present)
     loop, data = (_mapping(raw, name) for name in ("loop", "data"))
     reference, column = loop.get("reference") is not None, data.get("reference") is not None
+    unknown = raw.get("loop") == "unknown" or "unknown" in _mapping(loop, "controller")
+    if kind == "loop" and unknown:
+        yield ("loop",), "unknown is for measured records; simulated data need the controller"
     if kind == "data" and reference:
         yield ("loop", "reference"), "belongs to simulated data; that of a record is a column, data.reference"
     if kind == "data" and column and "loop" not in present:
-        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}"
-    elif kind == "data" and isinstance(raw["data"], Mapping) and not column and "loop" in present:
+        yield ("data", "reference"), "needs the controller too; add loop: {controller: {…}}, or loop: unknown"
+    elif kind == "data" and isinstance(raw["data"], Mapping) and not column and "loop" in present and not unknown:
         yield ("data", "reference"), "is missing; a loop has a reference: name its column"
     needed = kind == "loop" and isinstance(raw["loop"], Mapping) and "relay" not in _mapping(loop, "controller")
     if needed and not reference and "excitation" not in present:

@@ -24,7 +24,13 @@ from ctid_cli.specification.custom_sections import CustomMeasureSection, Kinds
 from ctid_cli.specification.messages import Complaint, wrong
 from ctid_cli.specification.sections import Options, Section, WithKey, section_for
 from ctid_cli.specification.sweeps import variants
-from ctid_cli.specification.system_sections import AnySystemSection, ExcitationSection, LoopSection, StartsSection
+from ctid_cli.specification.system_sections import (
+    AnySystemSection,
+    ExcitationSection,
+    LoopSection,
+    StartsSection,
+    loop_as_mapping,
+)
 from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
 from ctid_cli.specification.yaml_source import YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
@@ -300,7 +306,7 @@ class Spec(Section):
     experiment: Annotated[Text, _EXPERIMENT, AfterValidator(_usable)]
     system: AnySystemSection | None = None
     excitation: ExcitationSection | None = None
-    loop: LoopSection | None = None
+    loop: Annotated[LoopSection | None, BeforeValidator(loop_as_mapping)] = None
     signal: SignalSection | None = None
     disturbance: DisturbanceOrNone | None = None
     sampling: AnySamplingSection | None = None

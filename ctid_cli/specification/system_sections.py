@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -11,7 +11,7 @@ from ctid_cli.arrays import ComplexArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.controller import ContinuousPid, DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousController, ContinuousPid, DiscreteController, Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.components import is_custom
@@ -168,7 +168,7 @@ def _unstable(poles: ComplexArray) -> str:
 
 
 _Gain = Annotated[float | list[float], Swept(Number)]
-_CONTROLLERS = ("pid", "continuous_pid", "relay", "numerator", "denominator")
+_CONTROLLERS = ("pid", "continuous_pid", "continuous", "relay", "numerator", "denominator")
 
 
 def _other_forms(form: str) -> dict[str, str]:
@@ -237,6 +237,39 @@ class ContinuousPidControllerSection(ControllerSection):
     continuous_pid: Annotated[Section, Options(ContinuousPid)]
 
 
+class ContinuousControllerSection(ControllerSection):
+    """A controller that acts in continuous time, for measured records.
+
+    Parameters
+    ----------
+    continuous : mapping
+        Numerator and denominator in descending powers of s
+    """
+
+    target: ClassVar[type | None] = ContinuousController
+    elsewhere = _other_forms("continuous")
+
+    continuous: section_for(ContinuousController)  # type: ignore[valid-type]
+
+
+class UnknownControllerSection(ControllerSection):
+    """A controller that is not known, as ``loop: unknown`` says.
+
+    Parameters
+    ----------
+    unknown : bool
+        Always true
+    """
+
+    target: ClassVar[type | None] = None
+    elsewhere = _other_forms("unknown")
+
+    unknown: Literal[True]
+
+    def build(self) -> None:
+        """Return no controller."""
+
+
 class RelayControllerSection(ControllerSection):
     """A relay, which makes the loop oscillate by itself.
 
@@ -255,6 +288,13 @@ class RelayControllerSection(ControllerSection):
 _OfCoefficients = section_for(DiscreteController)
 _OfRelay = Annotated[Section, WithKey("relay", RelayControllerSection, _OfCoefficients)]
 _OfContinuousPid = Annotated[Section, WithKey("continuous_pid", ContinuousPidControllerSection, _OfRelay)]
+_OfContinuous = Annotated[Section, WithKey("continuous", ContinuousControllerSection, _OfContinuousPid)]
+_OfKnown = Annotated[Section, WithKey("pid", PidControllerSection, _OfContinuous)]
+
+
+def loop_as_mapping(given: Any) -> Any:
+    """Return the section of a loop, for the word unknown that of a controller that is not known."""
+    return {"controller": {"unknown": True}} if given == "unknown" else given
 
 
 class LoopSection(Section):
@@ -263,7 +303,7 @@ class LoopSection(Section):
     Parameters
     ----------
     controller : mapping
-        Controller that acts at every sample: pid, continuous_pid, relay, or numerator and denominator
+        Controller that acts at every sample: pid, continuous_pid, relay, or numerator and denominator; or continuous
     reference : mapping, optional
         The reference, none for a relay; for a measured record it is a column, data.reference
     enters : {"controller", "input"}, default "controller"
@@ -272,7 +312,7 @@ class LoopSection(Section):
 
     target: ClassVar[type | None] = LoopOptions
 
-    controller: Annotated[Section, WithKey("pid", PidControllerSection, _OfContinuousPid)]
+    controller: Annotated[Section, WithKey("unknown", UnknownControllerSection, _OfKnown)]
     reference: ExcitationSection | None = None
     enters: Annotated[Enters | list[Enters], Swept(Enters)] = "controller"
 

@@ -136,6 +136,19 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
 
 
 KNOWN_LOOP = ("--loop", "loop.yaml", "--reference", "r")
+
+
+def test_a_loop_whose_controller_is_not_known(ctid, closed, tmp_path):
+    options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
+    content = fitted(ctid, *options, "--reference", "r")
+    near(content, {"a1": 1.5, "b0": 2.0}, errors=3.0)
+    assert fitted(ctid, *options, "--loop", "unknown", "--reference", "r")["parameters"] == content["parameters"]
+    assert load_fit(tmp_path / "fit.json").records[0].loop.controller is None
+    direct = fitted(ctid, *options, "--loop", "unknown")
+    assert any("direct method" in note for note in direct["notes"])
+    assert all(one["standard_error"] is None for one in direct["parameters"])
+
+
 ADDITIVE = ("--model", "additive", "--terms", "2/0")
 REFUSED = {
     "terms alone": (("--terms", "2/0"), "add --model additive"),

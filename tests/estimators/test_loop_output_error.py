@@ -9,9 +9,12 @@ from scipy.signal import cont2discrete
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.estimators.srivc import Srivc
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
+from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
+from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -161,6 +164,22 @@ def test_what_is_no_solution_has_no_error():
     assert np.isnan(list(fit.standard_errors.values())).all()
 
 
+def test_margin_of_consistency_is_that_of_the_signals_it_is_made_of():
+    one = record(STABLE, NOTHING, noise=0.0, enters="input", interval=0.4)
+    fit = MeasuredSubmodels((Term(2, 0),)).fit(replace(one, loop=None))
+    A, u, t = STABLE.denominator, one.input, one.t
+    powers = [TransferFunction(np.eye(3)[2 - k], A) for k in range(3)]
+    x = simulate(STABLE, u, t)
+    held = HeldSignal(t, x, "foh")
+    twice = [TransferFunction(2.0 * power.numerator, np.polymul(A, A)) for power in powers[1:]]
+    psi = np.column_stack([*(-simulate(each, u, t) for each in twice), simulate(powers[0], u, t)])
+    phi = np.column_stack([*(-simulate(power, held, t) for power in powers[1:]), simulate(powers[0], u, t)])
+    psi, phi = (part / np.linalg.norm(psi, axis=0) for part in (psi, phi))
+    expected = np.linalg.svd(psi.T @ psi)[1][-1] / np.linalg.norm(psi.T @ (phi - psi), 2)
+    assert fit.consistency == pytest.approx(expected, rel=1e-4)
+    assert fit.sampling == pytest.approx(np.pi / (0.4 * 0.8), rel=1e-4)
+
+
 CONTINUOUS = Record(
     *(lambda t: (t, np.cos(t), HeldSignal(t, np.sin(t))))(0.1 * np.arange(50)), loop=Loop(np.ones(50), LEAD)
 )
@@ -173,7 +192,7 @@ REFUSED = {
     ),
     "a delay in continuous time": (LoopOutputError(1, 0, (0.1, 0.1)), CONTINUOUS, "the delay must be 0"),
     "two records": (LoopOutputError(1, 0), [record(STABLE, PI)] * 2, "one record"),
-    "instruments in continuous time": (Srivc(1, 0, instruments="closed_loop"), CONTINUOUS, "use loop_output_error"),
+    "instruments in continuous time": (Srivc(1, 0, instruments="closed_loop"), CONTINUOUS, "loop_output_error"),
 }
 
 
