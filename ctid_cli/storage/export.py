@@ -1,7 +1,7 @@
 """``runs.h5``: every estimate that a plan asks for, in columns, with all that is needed to redo them.
 
 The bytes of the file depend on the results alone: rows are in the order of the specification, and times, hosts and runs
-are not in it. It is made from the journal in memory, some rows at a time, and replaced as a whole; the journal keeps its
+are not in it. It is made from the journal in memory, some rows at a time, and replaced whole; the journal keeps its
 SHA-256. Where there is no journal, HDF5's own checksums tell whether it is whole.
 """
 
