@@ -4,6 +4,7 @@
 #                 goes on where it was; with RUNS=20 fewer data sets, which are checked and not published
 # make reproduce-small
 #                 the first data sets of every study, compared with the committed estimates: what CI does after make test
+# make docs      the documentation site in build/docs; warnings are errors
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -16,7 +17,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test reproduce reproduce-small bench clean
+.PHONY: demo test reproduce reproduce-small docs bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -39,11 +40,14 @@ reproduce: $(VENV)/.installed
 reproduce-small: $(VENV)/.installed
 	$(BIN)/ctid reproduce --first --jobs $(JOBS)
 
+docs: $(VENV)/.docs-installed
+	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs build/docs
+
 bench: $(VENV)/.test-installed
 	set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; PYTHONPATH=. $(BIN)/python "$$file"; done
 
 clean:
-	rm -rf $(VENV) build dist .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) build dist docs/reference .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find benchmarks ctid_cli experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The installation is editable: sources may change without a new one.
@@ -55,4 +59,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 $(VENV)/.test-installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) -e '.[test]'
+	@touch $@ $(VENV)/.installed
+
+$(VENV)/.docs-installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) -e '.[docs]'
 	@touch $@ $(VENV)/.installed

@@ -93,7 +93,7 @@ def find_class(kind: str, folder: Path) -> type[Any]:
 def is_shipped(kind: str, folder: Path) -> bool:
     """Return whether a kind names a file of the studies that are shipped with the program.
 
-    Such code is trusted as the program itself is, whoever wrote the specification. A link elsewhere to such a file is
+    Such code is trusted as the program itself is, whatever the specification. A link elsewhere to such a file is
     not: modules that the file imports would be looked for beside the link.
     """
     file = _file_of(kind.rpartition(":")[0], folder)

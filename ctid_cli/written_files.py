@@ -23,7 +23,7 @@ _numbers = itertools.count(1)
 
 
 def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
-    """Replace a file in one go: readers, and a crash or a full disk at any moment, find the old or the new content."""
+    """Replace a file atomically: readers, and a crash or a full disk at any moment, find the old or the new content."""
     # A link stays one, and what is no file, such as /dev/stdout, is written to.
     path = Path(os.path.realpath(path))
     before = path.stat().st_mode if path.exists() else None
@@ -32,7 +32,7 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
         return
     temporary = path.with_name(f".{path.name[:40]}-{os.getpid()}-{next(_numbers)}{_TEMPORARY}")
     try:
-        # Nobody else's file is written to.
+        # No file of another program is written to.
         temporary.touch(exist_ok=False)
         _write(temporary, data)
         if before is not None:

@@ -46,7 +46,9 @@ AllowOutside = Annotated[
     ),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
-Runs = Annotated[int | None, typer.Option("--runs", min=1, help="Data sets per setting, not the file's own number.")]
+Runs = Annotated[
+    int | None, typer.Option("--runs", min=1, help="Number of data sets per setting, in place of the file's.")
+]
 AllowMixed = Annotated[bool, typer.Option("--allow-mixed", help="Mix code versions or processors.")]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]

@@ -83,7 +83,7 @@ class RecordOptions:
 class FormatOptions:
     """The form of what a command prints."""
 
-    format: Annotated[Format, typer.Option("--format", help="Form of the output.")] = "text"
+    format: Annotated[Format, typer.Option("--format", help="Output format.")] = "text"
     json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False
 
     @property

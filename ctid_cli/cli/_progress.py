@@ -81,7 +81,7 @@ class RecordProgress(_Progress):
         self.what = what
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that so many of all samples are done."""
+        """Show the number of samples done."""
         if sys.stderr.isatty():
             if self._bar is None and time.monotonic() - self._began > BAR_AFTER:
                 from rich.progress import TaskProgressColumn
@@ -109,7 +109,7 @@ class FitProgress(RecordProgress):
         self._stop_time()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that so many of all draws are done."""
+        """Show the number of draws done."""
         if done == 1:
             self._stop_time()
         super().__call__(done, total)

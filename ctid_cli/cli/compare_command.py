@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 @guarded
 def compare(
     files: Annotated[list[Path], typer.Argument(metavar="FIT", help="Files that ctid fit wrote (fit.json).")],
-    on: Annotated[Path, typer.Option("--on", metavar="FILE", help="Record, best one that no model was fitted to.")],
+    on: Annotated[
+        Path, typer.Option("--on", metavar="FILE", help="Record, preferably one that no model was fitted to.")
+    ],
     columns: RecordOptions,
     form: FormatOptions,
     hold: Annotated[

@@ -142,9 +142,13 @@ def run(
     ] = None,
     dask: Annotated[
         str | None,
-        typer.Option("--dask", metavar="ADDRESS", help="Workers of the dask scheduler at tcp://host:port compute."),
+        typer.Option(
+            "--dask", metavar="ADDRESS", help="Compute with the workers of the dask scheduler at tcp://host:port."
+        ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be computed, and stop.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print what would be computed, without computing it.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> None:
     """Run experiments; the same command again resumes.
@@ -264,7 +268,7 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
 @guarded
 def schema(
     section: Annotated[str | None, typer.Argument(metavar="SECTION", help="A section or kind, with --text.")] = None,
-    as_text: Annotated[bool, typer.Option("--text", help="Write a reference to read, not JSON.")] = False,
+    as_text: Annotated[bool, typer.Option("--text", help="Write a readable reference instead of JSON.")] = False,
 ) -> None:
     """Print the JSON Schema of experiment files, or a reference.
 

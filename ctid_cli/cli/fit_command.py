@@ -71,7 +71,10 @@ def fit(
     validate: Annotated[
         Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record.")
     ] = None,
-    bootstrap: Annotated[int | None, typer.Option("--bootstrap", metavar="DRAWS", help="Bootstrap intervals.")] = None,
+    bootstrap: Annotated[
+        int | None,
+        typer.Option("--bootstrap", metavar="DRAWS", help="Compute bootstrap intervals from this number of draws."),
+    ] = None,
     predict: Annotated[
         int | None, typer.Option("--predict", metavar="K", help="Fit of predictions K samples ahead, with --noise.")
     ] = None,

@@ -34,7 +34,7 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
-HoldOption = Annotated[AskedHold, typer.Option("--hold", help="The input between its samples; else chosen.")]
+HoldOption = Annotated[AskedHold, typer.Option("--hold", help="Input between its samples; else chosen.")]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class StructureOptions:
     integrators: Annotated[
         int | None,
         typer.Option(
-            "--integrators", help="Poles at the origin besides; of a sum, in its first submodel; else chosen."
+            "--integrators", help="Additional poles at the origin (of a sum: in its first submodel); else chosen."
         ),
     ] = None
 
@@ -98,7 +98,9 @@ class ModelOptions(StructureOptions):
         int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else chosen.")
     ] = None
     zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles; else chosen.")] = None
-    model: Annotated[ModelForm, typer.Option("--model", help="One fraction, or a sum of submodels.")] = "fraction"
+    model: Annotated[ModelForm, typer.Option("--model", help="One transfer function, or a sum of submodels.")] = (
+        "fraction"
+    )
     terms: Annotated[
         str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
     ] = None
@@ -161,7 +163,7 @@ class LoopOptions:
 class FitOptions(TreatmentOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
-    loss: Annotated[LossKind, typer.Option("--loss", help="What large output errors count.")] = "squares"
+    loss: Annotated[LossKind, typer.Option("--loss", help="Loss function of the output errors.")] = "squares"
     noise: Annotated[
         str, typer.Option("--noise", metavar="white|arma:P,Q|auto", help="Noise that is estimated with the model.")
     ] = "white"

@@ -33,7 +33,7 @@ def order(
     zeros: Annotated[str | None, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = None,
     hold: HoldOption = "auto",
     validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Judge on this record too.")
+        Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record too.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for order.json and order.svg.")] = Path("."),
 ) -> None:

@@ -22,14 +22,14 @@ def figure(
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", metavar="KIND", help="measure or box.")] = None,
     measure: Annotated[
-        str | None, typer.Option("--measure", metavar="NAME", help="What is measured, such as rmse or rmse:delay.")
+        str | None, typer.Option("--measure", metavar="NAME", help="Measure, such as rmse or rmse:delay.")
     ] = None,
     parameters: Annotated[
         str | None, typer.Option("--parameters", metavar="NAMES", help="With --kind box: a1,delay.")
     ] = None,
-    style: Annotated[Form | None, typer.Option("--format", help="Form of the files; svg by default.")] = None,
+    style: Annotated[Form | None, typer.Option("--format", help="Format of the files; svg by default.")] = None,
     out: Out = Path("results"),
-    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Where a single figure goes.")] = None,
+    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="File of a single figure.")] = None,
 ) -> None:
     """Draw figures of experiments and of studies.
 
@@ -103,14 +103,14 @@ def report(
         typer.Option(
             "--file",
             metavar="FILE",
-            help="Where the page goes; OUT/<experiment>/report.html, fit.html or track.html by default.",
+            help="File of the page; OUT/<experiment>/report.html, fit.html or track.html by default.",
         ),
     ] = None,
     record: Annotated[
-        list[Path] | None, typer.Option("--record", metavar="FILE", help="Of a fit or track: where its record is now.")
+        list[Path] | None, typer.Option("--record", metavar="FILE", help="Record of the fit or track, if it was moved.")
     ] = None,
     validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Of a fit: where its validation record is now.")
+        Path | None, typer.Option("--validate", metavar="FILE", help="Validation record of the fit, if it was moved.")
     ] = None,
 ) -> None:
     """Write a page about a fit, a track, an experiment or a study.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Actions:
     """What is done instead of running the studies; one at a time."""
 
-    list: Annotated[bool, typer.Option("--list", help="Name the studies with their experiments.")] = False
+    list: Annotated[bool, typer.Option("--list", help="List the studies with their experiments.")] = False
     check: Annotated[
         bool, typer.Option("--check", help="Test the claims, and compare the tables with those committed.")
     ] = False
@@ -32,7 +32,7 @@ class Actions:
         bool, typer.Option("--first", help="Compute the first data sets, and compare with those committed.")
     ] = False
     update_first: Annotated[
-        bool, typer.Option("--update-first", help="Compute the first data sets, and commit to them anew.")
+        bool, typer.Option("--update-first", help="Compute the first data sets, and store them as the reference.")
     ] = False
     publish: Annotated[
         bool, typer.Option("--publish", help="Write tables, figures, claims and environment to results/published.")

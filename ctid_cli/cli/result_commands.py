@@ -102,15 +102,17 @@ def export(
         str | None, typer.Option("--id", metavar="ID", help="One estimate in full, by the first letters of its id.")
     ] = None,
     format: Annotated[
-        Format | None, typer.Option("--format", help="Form of the output: csv or json; of one estimate any form.")
+        Format | None, typer.Option("--format", help="Output format: csv or json; of one estimate any.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
-    tool: Annotated[Tool | None, typer.Option("--as", help="Of a fit: the tool that the model is for.")] = None,
+    tool: Annotated[Tool | None, typer.Option("--as", help="Tool for which the model of a fit is written.")] = None,
     pade: Annotated[
         int | None, typer.Option("--pade", metavar="ORDER", help="With --as control: approximate the delay.")
     ] = None,
     out: Out = Path("results"),
-    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="Write here, not to stdout.")] = None,
+    file: Annotated[
+        Path | None, typer.Option("--file", metavar="FILE", help="Write to this file, not to stdout.")
+    ] = None,
 ) -> None:
     """Write the estimates of an experiment, or a fit as code.
 

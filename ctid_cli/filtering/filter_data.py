@@ -61,7 +61,7 @@ def filter_data(
 ) -> FilterData:
     """Lay a record out for filtering; a periodic one repeats itself one interval after its end.
 
-    The samples of a record whose input is band-limited are every so many points of its finer clock: regular passes are
+    The samples of a record whose input is band-limited are every k-th point of its finer clock: regular passes are
     many times faster than those over any clock.
     """
     signal = record.input.periodic_lines if periodic else record.input.lines

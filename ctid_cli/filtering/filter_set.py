@@ -6,7 +6,7 @@ the cost of a delay error d after a low-pass filter L is, by Parseval,
 .. math:: J(d) = \frac1\pi \int_{-\infty}^{\infty} (1 - \cos w d) |L G_0(jw)|^2 \Psi(w)\,dw
                  + \frac{\lambda}{2\pi} \int_{-\infty}^{\infty} |L(jw)|^2\,dw,
 
-twice the drop of the autocorrelation of the filtered output from its peak, above a floor of noise. Every such cost is
+twice the drop of the autocorrelation of the filtered output from its peak, above the noise floor. Every such cost is
 even in d and least at d = 0. The longer the period of the filter, the wider the valley around zero.
 
 A descent of one filtered cost may stop at a local minimum. If for every delay error some filter of a set has a descent

@@ -464,7 +464,7 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
         # eigenvector u of the least eigenvalue, theta = -v_phi/v_psi.
         v = whitener.T @ np.ascontiguousarray(np.linalg.eigh(whitener @ gram @ whitener.T)[1][:, 0])
         theta[:] = -v[:n] / v[n:]
-    # Residuals of an exact fit are rounding; the floor keeps them from raising an alarm.
+    # Residuals of an exact fit are rounding; the lower limit keeps them from raising an alarm.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
     verdict, judges = judge(gram, theta, fit.omega, clock, weight, counters[ROWS])
     if not judges:

@@ -58,7 +58,7 @@ class Status(Enum):
 
 
 class DeferredFields:
-    """A result whose numbers for single samples may be left out until somebody wants them.
+    """A result whose numbers for single samples may be left out until they are used.
 
     A loaded result has a model and its covariance without its records; residuals need these. The fields that
     ``deferred`` names must have no default but a factory, so that the class has no such attributes.

@@ -15,7 +15,7 @@ from ctid_cli.signals.record import Record
 
 #: Share of the power of the response that its band holds.
 SHARE = 0.95
-#: Bands of the spectra are at least this many bins of the whole record wide, and at most so many per octave. Narrow
+#: Bands of the spectra are at least this many bins of the whole record wide, and at most this number per octave. Narrow
 #: ones resolve resonances, wide ones average over more noise; those that show more of the response count.
 BINS = (8, 24)
 BANDS_PER_OCTAVE = 6

@@ -64,7 +64,7 @@ class UncertainValue:
         quantile: float = NORMAL,
         reason: str = "",
     ) -> UncertainValue:
-        """An interval that reaches so many standard errors to both sides."""
+        """An interval of ``estimate -+ quantile`` standard errors."""
         reach = quantile * standard_error
         return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
 

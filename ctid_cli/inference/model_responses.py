@@ -124,7 +124,7 @@ class PoleBand:
 Bands = Literal["linearised", "sampled"]
 #: Parameters that are drawn, and the seed: one fit always gets one band.
 DRAWS, SEED = 1000, 20261122
-#: Points of a curve for which nobody gave any.
+#: Default number of points of a curve.
 POINTS = 400
 
 

@@ -1,4 +1,4 @@
-"""What simulated data sets tell of an estimator, and how well so many of them tell it.
+"""Measures of an estimator from simulated data sets, with their Monte Carlo errors.
 
 The Monte Carlo standard errors are those of T. P. Morris, I. R. White and M. J. Crowther, Using simulation studies to
 evaluate statistical methods, Statistics in Medicine 38 (2019) 2074-2102, Table 6, with one change. Their formula for an

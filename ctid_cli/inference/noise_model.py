@@ -27,7 +27,7 @@ from ctid_cli.arrays import Array
 ORDERS, RISES = 8, 3
 #: Greatest partial correlation.
 INSIDE = 0.9999
-#: Fisher's steps end where they promise less than this of the criterion, or after so many.
+#: Fisher's steps end where they promise less than this of the criterion, or after this number.
 PROMISE, STEPS = 1e-10, 60
 #: Residuals of which the sensitivities leave less than this fraction are rounding.
 NO_NOISE = 1e-12
@@ -48,7 +48,7 @@ class Rows(Protocol):
 
 
 def row_blocks(count: int) -> Iterator[slice]:
-    """Slices that cover so many rows."""
+    """Slices that cover ``count`` rows."""
     return (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))
 
 
@@ -76,7 +76,7 @@ class NoiseModel:
         return int(self.coefficients.size - 1)
 
     def effective_count(self, count: int) -> float:
-        """How many independent samples have a mean as uncertain as so many of these, and not more than these."""
+        """Number of independent samples whose mean is as uncertain, at most the number of these samples."""
         gain = float(self.coefficients.sum()) ** 2
         ratio = gain * float(self.first_autocovariances[0]) / self.innovation_variance if self.order else 1.0
         return count * min(ratio, 1.0)

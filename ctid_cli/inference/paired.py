@@ -101,7 +101,7 @@ def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, seco
     # The same, solved for the level at which the end is zero.
     beyond = NORMAL.inv_cdf(_share(drawn, 0.0)) - shift
     z = beyond / (1 + acceleration * beyond) - shift
-    # So many resamples cannot tell of a smaller one, whatever the normal distribution says out there.
+    # A p-value below one over the number of resamples cannot be resolved, whatever the normal tail says.
     p_value = 1.0 if not drawn.any() else max(2 * NORMAL.cdf(-abs(z)), 2 / (DRAWS + 1))
     return Difference(value, ends[0], ends[1], p_value)
 

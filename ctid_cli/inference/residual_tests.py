@@ -314,7 +314,7 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     del behind  # as large as all that follows
 
     def inputs(shift: float, steps: range) -> Array:
-        """A look at the input so many samples from each residual, without a copy for every column."""
+        """A view of the input at a lag from each residual, without a copy for every column."""
         values = record.input.at(t - shift) - record.input.mean
         looks = np.lib.stride_tricks.sliding_window_view(values, len(steps))
         return looks[inside.start + min(steps) : inside.stop + min(steps), :: steps.step]

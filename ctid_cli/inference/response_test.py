@@ -26,7 +26,7 @@ SERIES, SEED = 199, 20140801
 TIME_CONSTANTS, FREQUENCIES, DAMPINGS = 10, 8, (0.05, 0.3, 0.9)
 #: Least and greatest number of delays of each response; between them, one for each time constant of the response.
 FEWEST_DELAYS, MOST_DELAYS = 12, 48
-#: Of longer records means over successive samples are tested, so many that at most this number is left.
+#: Of longer records means over successive samples are tested, at most this number of them.
 MOST_SAMPLES = 2000
 #: Shares of the false alarms that are given to the tests of the signals as they are, of what is new in them, and of
 #: the likelihood. The second alone sees anything after fast inputs in slow noise, and the third after few steps, where
@@ -36,7 +36,7 @@ WEIGHTS = (0.4, 0.2, 0.4)
 MOST_LAGS = 8
 #: Length of periodic noise over that of the record it stands for.
 PERIOD = 4
-#: Outliers are cut off at so many times the deviation from the median that nine samples in ten do not exceed.
+#: Outliers are cut off at this multiple of the deviation from the median that nine samples in ten do not exceed.
 CUT_OFF = 5.0
 #: Fewer samples than this tell nothing.
 FEWEST_SAMPLES = 8

@@ -106,7 +106,7 @@ def scale_of(errors: Array, least: float) -> float:
 def weighted(losses: Sequence[Loss], errors: Sequence[Array], parameters: int) -> Weighting:
     """Weights and pseudo-errors; samples without any weight are as if they were missing.
 
-    With so many parameters a few samples see a part of their own outliers, by Huber's factor K.
+    With many parameters a few samples see a part of their own outliers, by Huber's factor K.
     """
     pairs = list(zip(losses, errors, strict=True))
     weights = tuple(loss.weight(r) for loss, r in pairs)

@@ -242,7 +242,7 @@ def _choose(excess: Array, determined: BoolArray, widths: IntArray) -> IntArray:
 #: An input repeats itself where the mean square of its change over a period is below this share of twice its variance.
 REPEATED = 1e-3
 #: Lines on which the input has less than this share of its greatest power do not excite, nor those that stand out of
-#: the input's noise by less than so many times its variance.
+#: the input's noise by less than this multiple of its variance.
 LEAST_POWER, ABOVE_NOISE = 1e-6, 10.0
 #: Lines on each side of one of the input from which transient and noise are read.
 BETWEEN = 4

@@ -181,7 +181,7 @@ def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[
 
 
 def _check_terms(fractions: _PartialFractions, terms: Sequence[Term], direct: int) -> None:
-    """Refuse terms that cannot take all of a sum; so many take the feedthrough."""
+    """Refuse terms that cannot take all of a sum; ``direct`` of them take the feedthrough."""
     pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
     asked = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
     if asked != (n, [integrators] * (integrators > 0)):
@@ -189,10 +189,10 @@ def _check_terms(fractions: _PartialFractions, terms: Sequence[Term], direct: in
             f"the terms have {asked[0]} poles and {sum(asked[1])} integrators, the latter in {len(asked[1])} of them; "
             f"the model has {n} poles and {integrators} at the origin, which one term must take together"
         )
-    room = sum(term.poles // 2 for term in terms)
-    if pairs > room:
+    possible = sum(term.poles // 2 for term in terms)
+    if pairs > possible:
         raise DataError(
-            f"the model has {pairs} complex pairs of poles, the terms room for {room}; let more have two poles"
+            f"the model has {pairs} complex pairs of poles, the terms have room for {possible}; let more have two poles"
         )
     if fractions.direct.size != direct:
         raise DataError(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: The figure of ``ctid fit``, and its parts.
 Kind = Literal["all", "overlay", "residuals", "correlation", "profile"]
-#: Experiments that are drawn; the others would leave no room.
+#: Experiments that are drawn; more do not fit into one figure.
 MOST_DRAWN = 3
 #: A profile whose greatest cost is this many times its least one has a logarithmic scale.
 STEEP = 5.0

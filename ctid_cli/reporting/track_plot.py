@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TURN = 2.0 * np.pi
-#: Up to so many tones get a panel each, which shows how far they move; more share one.
+#: Up to this number of tones get a panel each, which shows how far they move; more share one.
 MOST_PANELS = 5
 #: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
 SHOWN_PERCENT = 98.0
 MARGIN = 0.35
 #: Amplitudes that differ by more than this factor are drawn on a logarithmic axis.
 LOGARITHMIC = 10.0
-#: The frequency axes end at so many times the highest tone or line, or at the Nyquist frequency.
+#: The frequency axes end at this multiple of the highest tone or line, or at the Nyquist frequency.
 BEYOND = 2.0
-#: A spectrogram has so many columns, of segments in which the closest tones are so many bins apart where it is long
-#: enough, shows so many decibels, and has at most so many rows.
+#: Of a spectrogram: columns; distance in bins of the closest tones in a segment, where the record is long enough;
+#: range in dB; most rows.
 COLUMNS = 480
 RESOLVED_BINS = 8.0
 SHORTEST, LONGEST = 64, 2**15

@@ -1,7 +1,7 @@
 """Jobs: one data set and the estimates wanted of it, computed to numbers that can be stored.
 
 Nothing here raises. Whatever goes wrong with an estimate becomes its result, with status ``FAILED``; only where the
-machine was short of something (memory, descriptors, room on a disk) there is no result at all.
+machine was short of something (memory, descriptors, space on a disk) there is no result at all.
 """
 
 from __future__ import annotations

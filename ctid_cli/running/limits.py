@@ -126,7 +126,7 @@ _ADVICE = (
     ),
     (r"Too many open files", f"raise the number of open files ('ulimit -n 4096'), or {_FEWER}"),
     (r"Resource temporarily unavailable|can't start new thread", f"raise the number of processes, or {_FEWER}"),
-    (r"No space left|[Dd]isk quota", "make room on the disk, also that of temporary files (TMPDIR)"),
+    (r"No space left|[Dd]isk quota", "free space on the disk, also on that of temporary files (TMPDIR)"),
     (r"SIGXCPU", "raise the limit of processor time of this shell or batch job ('ulimit -t')"),
 )
 _ANY = f"look whether something ends processes here, {_FEWER}, or try another machine"
@@ -149,7 +149,7 @@ class StopRequest:
     """Notices requests to stop; signals, while it is entered.
 
     The first signal is only noted, so that what is in work can be finished and stored. The second ends the process at
-    once, as if nobody had listened; the workers end with it, and the journal is made for that.
+    once, as without a handler; the workers end with it, and the journal is made for that.
     """
 
     def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
@@ -160,7 +160,7 @@ class StopRequest:
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
-        # Python hands signals to the main thread only; elsewhere whoever owns the main thread decides.
+        # Python hands signals to the main thread only; elsewhere the owner of the main thread decides.
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 self._before[number] = signal.signal(number, self._note)

@@ -3,8 +3,8 @@
 What was in work when a process died is a suspect: one of them killed its process, the others were in work beside it.
 Each is computed again alone. What exceeds a limit there, or ends a process that has computed nothing else, is a failure
 of its estimator. What the machine did (out of memory, no more descriptors, a process killed from outside) is never a
-result, and a process that was stopped for a while is not guilty of the time: such estimates are computed once more, one
-at a time. What the machine does not let finish then is given up, and missing.
+result, and a process that was stopped for a while is not charged with the time: such estimates are computed once
+more, one at a time. What the machine does not let finish then is given up, and missing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 #: to their number [s]. A round ends early when the machine was short of something this often.
 PATIENCE, PAUSE = 4, 0.3
 SHORTAGES = 8
-#: Share of a limit of wall time that a process must have had the processor for, to be guilty of it [-].
+#: Share of a limit of wall time that a process must have had the processor for, to be charged with exceeding it [-].
 AT_WORK = 0.5
 #: Estimates given up that are named.
 NAMED = 3

@@ -1,4 +1,4 @@
-"""Files that somebody else may have made: ordinary ones only, of bounded size, and where they may lie."""
+"""Untrusted files: ordinary ones only, of bounded size, and where they may lie."""
 
 import os
 import stat

@@ -1,4 +1,4 @@
-"""HDF5 files that somebody else may have made: only plain arrays in the file itself, of bounded size."""
+"""Untrusted HDF5 files: only plain arrays in the file itself, of bounded size."""
 
 import itertools
 import os

@@ -14,7 +14,7 @@ from ctid_cli.signals.measurement import open_table
 from ctid_cli.signals.sound import is_sound, read_sound
 from ctid_cli.signals.table import Columns, Table, split_header
 
-#: An instant may lie so many sampling intervals beside the grid.
+#: Largest distance of an instant from the grid, in sampling intervals.
 CLOCK_TOLERANCE = 0.01
 #: A record with more samples missing between its lines than this many times those it has is not on one grid.
 MOST_FILLED = 20

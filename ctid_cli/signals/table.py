@@ -19,7 +19,7 @@ Role = Literal["time", "input", "output"]
 #: Roles of the columns of a record. A signal has a time and a signal; a record of a loop has a reference too.
 ROLES: tuple[Role, ...] = get_args(Role)
 
-#: Names by which a column is recognised when nobody says which one it is, the most telling first; case is ignored.
+#: Names by which a column is recognised by default, the most specific first; case is ignored.
 USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("t", "time", "times", "seconds", "timestamp", "samplinginstants", "ts", "sampletime"),
     "input": ("u", "input", "inputs", "inputdata"),

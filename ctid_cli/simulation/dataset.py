@@ -31,7 +31,7 @@ from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.simulation.components import ComponentError, Noise, System, is_custom
 
-#: Data sets to try models on are numbered from here: no experiment has so many.
+#: First number of the data sets for trying models; above the most that an experiment may have.
 FRESH = 2**31
 
 
@@ -310,7 +310,7 @@ class MeasuredSource:
     offset : {"remove", "none"}, default "none"
         What is done to the means of input and output over the samples for estimation.
     estimation_samples : int, optional
-        Identify on the first so many samples and judge on the rest; null identifies on all.
+        Estimate from this number of first samples and validate on the rest; null estimates from all.
     reference : str, optional
         Column of the reference, if the record was taken in a loop; loop has the controller.
     loop : LoopOptions, optional

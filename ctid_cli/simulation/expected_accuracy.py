@@ -25,9 +25,9 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
 
-#: From so many samples on the limit for long records is taken.
+#: From this number of samples on the limit for long records is taken.
 LONG = 5000
-#: Data sets whose covariances are averaged otherwise: so many, and so many samples altogether.
+#: Data sets whose covariances are averaged otherwise: their number, and the number of samples in all.
 MOST_SETS, SET_SAMPLES = 10, 20_000
 #: A known delay may differ from the true one by this fraction of it.
 SAME_DELAY = 1e-6

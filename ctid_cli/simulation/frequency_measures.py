@@ -45,7 +45,7 @@ MEASURE_UNITS = {
     "false_alarms": "-",
     "valid_share": "%",
 }
-#: An alarm within so many periods of the lowest frequency after a step answers to it.
+#: An alarm within this number of periods of the lowest frequency after a step is attributed to the step.
 ALARM_PERIODS = 2.0
 #: Length of the window of rms and bias, before the end of the record, if none is given [s].
 USUAL_WINDOW = 10.0

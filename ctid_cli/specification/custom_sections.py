@@ -98,7 +98,7 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
         return section_for(target, kind, base=form, sweeping=part != "measure")
-    # Whatever is wrong with the annotations of a class that somebody wrote.
+    # Annotations of a custom class can fail in any way.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
 

@@ -15,7 +15,7 @@ from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import checked, variants
 
-#: A record shows the slowest pole if it lasts so many of its time constants beyond the delay: below that its standard
+#: A record shows the slowest pole if it lasts this many of its time constants beyond the delay: below that its standard
 #: error grows much faster than that of a longer record falls with the number of samples.
 TIME_CONSTANTS = 3.0
 #: Input edges this close to a sample, as a fraction of the sampling interval, are seen when they happen.

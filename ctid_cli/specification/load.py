@@ -32,8 +32,8 @@ def load_spec(
 ) -> Spec:
     """Read and check a specification, of a file or as a mapping.
 
-    Code that it names is run, and data files outside its folder are read, only if that is allowed; whoever gives a
-    mapping names the files himself. A trial is given what is right, and returns what is wrong and odd about it.
+    Code that it names is run, and data files outside its folder are read, only if that is allowed; a caller that gives
+    a mapping chooses the files. A trial is given what is right, and returns what is wrong and odd about it.
 
     Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
     poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.

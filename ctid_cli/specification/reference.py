@@ -13,7 +13,7 @@ Node = Mapping[str, Any]
 
 _TYPES = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
 _LIMITS = {"exclusiveMinimum": "above", "minimum": "at least", "exclusiveMaximum": "below", "maximum": "at most"}
-#: Limits of what the computer can hold, of which nobody needs to read.
+#: Limits of what the computer can hold, which the reference omits.
 _ENORMOUS = 10**15
 _UNIT = re.compile(r" \[([^],…]+)\]")
 #: Python's words for what YAML writes otherwise.

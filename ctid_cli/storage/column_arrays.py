@@ -51,7 +51,7 @@ class ColumnWriter:
 
     @property
     def is_fixed(self) -> bool:
-        """Return whether the arrays need the same room whatever the values are."""
+        """Return whether the arrays need the same space whatever the values are."""
         return self._column.type not in ("str", "coefficients", "by name")
 
     def include(self, rows: Sequence[Mapping[str, Any]]) -> None:

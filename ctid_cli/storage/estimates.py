@@ -227,7 +227,7 @@ class Estimates:
             return self._all._truths
         try:
             return {cell["hash"]: plans.true_values(cell) for cell in self.manifest["data_cells"]}
-        # Somebody else may have written the plan.
+        # The plan is untrusted input.
         except (TypeError, ValueError, KeyError, AttributeError) as error:
             raise StorageError(f"the plan of {self.manifest['experiment']} holds a system that is none") from error
 

@@ -1,7 +1,7 @@
 """``runs.h5``: every estimate that a plan asks for, in columns, with all that is needed to redo them.
 
 The bytes of the file depend on the results alone: rows are in the order of the specification, and times, hosts and runs
-are not in it. It is made from the journal in memory, some rows at a time, and written in one go; the journal keeps its
+are not in it. It is made from the journal in memory, some rows at a time, and replaced whole; the journal keeps its
 SHA-256. Where there is no journal, HDF5's own checksums tell whether it is whole.
 """
 
@@ -59,7 +59,7 @@ def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
         log.require_in_place()
         reason = f"{path} could not be written ({error.strerror or error})"
         safe = f"all {log.count()} estimates are safe in {log.path}"
-        raise StorageError(f"{reason}; {safe}. Make room and run the same command again") from error
+        raise StorageError(f"{reason}; {safe}. Free some space and run the same command again") from error
     sha256 = hashlib.sha256(image.getbuffer()).hexdigest()
     log.note_export(sha256)
     return count, sha256
@@ -172,7 +172,7 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
 
 
 class Export:
-    """An open ``runs.h5``; anybody may have made it, so that nothing in it is trusted before it is checked."""
+    """An open ``runs.h5``; untrusted: everything in it is checked before use."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self.path = path

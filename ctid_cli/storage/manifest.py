@@ -108,7 +108,7 @@ def read_json(text: str) -> Any:
 
 
 def require_manifest(found: Any) -> Manifest:
-    """Return the plan in a file that anybody may have written; a ValueError says what is wrong with it."""
+    """Return the plan in an untrusted file; a ValueError says what is wrong with it."""
     from pydantic import ValidationError
 
     try:
@@ -238,7 +238,7 @@ def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
     """Return True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
 
     ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
-    parameters of the submodels of a sum, and its delay; the truth that a system of one's own gives.
+    parameters of the submodels of a sum, and its delay; the true values that a custom system gives.
     """
     from ctid_cli.models.additive import AdditiveModel, Submodel
     from ctid_cli.models.transfer_function import TransferFunction

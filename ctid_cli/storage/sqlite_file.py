@@ -49,7 +49,7 @@ def readable(path: Path, *, live: bool) -> Iterator[str]:
     """Return an address at which SQLite reads a journal and changes nothing.
 
     After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
-    index is there, however stale; else a copy is read. A file that nobody writes to and that has no log needs no locks.
+    index is there, however stale; else a copy is read. A file without a writer and without a log needs no locks.
     """
     log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
     # A log that was only begun holds nothing, and SQLite does not get on with its index.

@@ -109,7 +109,7 @@ def _add_coefficients(
 
 
 def _shift_numerator(numbers: dict[str, Array], alike: BoolArray, shifts: IndexArray, zeros: int) -> None:
-    """Put numbers of coefficients ``b`` under the true names, which are so many powers further in each model."""
+    """Put numbers of coefficients ``b`` under the true names, which are shifted by a number of powers in each model."""
     none, own = np.full(len(alike), np.nan), dict(numbers)
     for k in range(zeros):
         found = own.get(f"b{k}", none)

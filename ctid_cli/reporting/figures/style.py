@@ -63,7 +63,7 @@ def load_matplotlib() -> None:
 
 
 def _import_matplotlib() -> None:
-    # Whoever draws says what is missing.
+    # The caller reports what is missing.
     with suppress(ImportError):
         import matplotlib.backends.backend_svg
         import matplotlib.figure  # noqa: F401
@@ -141,7 +141,7 @@ def look(k: int) -> dict[str, Any]:
 
 
 def panels_of(figure: Figure, n: int, columns: int | None = None, **shared: Any) -> list[Any]:
-    """So many panels in rows; where panels share an axis, the lowest of each column still has its numbers."""
+    """Return ``n`` panels in rows; where panels share an axis, the lowest of each column still has its numbers."""
     across = columns or columns_for(n)
     panels = list(figure.subplots(-(-n // across), across, squeeze=False, **shared).flat)
     for k, axes in enumerate(panels):

@@ -26,7 +26,7 @@ from ctid_cli.text import count
 
 #: What is measured of every simulated system, beside what the specification asks for.
 MEASURES = ("bias", "rmse", "coverage")
-#: So many estimators are compared two by two; more of them with the first one.
+#: Up to this number of estimators are compared pairwise; more of them with the first one.
 ALL_PAIRS = 3
 #: Kinds of failure that are listed.
 FAILURES_LISTED = 20
