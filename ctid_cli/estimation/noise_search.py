@@ -5,6 +5,7 @@ Either step raises the likelihood, and where neither does any more its slope by 
 the information on both is block-diagonal, so that a few rounds do.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ctid_cli.arrays import Array
@@ -23,15 +24,28 @@ class JointOptimum(NamedTuple):
     noise: NoiseFit
 
 
-def joint_optimum(measured: MeasuredRecords, found: Optimum, orders: Orders | None, nested: bool) -> JointOptimum:
+def joint_optimum(
+    measured: MeasuredRecords,
+    found: Optimum,
+    orders: Orders | None,
+    starts: Sequence[tuple[Array, float]],
+    *,
+    nested: bool,
+) -> JointOptimum:
     """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC.
 
-    If nested, plants are searched once more as the innovations under that noise see them, smaller ones included.
+    The least output error may have followed the noise: the plant is searched once more as the innovations under that
+    noise see it, from the starts of the output-error search, and if nested from the smaller plants too.
     """
     joint = _near(measured, found, orders)
-    if not nested or not sum(joint.noise.orders) or sum(e.size for e in measured.outputs) > LONG:
+    if not sum(joint.noise.orders):
         return joint
-    other = measured.whitened_by(joint.noise.noise).best([(found.denominator, found.delay)], nested)
+    white, size = measured.whitened_by(joint.noise.noise), found.denominator.size
+    # Poles that have run to infinity are not looked for again.
+    alike = [start for start in starts if start[0].size == size]
+    starts = [(joint.found.denominator, joint.found.delay), *alike]
+    nested = nested and sum(e.size for e in measured.outputs) <= LONG
+    other = white.best(starts, nested) if nested else white.local(*starts)
     if other.denominator.size != found.denominator.size:
         return joint
     return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)

@@ -381,7 +381,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                     found = measured.best(starts, self.nested)
                     fit = fitted(measured, found, profile, None)
                     if self.noise_model != "white":
-                        fit = _with_noise(measured, fit, found, self)
+                        fit = _with_noise(measured, fit, found, self, starts)
                 else:
                     robust = robust_fit(measured, self.loss, starts, self.nested)
                     fit = fitted(measured, robust.found, profile, robust)
@@ -470,9 +470,15 @@ def fitted(
     )
 
 
-def _with_noise(measured: MeasuredRecords, beside: MeasuredFit, found: Optimum, options: DelayProfile) -> MeasuredFit:
+def _with_noise(
+    measured: MeasuredRecords,
+    beside: MeasuredFit,
+    found: Optimum,
+    options: DelayProfile,
+    starts: Sequence[tuple[Array, float]],
+) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
-    joint = joint_optimum(measured, found, orders_of(options.noise_model), options.nested)
+    joint = joint_optimum(measured, found, orders_of(options.noise_model), starts, nested=options.nested)
     search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
     fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
     law = beside.uncertainty("robust")
