@@ -30,7 +30,7 @@ LoopUse = Literal["none", "reference", "controller"]
 UNKNOWN = "unknown"
 DIRECT = (
     "The model is fitted to the input as it was measured in the loop (direct method): that is right only if the noise "
-    "model is, here white noise of the output, and if there is a delay of a sample in the loop."
+    "model is (white noise of the output, or that of --noise) and if there is a delay of a sample in the loop."
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]

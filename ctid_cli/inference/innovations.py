@@ -49,7 +49,7 @@ def filter_innovations(
 
     ``steps`` are the intervals of the clock from the sample before to each sample, 0 or 1 at the first one. F shifts,
     and has minus the denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of the
-    variances; ``after`` gets the predicted states of the first row, if there is room.
+    variances; ``after``, unless empty, gets the predicted states of the first row.
     """
     r, logarithms, known = gain.size, 0.0, False
     # A column and a row of zeros save questions at the ends.
@@ -124,7 +124,7 @@ class SampledNoise:
         return np.asarray(Whitener(self.noise, len(rows))(rows, self.steps).T.reshape(columns.shape))
 
     def predicted(self, errors: Array, ahead: int) -> Array:
-        """Prediction of the noise from samples that are at least so many intervals old; zero without any."""
+        """Prediction of the noise from samples that are at least ``ahead`` intervals old; zero without any."""
         states = np.zeros((errors.size, self.steps.size and Whitener(self.noise, 1).gain.size))
         whitener, places = Whitener(self.noise, 1), np.cumsum(self.steps)
         whitener(errors[None].copy(), self.steps, states)

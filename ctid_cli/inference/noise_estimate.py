@@ -118,7 +118,7 @@ class NoiseEstimate:
         return self.test.p_value < LEVEL
 
     def prediction_errors(self, errors: Sequence[Array], used: Sequence[BoolArray], ahead: int) -> list[Array]:
-        """Errors of predictions from outputs at least so many samples old, from output errors."""
+        """Errors of predictions from outputs that are at least ``ahead`` samples old, from output errors."""
         each = zip(sampled(self.noise, used), errors, strict=True)
         return [e - noise.predicted(e, ahead) for noise, e in each]
 
