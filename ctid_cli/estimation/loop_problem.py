@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import butter
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
@@ -194,6 +193,8 @@ class LoopProblem:
         right side only what follows the filtered reference counts (two-stage least squares), so that noise in the loop
         leaves no bias. E is first that of a Butterworth filter, then the denominator with its unstable poles mirrored.
         """
+        from scipy.signal import butter  # slow to import
+
         t, n = self.data.t, self.response.poles + self.response.integrators
         cutoffs = np.geomspace(6.0 / (t[-1] - t[0]), 1.5 / float(np.median(np.diff(t))), CUTOFFS)
         filters = [np.asarray(butter(n, cutoff, analog=True)[1], dtype=float) for cutoff in cutoffs]

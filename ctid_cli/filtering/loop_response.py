@@ -16,7 +16,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import schur
 
 from ctid_cli.arrays import Array
 from ctid_cli.filtering.bank import chain_states
@@ -166,6 +165,8 @@ class LoopResponse:
         return dynamics, np.concatenate((w0 * g * closing * share, B[:, 0] * seen)), y, direct
 
     def _continuous(self, theta: Array, count: int, state: Array | None) -> LoopRows:
+        from scipy.linalg import schur  # slow to import
+
         F, g, c, d = self._whole(theta)
         size, data, start = g.size, self.data, np.zeros(g.size) if state is None else state
         # Passes take dynamics that are zero above their first superdiagonal: a real Schur form from below.
