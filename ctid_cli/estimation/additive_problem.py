@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
@@ -72,6 +71,8 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
 
 def following(reference: Array, u: Array) -> Array:
     """Return what of an input follows the reference: its best prediction by a finite impulse response, from rest."""
+    from scipy.linalg import solve_toeplitz  # slow to import
+
     r, moved = reference - reference.mean(), u - u.mean()
     lags = min(MOST_LAGS, u.size // SAMPLES_PER_LAG + 1)
     size = 2 * u.size

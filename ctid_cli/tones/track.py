@@ -246,7 +246,7 @@ def track(
     paths = paths_of(found, places)
     if not paths and tones is None:
         raise DataError(
-            f"no tone stands out of {samples.size * interval:.4g} s, in which a tone must turn at least eight times; use a "
+            f"no tone stands out of {samples.size * interval:.4g} s, in which a tone must turn eight times; use a "
             "longer record, or one with less noise"
         )
     wanted = sorted(paths[: c.MOST_ASKED if tones is None else tones], key=lambda path: _middle(found, path))
