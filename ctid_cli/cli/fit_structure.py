@@ -333,11 +333,13 @@ def _refuse_unable(asked: Asked) -> None:
     """What refined instrumental variables at a known delay cannot do."""
     in_loop = asked.loop != "none"
     what = "a record in a loop" if in_loop else "a sum of submodels"
+    what = "the reference as an instrument" if asked.loop == "reference" else what
     low, high = asked.delay
     if low < high:
-        why = "noise that comes back through the loop would move it" * in_loop or "a known delay is needed"
+        instead = "; with the controller (--loop FILE) it can be searched" * (asked.loop == "reference")
         raise UsageError(
-            f"--delay {low:g}:{high:g} cannot be searched for {what}: {why}; give one value, --delay VALUE"
+            f"--delay {low:g}:{high:g} cannot be searched for {what}: a known delay is needed; give one value, "
+            f"--delay VALUE{instead}"
         )
     _refuse_of_loop(asked, what)
     if asked.treatment.offset in ("estimate", "drift"):
@@ -357,7 +359,8 @@ def _refuse_of_loop(asked: Asked, what: str = "a record in a loop") -> None:
     if asked.treatment.loss != "squares":
         raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
     if asked.treatment.noise != "white":
-        raise UsageError(f"--noise {asked.treatment.noise} is not there for {what}; drop --noise")
+        direct = ", or fit to the input with --direct" * (asked.loop != "none")
+        raise UsageError(f"--noise {asked.treatment.noise} is not available for {what}; drop --noise{direct}")
 
 
 def _terms(text: str, integrators: int) -> list[Term]:

@@ -204,8 +204,10 @@ class _Choosing:
         return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
 
     def _holds(self) -> list[Hold]:
-        """Return the holds to compare: an input that jumps between levels shows that it is held."""
+        """Return the holds to compare: an input that jumps between levels shows that it is held, as in most loops."""
         if self.given.hold != "auto" or {input_moves(record).kind for record in self.records} != {"continuous"}:
+            return [self.first_hold]
+        if any(record.feedback for record in self.records):
             return [self.first_hold]
         if not all(np.array_equal(record.input.t, record.t) for record in self.records):
             return [self.records[0].input.hold]

@@ -23,6 +23,8 @@ LOW_FIT = 80.0
 #: Residuals depend on the input where chance gives as much less often than this; of feedback, which is looked for among
 #: many inputs, and explains this share of the residuals' variance.
 DEPENDENT, FED_BACK, FEEDBACK_SHARE = 0.01, 1e-4, 0.01
+#: Endings of a search at which nothing else of a fit means anything.
+UNFINISHED = (Status.MAX_ITERATIONS, Status.DIVERGED, Status.REFLECTED)
 #: A real pole is slow where its time constant exceeds this fraction of the record.
 SLOW = 0.6
 #: Instants of outliers that are listed.
@@ -55,6 +57,10 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
         fastest = float(np.nanmin(growing))
         what = f"The output diverges: it grows by a factor of e every {fastest:.2g}, and the input does not"
         return [FitWarning(f"{what}; an unstable plant is not among the models")]
+    if fit.status in UNFINISHED:
+        loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
+        unfinished = fit.status.value.removesuffix(".")
+        return [FitWarning(f"{unfinished}{loop * any(record.loop is not None for record in records)}")]
     seen = found.answer.seen
     suspicious = fit.fit_percent < LOW_FIT or fit.status is not Status.CONVERGED or len(found.tests) < len(records)
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
@@ -108,6 +114,8 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
     if test is None or not p < least:
         return ""
     later = int(np.argmax(np.abs(test.cross_correlation))) < test.lags
+    if later and found.records[k - 1].feedback:  # as the input of a loop must
+        return ""
     of = f" of experiment {k}" * (len(found.records) > 1)
     return f"The residuals{of} depend on the input{', most on later values' * later} (p = {p:.2g})"
 
@@ -162,6 +170,8 @@ def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
     fit, noisy = found.fit.linear, found.fit.noise is not None
     # Of residuals with outliers nothing else is told.
     for k, (record, use) in enumerate(_used(found) if not outliers else ()):
+        if record.feedback:  # which is known
+            continue
         e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
         acting = found.options._acting(record)
         x = record.y[use] - (found.fit.residuals[k] if noisy else e)

@@ -41,8 +41,8 @@ def identification_drawing(
                 _name_panels(axes, axes, measurement, k, len(measurements), units)
         elif kind == "correlation":
             both = figure.subplots(1, 2)
-            draw_autocorrelation(both[0], result.tests, len(measurements))
-            draw_cross_correlation(both[1], result.tests, len(measurements))
+            draw_autocorrelation(both[0], result.tests, len(measurements), _tested(result))
+            draw_cross_correlation(both[1], result.tests, len(measurements), _tested(result))
         elif kind == "profile":
             draw_profile(figure.add_subplot(), result, units)
         else:
@@ -53,6 +53,11 @@ def identification_drawing(
     if kind == "profile":
         return Drawing(5.5, 3.4, draw)
     return Drawing(8.0, 2.8 * len(drawn) if kind in ("overlay", "residuals") else 3.4 * len(drawn) + 2.8, draw)
+
+
+def _tested(result: Identification) -> str:
+    """What the tests are of."""
+    return "residuals" if result.fit.noise is None else "innovations"
 
 
 def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Measurement], units: Units) -> None:
@@ -66,7 +71,7 @@ def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Mea
         output.margins(x=0.0)
         _draw_residuals(error, result, measurement, k, units)
         _name_panels(output, error, measurement, k, len(measurements), units)
-    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements))
+    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements), _tested(result))
     draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
 
 
@@ -114,17 +119,21 @@ def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, 
     return outline(t, full)
 
 
-def draw_autocorrelation(axes: Any, tests: Sequence[ResidualTests], experiments: int = 1) -> None:
-    """Autocorrelation of the residuals of each experiment, with the band of white ones."""
-    axes.set_ylabel("autocorrelation\nof the residuals [-]")
+def draw_autocorrelation(
+    axes: Any, tests: Sequence[ResidualTests], experiments: int = 1, what: str = "residuals"
+) -> None:
+    """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
+    axes.set_ylabel(f"autocorrelation\nof the {what} [-]")
     _draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests], experiments)
     if tests:
         _draw_band(axes, tests[0].autocorrelation_band, f"{100 * tests[0].level:.3g} % band if white")
 
 
-def draw_cross_correlation(axes: Any, tests: Sequence[ResidualTests], experiments: int = 1) -> None:
-    """Correlation of the residuals with the input, with the band of residuals that do not depend on it."""
-    axes.set_ylabel("correlation of the residuals\nwith the delayed input [-]")
+def draw_cross_correlation(
+    axes: Any, tests: Sequence[ResidualTests], experiments: int = 1, what: str = "residuals"
+) -> None:
+    """Correlation of the residuals, or innovations, with the input, with the band where they do not depend on it."""
+    axes.set_ylabel(f"correlation of the {what}\nwith the delayed input [-]")
     _draw_lags(axes, [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests], experiments)
     if tests:
         _draw_band(axes, tests[0].cross_correlation_band, f"{100 * tests[0].level:.3g} % band if independent")
@@ -154,18 +163,21 @@ def draw_profile(axes: Any, result: Identification, units: Units) -> None:
     axes.set_xlabel(plain(f"delay [{units.time}]"))
     axes.set_ylabel(plain(f"cost [({units.output})²]"))
     if profile is None:
-        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=plain(f"known delay {delay:.4g} {units.time}"))
+        low, high = result.options.delay_bounds
+        what = "estimated delay" if low < high else "known delay"
+        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=plain(f"{what} {delay:.4g} {units.time}"))
     else:
         whole = profile.samples >= result.fit.count
         behind = "" if whole else f" of the liveliest {profile.samples} samples"
         behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
         label = plain(f"profile{behind}")
         axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=label)
-        label = plain(f"minimum at {delay:.4g} {units.time}")
-        if profile.cutoff is None and whole:
+        noisy = result.fit.noise is not None
+        label = plain(f"{'estimate with the noise model:' if noisy else 'minimum at'} {delay:.4g} {units.time}")
+        if profile.cutoff is None and whole and not noisy:
             axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
         else:
-            # The cost of the estimate is that of all frequencies and samples.
+            # The cost of the estimate is that of all frequencies and samples, or of the innovations.
             axes.axvline(delay, color="black", linewidth=0.8, label=label)
     low, high = axes.get_ylim()
     if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():

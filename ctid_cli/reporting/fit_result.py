@@ -270,7 +270,9 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
 
 
 def _conditions(fit: SubmodelsFit) -> Iterator[tuple[str, str]]:
-    """Conditions for consistent estimates (González et al. 2025), at the estimate."""
+    """Conditions for consistent estimates (González et al. 2025), at a converged estimate."""
+    if not fit.status.succeeded:
+        return
     lines = (
         (f"condition ({37 if fit.in_loop else 36})", fit.consistency, "right side over left side, for consistency"),
         ("assumption 4", fit.sampling, "sampling frequency over twice the greatest imaginary part of a pole"),
@@ -323,6 +325,8 @@ def _covariance_line(result: Identification) -> str:
         return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
     if found.kind == "biased":
         return f"{BIASED} {_form(result.fit)}"
+    if not np.isfinite(np.diag(found.covariance)).any():
+        return f"There are no standard errors. {_form(result.fit)}"
     if found.kind != "white":
         text = f"Standard errors are those for coloured noise{f', because the {what} are not white' * (not asked)}"
     elif result.tests:

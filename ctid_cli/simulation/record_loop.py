@@ -35,14 +35,17 @@ def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
     elif record.interval is None:
         why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
     elif not (left := unexplained(record, r, controller, loop.enters)) <= UNEXPLAINED:
+        share = f"{100 * min(left, 1.0):.3g} %"
         made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
         why = (
-            f"the input is not what the controller makes, u = {made}: {100 * left:.3g} % of its moves differ; a "
+            f"the input is not what the controller makes, u = {made}: {share} of its moves differ; a "
             "controller with two degrees of freedom or in continuous time, another sampling interval, sign or "
             "reference, or limits of the actuator do that, and estimates with it would be wrong"
         )
     if why:
         cure = "correct --loop or --reference, or give --loop unknown, which needs no controller"
+        if record.interval is None:
+            cure = "give a controller in continuous time, or --loop unknown without --reference (the direct method)"
         raise DataError(f"{record.name}: {why}; {cure}")
     closed = Record(record.t, record.y, record.input, name=record.name, loop=Loop(r, controller, loop.enters))
     return replace(measured, record=closed)
@@ -55,7 +58,7 @@ def in_unknown_loop(measured: Measurement) -> Measurement:
     if record.interval is None:
         raise DataError(
             f"{record.name}: the reference as an instrument needs a regular clock, and that of this record is "
-            "irregular; give the controller (--loop FILE), or leave --reference out"
+            "irregular; give a controller in continuous time (--loop FILE), or leave --reference out"
         )
     return replace(measured, record=replace(record, loop=Loop(r, None)))
 
