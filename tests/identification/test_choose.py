@@ -99,6 +99,12 @@ def test_the_hold_is_compared_where_the_input_moves_continuously():
     assert any(sentence.startswith("Hold: ") for sentence in made.sentences)
 
 
+def test_the_input_of_a_loop_is_held():
+    u = np.sin(np.outer(0.1 * np.arange(600), [0.7, 1.9, 3.1]) + np.arange(3)).sum(axis=1)
+    record = replace(record_of(SECOND, u=u, hold="foh", deviation=0.003), feedback=True)
+    assert choose(record, Given(poles=2, zeros=0)).records[0].input.hold == "zoh"
+
+
 def test_what_is_given_is_kept():
     given = Given(poles=3, zeros=1, delay_bounds=(0.1, 0.6), initial_state="estimate", offset="drift", hold="foh")
     choice = choose(record_of(SECOND), given)

@@ -8,10 +8,11 @@ import pytest
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.identification.fit_warnings import MOST
+from ctid_cli.identification.fit_warnings import MOST, fit_warnings
 from ctid_cli.identification.held_back import block_numbers, compared, held_back_errors
 from ctid_cli.identification.identify import identify
 from ctid_cli.identification.remedies import tried_remedies
+from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -167,3 +168,16 @@ def test_a_long_record_is_tried_on_its_beginning():
     record = record_of(n=12_000)
     (remedy,) = tried_remedies([record], FIRST_ORDER, FIRST_ORDER.fit([record])).remedies
     assert remedy.option == "--poles 2 --zeros 0"
+
+
+def test_feedback_that_is_known_is_no_warning():
+    record = looped()
+    said = [identify(each, SEARCHED).warnings for each in (record, replace(record, feedback=True))]
+    assert [any("as in a loop" in text for text in each) for each in said] == [True, False]
+
+
+def test_of_a_search_that_did_not_end_nothing_else_is_said():
+    found = identify(record_of(), FIRST_ORDER)
+    unfinished = replace(found, fit=replace(found.fit, status=Status.MAX_ITERATIONS))
+    (said,) = fit_warnings(unfinished)
+    assert str(said).startswith("The iterations stopped at max_iterations")
