@@ -263,9 +263,9 @@ def _in_loop(asked: Asked) -> LoopOutputError:
         raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
     state, offset = asked.treatment.initial_state or "rest", asked.treatment.offset or "none"
     if state == "periodic":
-        raise UsageError("--initial-state periodic is not there for a record in a loop; use rest or estimate")
+        raise UsageError("--initial-state periodic is not available for a record in a loop; use rest or estimate")
     if offset == "drift":
-        raise UsageError("--offset drift is not there for a record in a loop; use estimate, remove or none")
+        raise UsageError("--offset drift is not available for a record in a loop; use estimate, remove or none")
     with as_usage_errors():
         degrees = asked.model.poles, asked.model.zeros or 0
         return LoopOutputError(*degrees, asked.delay, state, offset, asked.integrators)
@@ -343,7 +343,7 @@ def _refuse_unable(asked: Asked) -> None:
         )
     _refuse_of_loop(asked, what)
     if asked.treatment.offset in ("estimate", "drift"):
-        raise UsageError(f"--offset {asked.treatment.offset} is not there for {what}; use --offset remove")
+        raise UsageError(f"--offset {asked.treatment.offset} is not available for {what}; use --offset remove")
     if in_loop and asked.treatment.hold not in ("auto", "zoh"):
         raise UsageError(
             f"--hold {asked.treatment.hold} does not go with --reference: a discrete controller holds its input (zoh)"
@@ -355,9 +355,10 @@ def _refuse_unable(asked: Asked) -> None:
 def _refuse_of_loop(asked: Asked, what: str = "a record in a loop") -> None:
     """What neither submodels nor simulated loops can do."""
     if asked.treatment.input_before is not None:
-        raise UsageError(f"--input-before is not there for {what}; use --initial-state estimate")
+        raise UsageError(f"--input-before is not available for {what}; use --initial-state estimate")
     if asked.treatment.loss != "squares":
-        raise UsageError(f"--loss {asked.treatment.loss} is not there for {what}: it is fitted by squares; drop --loss")
+        why = "it is fitted by squares"
+        raise UsageError(f"--loss {asked.treatment.loss} is not available for {what}: {why}; drop --loss")
     if asked.treatment.noise != "white":
         direct = ", or fit to the input with --direct" * (asked.loop != "none")
         raise UsageError(f"--noise {asked.treatment.noise} is not available for {what}; drop --noise{direct}")
