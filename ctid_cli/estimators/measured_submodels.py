@@ -17,6 +17,7 @@ from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
 from ctid_cli.estimators.rivc import Rivc
+from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
@@ -53,6 +54,9 @@ class SubmodelsFit(MeasuredFit):
         Margin of the condition for consistent estimates, right side over left side [-]; NaN where it is not defined.
     sampling : float
         Sampling frequency over twice the greatest imaginary part of a pole [-]; NaN on an irregular clock.
+    two_stage : float
+        Of an estimate with instruments from the reference: the largest difference to that of the two-stage method, in
+        standard errors of the latter [-]; NaN otherwise.
     """
 
     additive: AdditiveModel | None = None
@@ -62,6 +66,7 @@ class SubmodelsFit(MeasuredFit):
     in_loop: bool = False
     consistency: float = float("nan")
     sampling: float = float("nan")
+    two_stage: float = float("nan")
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -221,7 +226,17 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         )
         samples = self._samples(fit, laid_out)
         fit = replace(fit, residuals=samples.residuals, sensitivities=samples.sensitivities, used=samples.used)
-        return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
+        fit = fit._with_uncertainty(self.covariance, self.bootstrap_draws)
+        return replace(fit, two_stage=self._two_stage_difference(fit, laid_out.record))
+
+    def _two_stage_difference(self, fit: SubmodelsFit, record: Record) -> float:
+        """Largest difference of a parameter to the two-stage method, in standard errors; NaN where there is none."""
+        if self.instruments != "reference" or not fit.status.succeeded:
+            return float("nan")
+        other = replace(self, instruments="open_loop", offset="none").fit(without_feedback(record))
+        own, errors = fit.parameters, other.standard_errors
+        found = [abs(other.parameters[name] - own[name]) / errors[name] for name in own if errors.get(name, 0.0) > 0.0]
+        return max(found) if other.status.succeeded and found else float("nan")
 
     # --- what a fit is judged by -----------------------------------------------------------------------
 

@@ -67,7 +67,7 @@ def fit_content(fitted: Identification, records: Records, ahead: int | None = No
             "parameters": criteria.parameters,
         },
         "condition_number": fit.condition_number,
-        "conditions": picked(fit, ("consistency", "sampling")) if isinstance(fit, SubmodelsFit) else None,
+        "conditions": picked(fit, ("consistency", "sampling", "two_stage")) if isinstance(fit, SubmodelsFit) else None,
         "iterations": fit.iterations,
         "residual_tests": [picked(test, TEST_KEYS) for test in fitted.tests],
         "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),

@@ -280,6 +280,9 @@ def _conditions(fit: SubmodelsFit) -> Iterator[tuple[str, str]]:
     for label, margin, text in lines:
         if not np.isnan(margin):
             yield label, f"{'holds' if margin > 1.0 else 'is violated'} with the margin {margin:.3g} = {text}"
+    if not np.isnan(fit.two_stage):
+        how = "input simulated from the reference, then a fit in open loop"
+        yield "two-stage", f"parameters differ by at most {fit.two_stage:.2g} of its standard errors ({how})"
 
 
 def _box_text(box: Box, units: Units) -> str:

@@ -11,6 +11,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.estimators.srivc import Srivc
+from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.loop import loop_radius, simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
@@ -155,6 +156,18 @@ def test_instruments_of_the_reference_need_no_controller_where_noise_is_coloured
     errors = [abs(fit.parameters[name] - value) for name, value in {"a1": 1.2, "a2": 1.0, "b0": 2.0}.items()]
     assert all(error < 3.5 * fit.standard_errors[name] for error, name in zip(errors, ("a1", "a2", "b0"), strict=True))
     assert max(wrong) > 3.0 * max(errors)
+
+
+def test_two_stage_method_agrees_with_instruments_of_the_reference():
+    one = record(STABLE, PI, noise=0.2, count=6000, colour=0.9, seed=4)
+    unknown = replace(one, loop=Loop(one.loop.reference, None))
+    options = MeasuredSubmodels((Term(2, 0),), instruments="reference", factored=False)
+    fit = options.fit(unknown)
+    two_stage = replace(options, instruments="open_loop").fit(without_feedback(unknown))
+    for name, value in {"a1": 1.2, "a2": 1.0, "b0": 2.0}.items():
+        assert abs(two_stage.parameters[name] - value) < 3.5 * two_stage.standard_errors[name]
+    assert 0.0 < fit.two_stage < 2.0
+    assert np.isnan(replace(options, instruments="open_loop").fit(unknown).two_stage)
 
 
 def test_what_is_no_solution_has_no_error():
