@@ -45,9 +45,7 @@ class WritingOptions:
         text = result.file_text(self.out, command)
         contents = {self.out / "fit.json": text.encode() + b"\n", self.out / "fit.svg": result.drawing().saved()}
         if self.report:
-            from ctid_cli.reporting.pages.fit_page import fit_page
-
-            contents[self.out / "fit.html"] = fit_page(result, json.loads(text)).encode()
+            contents[self.out / "fit.html"] = result.page(json.loads(text)).encode()
         if self.csv is not None:
             contents |= {self.csv / name: frame_bytes(frame) for name, frame in fit_tables(result).items()}
         if self.export is not None:
