@@ -82,7 +82,7 @@ def of_hold(models: Ranking) -> str:
     return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else other.hold)}."
 
 
-def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list[str]:
+def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Return the structure and the range of the delay."""
     best = ranking.best
     other = ranking.runner_up("poles", "zeros", "integrators")
@@ -90,7 +90,7 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list
     if other is not None:
         found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
     if given.delay_bounds is None:
-        found.append(f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {best.fit.model.delay:.4g}.")
+        found.append(f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay).")
     return found
 
 

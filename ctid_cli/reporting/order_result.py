@@ -36,8 +36,7 @@ class OrderSearchResult(Result):
     @classmethod
     def of(cls, choice: Choice, given: Given, records: Records) -> OrderSearchResult:
         """Judge the structures of a choice."""
-        other = None if records.validation is None else records.validation.record
-        return cls(choice, judged_candidates(choice, given, other), records)
+        return cls(choice, judged_candidates(choice, given, records.validation_record), records)
 
     def sections(self) -> list[Section]:
         """Return the choice, the best structures, and what else was chosen."""
