@@ -123,6 +123,31 @@ class Identification(DeferredFields, FittedModel, Shown):
         return self.fit.law
 
     @property
+    def errors_sentence(self) -> str:
+        """What the standard errors hold for, and how intervals follow from them."""
+        found, what = self.uncertainty, self.fit.left_over
+        if not self.answer.seen:
+            return "There are no standard errors, as no answer to the input is seen."
+        if found.kind == "biased":
+            return BIASED
+        if not np.isfinite(np.diag(found.covariance)).any():
+            return "There are no standard errors."
+        if found.kind == "white":
+            text = f"Standard errors are those for white {what}" + f", as the {what} pass the test" * bool(self.tests)
+        else:
+            why = "" if all(test.white for test in self.tests) else f", because the {what} are not white"
+            text = f"Standard errors are those for coloured noise{why}"
+        if found.bootstrap is None:
+            text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
+            text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
+        else:
+            draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
+            text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
+        if self.delay_interval is not None:
+            text += ", that of the delay from the profile of the cost, which is not quadratic there"
+        return f"{text}."
+
+    @property
     def driver(self) -> str:
         """What residuals are tested against: the input, or the reference of a loop."""
         return self.tests[0].driver if self.tests else "input"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -67,6 +67,26 @@ class SubmodelsFit(MeasuredFit):
     consistency: float = float("nan")
     sampling: float = float("nan")
     two_stage: float = float("nan")
+
+    @property
+    def conditions(self) -> Iterator[tuple[str, str]]:
+        """Conditions for consistent estimates (González et al. 2025) in sentences, at a converged estimate."""
+        if not self.status.succeeded:
+            return
+        lines = (
+            (
+                f"condition ({37 if self.in_loop else 36})",
+                self.consistency,
+                "right side over left side, for consistency",
+            ),
+            ("assumption 4", self.sampling, "sampling frequency over twice the greatest imaginary part of a pole"),
+        )
+        for label, margin, text in lines:
+            if not np.isnan(margin):
+                yield label, f"{'holds' if margin > 1.0 else 'is violated'} with the margin {margin:.3g} = {text}"
+        if not np.isnan(self.two_stage):
+            how = "input simulated from the reference, then a fit in open loop"
+            yield "two-stage", f"parameters differ by at most {self.two_stage:.2g} of its standard errors ({how})"
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None

@@ -1,6 +1,10 @@
 """Why an estimate must not be trusted, one bit for each reason."""
 
 from enum import IntFlag
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Flag(IntFlag):
@@ -57,3 +61,10 @@ MEANINGS: dict[Flag, str] = {
     Flag.ABSENT: "The tone is not there, or not beyond doubt, at this instant.",
     Flag.UNCONFIRMED: "No window around this instant in which nothing changes shows such a tone.",
 }
+
+
+def flag_names(flags: NDArray[np.uint16]) -> NDArray[Any]:
+    """Return the names of the flags that are set in each of some bit fields, of the same shape."""
+    values, places = np.unique(flags, return_inverse=True)
+    names = [" ".join(str(flag.name).lower() for flag in Flag if value & flag) for value in values.tolist()]
+    return np.array(names, dtype=object)[places].reshape(flags.shape)

@@ -157,3 +157,12 @@ def indistinct(
     with np.errstate(invalid="ignore"):
         spread = float(np.sqrt(slope.real @ covariance @ slope.real + slope.imag @ covariance @ slope.imag))
     return quantile(slope.real) * spread >= distance
+
+
+def modes_of(poles: ComplexArray) -> list[tuple[float, float | None]]:
+    """Return natural frequency [1/time unit] and damping of each real pole and each pair; no damping of an integrator.
+
+    The frequency ``|p|/(2 pi)`` is in hertz where poles are in rad/s; the damping is ``-Re p/|p|``.
+    """
+    above = [pole for pole in poles.tolist() if pole.imag >= 0]
+    return [(abs(pole) / (2 * np.pi), -pole.real / abs(pole) if pole else None) for pole in above]

@@ -113,6 +113,13 @@ class NoiseEstimate:
         return len(self.noise.denominator) - 1, len(self.noise.numerator) - 1
 
     @property
+    def formula(self) -> str:
+        """The noise model, each coefficient with its standard error in brackets."""
+        errors, (p, _) = np.sqrt(np.diag(self.covariance)), self.orders
+        d, c = _polynomial(self.noise.denominator, errors[:p]), _polynomial(self.noise.numerator, errors[p:])
+        return f"v = C/D e, D = {d}, C = {c}"
+
+    @property
     def differs(self) -> bool:
         """Whether the estimates of the plant differ by more than chance gives."""
         return self.test.p_value < LEVEL
@@ -139,3 +146,10 @@ class NoiseEstimate:
             basis = beside @ orthonormal(beside, RANK)
             columns = columns - basis @ (basis.T @ columns)
         return tuple(np.split(columns, np.cumsum([e.size for e in errors])[:-1])), innovations
+
+
+def _polynomial(coefficients: Sequence[float], errors: Array) -> str:
+    """Return a polynomial in q^-1 with the standard errors of its coefficients."""
+    each = zip(coefficients[1:], errors.tolist(), strict=True)
+    terms = (f" {'-' if c < 0 else '+'} {abs(c):.4g}({e:.1g}) q^-{k}" for k, (c, e) in enumerate(each, start=1))
+    return "1" + "".join(terms)

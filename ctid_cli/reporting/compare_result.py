@@ -13,8 +13,8 @@ import pandas as pd
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Column, Result, Section
-from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, name_axes, outline, plain
 from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked

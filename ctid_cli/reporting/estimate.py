@@ -1,90 +1,17 @@
-"""Units of a record, and the parameters of an estimate with their uncertainty."""
+"""The parameters of an estimate with their uncertainty."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import nan
 from typing import Any
 
 from ctid_cli.inference.intervals import NORMAL, UncertainValue
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Column
 from ctid_cli.reporting.layout import picked
-from ctid_cli.signals.measurement import Measurement
-from ctid_cli.signals.sampled_signal import SECONDS
-from ctid_cli.signals.table import Role, split_header
-
-#: What stands for a unit of input or output that is not known.
-INPUT, OUTPUT = "in", "out"
-UNKNOWN = {INPUT, OUTPUT}
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units of a record, and those that follow for the parameters of a model."""
-
-    time: str = "s"
-    input: str = INPUT
-    output: str = OUTPUT
-
-    @property
-    def gain(self) -> str:
-        """Unit of a static gain."""
-        return f"{self.output}/{self.input}"
-
-    def label(self, name: str, unit: str) -> str:
-        """Return a name with its unit in brackets, where the unit is known."""
-        return f"{name} [{unit}]" if self.is_known(unit) else name
-
-    def column(self, measurement: Measurement, role: Role) -> str:
-        """Return the name of a column of a record with its unit."""
-        return self.label(split_header(str(getattr(measurement, role)))[0], getattr(self, role))
-
-    def amount(self, text: str, unit: str) -> str:
-        """Return a number with its unit, where the unit is known."""
-        return f"{text} {unit}" if self.is_known(unit) else text
-
-    def is_known(self, unit: str) -> bool:
-        """Whether a unit is made of those of the record, and not of what stands for unknown ones."""
-        return UNKNOWN.isdisjoint(re.findall(r"\w+", unit))
-
-    @property
-    def square(self) -> str:
-        """Unit of a squared output."""
-        return f"({self.output})^2"
-
-    @property
-    def seconds(self) -> float | None:
-        """Seconds in the unit of time; None where the label is not known."""
-        return SECONDS.get(self.time)
-
-    def of(self, name: str, poles: int, zeros: int) -> str:
-        """Unit of a parameter."""
-        if name == "delay":
-            return self.time
-        if name.startswith("offset"):
-            return self.output
-        if name.startswith("drift"):
-            return self._over_time(self.output, 1 if name[5:6] in ("", "_") else int(name[5]))
-        k = int(name[1:].split("_")[0])
-        unit, power = {"a": ("1", k), "b": (self.gain, poles - zeros + k)}.get(name[0], (self.output, k - 1))
-        return self._over_time(unit, power)
-
-    def of_submodel(self, name: str, integrators: int = 0) -> str:
-        """Unit of a parameter of a submodel, whose denominator has the constant term 1."""
-        coefficient = name.split("_")[1]
-        power = int(coefficient[1:])
-        if coefficient[0] == "a":
-            return self._power(power)
-        power -= integrators
-        return f"{self.gain}*{self._power(power)}" if power > 0 else self._over_time(self.gain, -power)
-
-    def _power(self, power: int) -> str:
-        return self.time if power == 1 else f"{self.time}^{power}"
-
-    def _over_time(self, unit: str, power: int) -> str:
-        return f"{unit}/{self._power(power)}" if power else unit
 
 
 def parameters(estimate: Mapping[str, Any], delay_bounds: Sequence[float] | None = None) -> list[UncertainValue]:

@@ -14,11 +14,13 @@ from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.loop_output_error import LoopFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
+from ctid_cli.inference.derived import modes_of
 from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.inference.noise_estimate import NoiseEstimate
+from ctid_cli.inference.units import Units
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.document import Column
-from ctid_cli.reporting.estimate import Units, parameter_rows
+from ctid_cli.reporting.estimate import parameter_rows
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
@@ -91,33 +93,21 @@ def fit_content(fitted: Identification, records: Records, predicted: Sequence[in
 
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
-    additive = additive_of(result.fit)
-    if additive is not None:
-        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
-    poles, zeros = result.fit.model.order, result.options.zeros
+    additive, poles, zeros = additive_of(result.fit), result.fit.model.order, result.options.zeros
     # The states of a loop are those of plant and controller, in different units.
-    nameless = "x" if isinstance(result.fit, LoopFit) else "-"
-    named = [
-        (item, "" if item.name.startswith(nameless) else units.of(item.name, poles, zeros)) for item in result.estimates
-    ]
-    return [replace(item, unit=unit) for item, unit in named]
+    nameless = isinstance(result.fit, LoopFit)
+
+    def unit(name: str) -> str:
+        if additive is not None:
+            return units.in_sum(name, additive)
+        return "" if nameless and name.startswith("x") else units.of(name, poles, zeros)
+
+    return [replace(item, unit=unit(item.name)) for item in result.estimates]
 
 
 def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
     """The submodels of a fit, None of a fit of one transfer function."""
     return fit.additive if isinstance(fit, SubmodelsFit) else None
-
-
-def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
-    """Unit of a parameter of a sum, or of a coefficient of its free response."""
-    if name.startswith("g"):
-        return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
-    if name == "delay":
-        return units.time
-    # c_k p^k/(p^l A) on an impulse.
-    power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
-    times = units.time if power == 1 else f"{units.time}^{power}"
-    return units.output if power == 0 else f"{units.output}*{times}"
 
 
 def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
@@ -162,13 +152,10 @@ def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
 
 def _modes(fit: MeasuredFit, units: Units) -> list[dict[str, float | None]]:
     """Natural frequency and damping of every real pole and every pair; an integrator has no damping."""
-    poles = [pole for pole in (additive_of(fit) or fit.model).poles.tolist() if pole.imag >= 0]
+    seconds = units.seconds
     return [
-        {
-            "frequency_hz": None if units.seconds is None else abs(pole) / (2 * np.pi * units.seconds),
-            "damping": -pole.real / abs(pole) if pole else None,
-        }
-        for pole in poles
+        {"frequency_hz": None if seconds is None else frequency / seconds, "damping": damping}
+        for frequency, damping in modes_of((additive_of(fit) or fit.model).poles)
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray, IntArray
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.reporting.estimate import Units
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, name_axes, outline, plain
 from ctid_cli.signals.measurement import Measurement
 

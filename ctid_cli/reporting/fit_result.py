@@ -11,21 +11,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
-from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import Options, SubmodelsFit
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.intervals import BIASED
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Section, pairs
-from ctid_cli.reporting.estimate import PARAMETER, Units, parameter_rows
+from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
 from ctid_cli.reporting.fit_plot import FitFigures
@@ -207,11 +205,11 @@ class FitResult(PagedResult):
         yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
         yield "condition number", number(fit.condition_number, 3)
         if isinstance(fit, SubmodelsFit):
-            yield from _conditions(fit)
+            yield from fit.conditions
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
-            yield "admissible", _box_text(fit.box, units)
+            yield "admissible", fit.box.sentence(units.time)
             for name, limit, value in fit.box.limits_met(fit.held_poles):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"
                 yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
@@ -225,18 +223,13 @@ class FitResult(PagedResult):
 
     def _noise(self, estimate: NoiseEstimate) -> Iterator[tuple[str, str]]:
         """Return the noise model, how well it predicts, and the output-error fit beside it."""
-        fit, units, noise, (p, q) = self.fitted.fit, self.units, estimate.noise, estimate.orders
-        errors = np.sqrt(np.diag(estimate.covariance))
-        d, c = _polynomial(noise.denominator, errors[:p]), _polynomial(noise.numerator, errors[p:])
+        fit, units, (p, q) = self.fitted.fit, self.units, estimate.orders
         chosen = ", orders of least BIC" * estimate.chosen
-        variance = units.amount(number(noise.innovation_variance or 0.0), units.square)
-        yield "noise", f"ARMA({p},{q}){chosen}: v = C/D e, D = {d}, C = {c}; variance of e {variance}"
+        variance = units.amount(number(estimate.noise.innovation_variance or 0.0), units.square)
+        yield "noise", f"ARMA({p},{q}){chosen}: {estimate.formula}; variance of e {variance}"
         for k in self.predicted:
-            old = count(k, "sample")
-            yield (
-                f"fit {k} ahead",
-                f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {old} old",
-            )
+            text = f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {count(k, 'sample')} old"
+            yield f"fit {k} ahead", text
         ratios = zip(fit.parameter_names, estimate.error_ratios(fit.covariance).tolist(), strict=True)
         each = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in ratios if np.isfinite(ratio))
         text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {each}"
@@ -251,13 +244,6 @@ class FitResult(PagedResult):
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
         return fit_content(self.fitted, self.records, self.predicted)
-
-
-def _polynomial(coefficients: Sequence[float], errors: Array) -> str:
-    """Return a polynomial in q^-1 with the standard errors of its coefficients."""
-    each = zip(coefficients[1:], errors.tolist(), strict=True)
-    terms = (f" {'-' if c < 0 else '+'} {abs(c):.4g}({e:.1g}) q^-{k}" for k, (c, e) in enumerate(each, start=1))
-    return "1" + "".join(terms)
 
 
 def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
@@ -278,40 +264,9 @@ def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str
     if instruments == "reference":
         yield "loop", f"controller not known; what of the input follows r = {measurement.reference} as instrument"
     elif instruments == "closed_loop" and loop is not None and loop.controller is not None:
-        b, a = (
-            " ".join(f"{c:.6g}" for c in np.asarray(side))
-            for side in (loop.controller.numerator, loop.controller.denominator)
-        )
-        p = "s" if loop.continuous else "q"
-        where = f"u = C({p}) (r - y)" if loop.enters == "controller" else f"u = r - C({p}) y"
-        text = f"{where}, r = {measurement.reference}, C = ({b})/({a}) in descending powers of {p}"
-        how = "instruments from the noise-free loop"
-        if isinstance(options, LoopOutputError):
-            how = "output error of the simulated loop, y - T r"
-        yield "loop", f"{text}; {how}"
-
-
-def _conditions(fit: SubmodelsFit) -> Iterator[tuple[str, str]]:
-    """Conditions for consistent estimates (González et al. 2025), at a converged estimate."""
-    if not fit.status.succeeded:
-        return
-    lines = (
-        (f"condition ({37 if fit.in_loop else 36})", fit.consistency, "right side over left side, for consistency"),
-        ("assumption 4", fit.sampling, "sampling frequency over twice the greatest imaginary part of a pole"),
-    )
-    for label, margin, text in lines:
-        if not np.isnan(margin):
-            yield label, f"{'holds' if margin > 1.0 else 'is violated'} with the margin {margin:.3g} = {text}"
-    if not np.isnan(fit.two_stage):
-        how = "input simulated from the reference, then a fit in open loop"
-        yield "two-stage", f"parameters differ by at most {fit.two_stage:.2g} of its standard errors ({how})"
-
-
-def _box_text(box: Box, units: Units) -> str:
-    rate = f"rad/{units.time}"
-    swing = f", imaginary parts up to {box.imaginary:.4g} {rate}" if np.isfinite(box.imaginary) else ""
-    poles = f"poles from {box.slowest:.4g} to {box.fastest:.4g} {rate}{swing}"
-    return f"{poles}; pairs with a damping of at least {box.least_damping:g}"
+        simulated = isinstance(options, LoopOutputError)
+        how = "output error of the simulated loop, y - T r" if simulated else "instruments from the noise-free loop"
+        yield "loop", f"{loop.formula}; r = {measurement.reference}; {how}"
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
@@ -349,31 +304,7 @@ def _covariance_line(result: Identification) -> str:
     form = "Monic denominator, descending powers."
     if additive_of(result.fit) is not None:
         form = "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
-    return f"{_errors_line(result)} {form}"
-
-
-def _errors_line(result: Identification) -> str:
-    found, what = result.uncertainty, result.fit.left_over
-    if not result.answer.seen:
-        return "There are no standard errors, as no answer to the input is seen."
-    if found.kind == "biased":
-        return BIASED
-    if not np.isfinite(np.diag(found.covariance)).any():
-        return "There are no standard errors."
-    if found.kind == "white":
-        text = f"Standard errors are those for white {what}" + f", as the {what} pass the test" * bool(result.tests)
-    else:
-        why = "" if all(test.white for test in result.tests) else f", because the {what} are not white"
-        text = f"Standard errors are those for coloured noise{why}"
-    if found.bootstrap is None:
-        text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
-        text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
-    else:
-        draws = f"95 % of {len(found.bootstrap.errors)} estimates from simulated noise"
-        text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
-    if result.delay_interval is not None:
-        text += ", that of the delay from the profile of the cost, which is not quadratic there"
-    return f"{text}."
+    return f"{result.errors_sentence} {form}"
 
 
 def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:

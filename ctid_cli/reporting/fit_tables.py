@@ -11,8 +11,8 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Tool
-from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.layout import picked
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.frequency_response import FrequencyResponse
-from ctid_cli.reporting.estimate import Units
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, name_axes, plain
 
 if TYPE_CHECKING:

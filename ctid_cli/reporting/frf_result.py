@@ -10,8 +10,8 @@ import pandas as pd
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Column, Result, Section
-from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.frf_plot import frf_drawing
 from ctid_cli.reporting.layout import picked

@@ -30,7 +30,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, wilson_interval
-from ctid_cli.reporting.estimate import Units
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import base_name

@@ -12,8 +12,8 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import DelayCosts, Validation, costs_about_delay
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
+from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Section
-from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, name_axes, plain
 from ctid_cli.reporting.fit_plot import MOST_DRAWN, FitFigures, draw_overlay
 from ctid_cli.reporting.frf_plot import decibels, draw_points, name_response

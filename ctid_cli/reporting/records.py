@@ -9,7 +9,7 @@ from typing import Any
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.reporting.estimate import Units
+from ctid_cli.inference.units import Units
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.table import ROLES

@@ -11,6 +11,7 @@ import pandas as pd
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.base import FrequencyTrack
+from ctid_cli.frequency.flags import flag_names
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting.document import Result, Section
@@ -18,7 +19,7 @@ from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import parameter_unit
-from ctid_cli.reporting.track_result import TURN, TrackResult, flag_names
+from ctid_cli.reporting.track_result import TURN, TrackResult
 from ctid_cli.tones.track import Track
 
 

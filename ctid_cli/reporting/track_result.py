@@ -12,25 +12,20 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ctid_cli.frequency.flags import MEANINGS, Flag
+from ctid_cli.frequency.flags import flag_names
 from ctid_cli.reporting.document import Column, Section
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import number, with_error
 from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
 from ctid_cli.reporting.track_plot import signal_drawing, spectra_drawing, track_drawing
 from ctid_cli.signals.sampled_signal import SampledSignal
-from ctid_cli.text import count, listed
-from ctid_cli.tones.constants import METHOD, MOST_ASKED, USUAL_ACCURACY
+from ctid_cli.text import count
+from ctid_cli.tones.constants import METHOD, USUAL_ACCURACY
 from ctid_cli.tones.residual import LeftOver, left_over
 from ctid_cli.tones.summary import ToneSummary, summarise
-from ctid_cli.tones.track import MissingLine, Track
+from ctid_cli.tones.track import Track
+from ctid_cli.tones.track_warnings import track_warnings
 
-#: A smaller share of valid rows is worth a warning.
-MOSTLY_VALID = 0.9
-#: Most frequent reasons for invalid rows, warnings of this kind, and missing lines that are named.
-MOST_REASONS = 3
-MOST_WARNINGS = 4
-MOST_LINES = 5
 TURN = 2.0 * math.pi
 
 
@@ -49,7 +44,7 @@ class TrackResult(PagedResult):
     def sections(self) -> list[Section]:
         """Return what was read and chosen, the tones, and warnings."""
         head = [] if self.signal is None else [signal_line(self.signal), *self.signal.notes]
-        warnings = [f"- {warning}" for warning in self.warnings()]
+        warnings = [f"- {warning}" for warning in track_warnings(self.track)]
         return [
             Section("", [*head, *(f"- {reason}" for reason in self.chosen())]),
             *self.tones(),
@@ -135,14 +130,6 @@ class TrackResult(PagedResult):
         rule = f"a row is valid only if the standard error of its frequency is at most {limit} (--accuracy HZ)."
         return [*self.track.reasons, f"Accuracy: {rule}"]
 
-    def warnings(self) -> list[str]:
-        """Return what a reader must know before believing the numbers."""
-        track = self.track
-        if not track.omega.shape[1]:
-            none = "No tone was asked for (--tones 0): there are no frequencies to report."
-            return [*track.warnings, *_missing_lines(track), none]
-        return [*track.warnings, *_missing_lines(track), *_invalid_rows(track)]
-
     def to_frame(self) -> pd.DataFrame:
         """Return the tones over time, those of one after those of another; ``attrs["units"]`` has units of columns."""
         track, unit = self.track, None if self.signal is None else self.signal.unit
@@ -186,7 +173,7 @@ class TrackResult(PagedResult):
                 {"frequency_hz": line.omega / TURN, "share": line.share, "amplitude": line.amplitude}
                 for line in track.missing
             ],
-            "warnings": self.warnings(),
+            "warnings": track_warnings(track),
             "notes": signal.notes,
             "chosen": self.chosen(),
             "settings": track.settings,
@@ -211,13 +198,6 @@ def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section
     return Section(notes=notes, drawing=spectra_drawing(left, track, signal.unit), caption=caption)
 
 
-def flag_names(flags: NDArray[np.uint16]) -> NDArray[Any]:
-    """Return the names of the flags that are set in each of some bit fields, of the same shape."""
-    values, places = np.unique(flags, return_inverse=True)
-    names = [" ".join(str(flag.name).lower() for flag in Flag if value & flag) for value in values.tolist()]
-    return np.array(names, dtype=object)[places].reshape(flags.shape)
-
-
 def signal_line(signal: SampledSignal) -> str:
     """Return what was read."""
     end = signal.start + (signal.samples.size - 1) * signal.interval
@@ -229,41 +209,3 @@ def signal_line(signal: SampledSignal) -> str:
 def _with_error(tone: ToneSummary) -> str:
     known = math.isfinite(tone.standard_error_hz)
     return with_error(tone.frequency_hz, tone.standard_error_hz) if known else number(tone.frequency_hz)
-
-
-def _missing_lines(track: Track) -> Iterator[str]:
-    """Say which lines are left over, and what to type."""
-    lines = track.missing
-    if lines:
-        named = listed([_line_words(line) for line in lines[:MOST_LINES]])
-        more = f", and {count(len(lines) - MOST_LINES, 'more line')}" if len(lines) > MOST_LINES else ""
-        wanted = min(track.omega.shape[1] + len(lines), MOST_ASKED)
-        what, it = ("a line", "it") if len(lines) == 1 else ("lines", "them")
-        yield f"The tones leave {what} at {named}{more}; ask for {wanted} tones to follow {it} too: --tones {wanted}"
-
-
-def _line_words(line: MissingLine) -> str:
-    rows = f", in {100 * line.share:.3g} % of the rows" if np.isfinite(line.share) else ""
-    return f"{line.omega / TURN:.6g} Hz (amplitude {line.amplitude:.3g}{rows})"
-
-
-def _invalid_rows(track: Track) -> list[str]:
-    """Say how many rows are not valid, and why, once for tones with the same reasons."""
-    found: dict[str, list[str]] = {}
-    for k, (flags, there) in enumerate(zip(track.flags.T, track.there.T, strict=True)):
-        if reasons := _reasons(flags[there]):
-            found.setdefault(reasons, []).append(f"tone {k + 1}")
-    said = [f"{listed(tones).capitalize()}: {reasons}" for reasons, tones in found.items()]
-    more = [f"{count(len(said) - MOST_WARNINGS, 'more tone')} with rows that are not valid."]
-    return said if len(said) <= MOST_WARNINGS else said[:MOST_WARNINGS] + more
-
-
-def _reasons(flags: NDArray[np.uint16]) -> str:
-    """Return the share of rows that are not valid with the most frequent reasons; empty where nearly all are."""
-    share = float(np.mean(flags == 0)) if flags.size else 0.0
-    if share >= MOSTLY_VALID:
-        return ""
-    shares = {flag: float(np.mean((flags & int(flag)) != 0)) if flags.size else 0.0 for flag in Flag}
-    reasons = sorted((flag for flag in shares if shares[flag] > 0), key=lambda flag: -shares[flag])
-    what = f"{100 * (1 - share):.3g} % of the rows are not valid." if share > 0 else "no row is valid."
-    return " ".join([what, *(f"{100 * shares[flag]:.3g} %: {MEANINGS[flag]}" for flag in reasons[:MOST_REASONS])])

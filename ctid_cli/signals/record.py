@@ -71,6 +71,15 @@ class Loop:
         """Whether the controller acts in continuous time."""
         return bool(getattr(self.controller, "continuous", False))
 
+    @property
+    def formula(self) -> str:
+        """How the controller makes the input from reference r and output y."""
+        sides = (getattr(self.controller, name) for name in ("numerator", "denominator"))
+        b, a = (" ".join(f"{c:.6g}" for c in np.asarray(side)) for side in sides)
+        p = "s" if self.continuous else "q"
+        where = f"u = C({p}) (r - y)" if self.enters == "controller" else f"u = r - C({p}) y"
+        return f"{where}, C = ({b})/({a}) in descending powers of {p}"
+
 
 @dataclass(frozen=True, eq=False)
 class Record:

@@ -14,8 +14,8 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.identify import identify
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.units import Units
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.fit_content import derived_of, parameters_of
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.records import Records

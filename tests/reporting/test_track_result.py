@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 from ctid_cli.canonical import plain
-from ctid_cli.frequency.flags import Flag
+from ctid_cli.frequency.flags import Flag, flag_names
 from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
 from ctid_cli.reporting.track_plot import track_drawing
-from ctid_cli.reporting.track_result import TrackResult, flag_names
+from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.tones.summary import summarise
 from ctid_cli.tones.track import MissingLine, Track

@@ -137,8 +137,8 @@ def _with_known(
     if not search.minima(poles, zeros):
         given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
         raise DataError(
-            f"no model with the fixed {given} has all its poles where they are searched: {box.in_words()}; "
-            "change or drop the fixed value"
+            f"no model with the fixed {given} has all its poles where they are searched: "
+            f"{box.sentence('s')}; change or drop the fixed value"
         )
     if nested:
         search.refine(poles, zeros, search.close_delays(poles, zeros))

@@ -140,12 +140,12 @@ class Box:
         met = {name for pole in poles for name in self.met_by(pole)}
         return [(name, limit, getattr(self, name)) for name, limit in LIMITS.items() if name in met]
 
-    def in_words(self) -> str:
-        """Return the bounds of the poles, for messages."""
-        return (
-            f"magnitudes of {self.slowest:.3g} to {self.fastest:.3g} rad/s, damping of pairs at least "
-            f"{self.least_damping:g}"
-        )
+    def sentence(self, time_unit: str) -> str:
+        """Return the bounds of the poles in words."""
+        rate = f"rad/{time_unit}"
+        swing = f", imaginary parts up to {self.imaginary:.4g} {rate}" if np.isfinite(self.imaginary) else ""
+        poles = f"poles from {self.slowest:.4g} to {self.fastest:.4g} {rate}{swing}"
+        return f"{poles}; pairs with a damping of at least {self.least_damping:g}"
 
 
 def widened(box: Box, poles: ComplexArray) -> Box:

@@ -1,0 +1,87 @@
+"""Units of a record, and those that follow for the parameters of a model."""
+
+import re
+from dataclasses import dataclass
+
+from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.sampled_signal import SECONDS
+from ctid_cli.signals.table import Role, split_header
+
+#: What stands for a unit of input or output that is not known.
+INPUT, OUTPUT = "in", "out"
+UNKNOWN = {INPUT, OUTPUT}
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of a record, and those that follow for the parameters of a model."""
+
+    time: str = "s"
+    input: str = INPUT
+    output: str = OUTPUT
+
+    @property
+    def gain(self) -> str:
+        """Unit of a static gain."""
+        return f"{self.output}/{self.input}"
+
+    def label(self, name: str, unit: str) -> str:
+        """Return a name with its unit in brackets, where the unit is known."""
+        return f"{name} [{unit}]" if self.is_known(unit) else name
+
+    def column(self, measurement: Measurement, role: Role) -> str:
+        """Return the name of a column of a record with its unit."""
+        return self.label(split_header(str(getattr(measurement, role)))[0], getattr(self, role))
+
+    def amount(self, text: str, unit: str) -> str:
+        """Return a number with its unit, where the unit is known."""
+        return f"{text} {unit}" if self.is_known(unit) else text
+
+    def is_known(self, unit: str) -> bool:
+        """Whether a unit is made of those of the record, and not of what stands for unknown ones."""
+        return UNKNOWN.isdisjoint(re.findall(r"\w+", unit))
+
+    @property
+    def square(self) -> str:
+        """Unit of a squared output."""
+        return f"({self.output})^2"
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds in the unit of time; None where the label is not known."""
+        return SECONDS.get(self.time)
+
+    def of(self, name: str, poles: int, zeros: int) -> str:
+        """Unit of a parameter."""
+        if name == "delay":
+            return self.time
+        if name.startswith("offset"):
+            return self.output
+        if name.startswith("drift"):
+            return self._times(self.output, -1 if name[5:6] in ("", "_") else -int(name[5]))
+        k = int(name[1:].split("_")[0])
+        unit, power = {"a": ("1", k), "b": (self.gain, poles - zeros + k)}.get(name[0], (self.output, k - 1))
+        return self._times(unit, -power)
+
+    def of_submodel(self, name: str, integrators: int = 0) -> str:
+        """Unit of a parameter of a submodel, whose denominator has the constant term 1."""
+        coefficient = name.split("_")[1]
+        power = int(coefficient[1:])
+        return self._times("", power) if coefficient[0] == "a" else self._times(self.gain, power - integrators)
+
+    def in_sum(self, name: str, model: AdditiveModel) -> str:
+        """Unit of a parameter of a sum, or of a coefficient of its free response ``c_k p^k/(p^l A)`` on an impulse."""
+        if name == "delay":
+            return self.time
+        if name.startswith("g"):
+            return self.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
+        powers = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)]
+        return self._times(self.output, powers[int(name[1:]) - 1])
+
+    def _times(self, unit: str, power: int) -> str:
+        """A unit times a power of the time."""
+        if power == 0:
+            return unit
+        time = self.time if abs(power) == 1 else f"{self.time}^{abs(power)}"
+        return f"{unit}/{time}" if power < 0 else f"{unit}*{time}" if unit else time
