@@ -4,12 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
 from ctid_cli.custom_code import STUDIES
+from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli.models.controller import DiscreteController
 
 #: Command lines: what they print, and how they are refused.
 COMMANDS = yaml.safe_load((Path(__file__).parent / "commands.yaml").read_text(encoding="utf-8"))
+#: A controller, and the file that names it.
+CONTROLLER = DiscreteController([0.8, -0.7], [1.0, -1.0])
+LOOP = "loop:\n  controller: {numerator: [0.8, -0.7], denominator: [1.0, -1.0]}\n"
 #: The system of most records.
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 
@@ -44,6 +50,17 @@ def first_order(n=300):
     u = np.where((k // 15 + k // 40) % 2, 1.0, -1.0)
     y = 1.0 + simulate(TransferFunction([2.0], [1.0, 2.0]), HeldSignal(t, u), t)
     return np.column_stack((t, u, y + 0.02 * np.random.default_rng(0).standard_normal(n)))
+
+
+def in_loop(file):
+    """A record of 2/(p + 1.5) under the controller of LOOP with coloured noise: u, y, r, and u with noise as v."""
+    rng = np.random.default_rng(4)
+    t = 0.05 * np.arange(1500)
+    r = np.repeat(rng.choice([-1.0, 1.0], 150), 10)
+    noise = lfilter([0.05], [1.0, -0.95], np.r_[0.0, rng.standard_normal(1499)])
+    found = simulate_loop(TransferFunction([2.0], [1.0, 1.5]), CONTROLLER, r, noise, 0.05)
+    spoilt = found.u + 0.1 * rng.standard_normal(1500)
+    return write(file, (t, found.u, found.x + noise, r, spoilt), "t,u [V],y [rpm],r [rpm],v [V]")
 
 
 def write(file, values, header="t,u,y"):

@@ -111,46 +111,6 @@ def test_microseconds(ctid, record, tmp_path):
     assert other["parameters"][-1]["unit"] == "us"
 
 
-# --- bad input -------------------------------------------------------------------------------------
-
-
-def refused(ctid, tmp_path, *arguments):
-    before = sorted(tmp_path.rglob("*"))
-    done = ctid("fit", *arguments, "--out", tmp_path / "out", code=2)
-    assert sorted(tmp_path.rglob("*")) == before
-    assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("ctid: ")
-    return line
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("--poles", 2, "--delay", "0:200"), ["record.csv", "greatest delay"]),
-        (("--poles", 2, "--delay", "0-3"), ["--delay", "LOW:HIGH", "'0-3'"]),
-        (("--poles", 2, "--zeros", 2, "--delay", "0:3"), ["zeros", "delay"]),
-        (("--poles", 2, "--zeros", 3), ["zeros"]),
-        (("--poles", 0), ["poles"]),
-        (("--poles", 2, "--from", 90), ["record.csv", "49.9"]),
-        (("--poles", 2, "--output", "z"), ["record.csv", "'z'"]),
-        (("--poles", 2, "--validate", "nowhere.csv"), ["nowhere.csv"]),
-        (("--poles", 2, "--bootstrap", 5), ["--bootstrap", "at least 40", "5"]),
-        (("--poles", 2, "--noise", "ar:2"), ["--noise", "white, auto or arma:P,Q", "'ar:2'"]),
-        (("--poles", 2, "--noise", "auto", "--loss", "tukey"), ["--noise", "loss squares"]),
-        (("--poles", 2, "--predict", 5), ["--predict", "add --noise auto"]),
-        (("--poles", 2, "--noise", "auto", "--predict", 0), ["--predict", "at least 1"]),
-        (("--poles", 2, "--noise", "auto", "--predict", 500), ["--predict 500", "record.csv", "500 samples"]),
-        (("--loop", "missing.yaml", "--reference", "y"), ["missing.yaml", "does not exist"]),
-        (("--model", "additive", "--terms", "2/0", "--noise", "auto"), ["--noise auto", "a sum of submodels"]),
-    ],
-)
-def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_path):
-    message = refused(ctid, tmp_path, record, *arguments)
-    for part in expected:
-        assert part in message
-
-
 @pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
 def test_a_range_of_delays_is_low_high_and_not_negative(text):
     with pytest.raises(UsageError, match="--delay must be LOW:HIGH"):

@@ -5,19 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from ctid_cli import HeldSignal, TransferFunction, load_fit
-from ctid_cli.filtering.loop import simulate_loop
+from ctid_cli import HeldSignal, load_fit
 from ctid_cli.filtering.simulate import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.controller import DiscreteController
-from tests.cli.records import write
+from tests.cli.records import LOOP, in_loop, write
 
 STEP = 0.05
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 RIGID = AdditiveModel([Submodel([0.5], [1.0], 1), Submodel([2.0], [0.3, 0.2, 1.0])])
-PLANT = TransferFunction([2.0], [1.0, 1.5])
-CONTROLLER = DiscreteController([0.8, -0.7], [1.0, -1.0])
-LOOP = "loop:\n  controller: {numerator: [0.8, -0.7], denominator: [1.0, -1.0]}\n"
 
 
 def record(file, system, n=800, noise=0.05, seed=0):
@@ -31,15 +26,7 @@ def record(file, system, n=800, noise=0.05, seed=0):
 @pytest.fixture
 def closed(tmp_path):
     (tmp_path / "loop.yaml").write_text(LOOP, encoding="utf-8")
-    rng = np.random.default_rng(4)
-    t = STEP * np.arange(1500)
-    r = np.repeat(rng.choice([-1.0, 1.0], 150), 10)
-    noise = np.zeros(1500)
-    for k in range(1, 1500):
-        noise[k] = 0.95 * noise[k - 1] + 0.05 * rng.standard_normal()
-    found = simulate_loop(PLANT, CONTROLLER, r, noise, STEP)
-    spoilt = found.u + 0.1 * rng.standard_normal(1500)
-    return write(tmp_path / "closed.csv", (t, found.u, found.x + noise, r, spoilt), "t,u [V],y [rpm],r [rpm],v [V]")
+    return in_loop(tmp_path / "closed.csv")
 
 
 def fitted(ctid, *arguments):
@@ -135,9 +122,6 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     assert "estimate is biased" in ignored["covariance"]["reason"]
 
 
-KNOWN_LOOP = ("--loop", "loop.yaml", "--reference", "r")
-
-
 def test_a_loop_whose_controller_is_not_known(ctid, closed, tmp_path):
     options = (closed, "--input", "u", "--poles", 1, "--out", tmp_path)
     content = fitted(ctid, *options, "--reference", "r")
@@ -147,71 +131,3 @@ def test_a_loop_whose_controller_is_not_known(ctid, closed, tmp_path):
     direct = fitted(ctid, *options, "--loop", "unknown")
     assert any("direct method" in note for note in direct["notes"])
     assert all(one["standard_error"] is None for one in direct["parameters"])
-
-
-ADDITIVE = ("--model", "additive", "--terms", "2/0")
-REFUSED = {
-    "terms alone": (("--terms", "2/0"), "add --model additive"),
-    "no terms": (("--model", "additive"), "--model additive needs --terms"),
-    "degrees twice": ((*ADDITIVE, "--poles", 2), "drop --poles"),
-    "bad terms": (("--model", "additive", "--terms", "2-0"), "for example 2/0,2/1"),
-    "too many zeros": (("--model", "additive", "--terms", "1/2"), "more zeros than poles"),
-    "a searched delay": ((*ADDITIVE, "--delay", "0:2"), "give one value, --delay VALUE"),
-    "a robust loss": ((*ADDITIVE, "--loss", "huber"), "drop --loss"),
-    "an estimated offset": ((*ADDITIVE, "--offset", "estimate"), "use --offset remove"),
-    "negative integrators": (("--poles", 1, "--integrators", -1), "--integrators must be 0 to 3"),
-    "a fixed delay": (("--poles", 1, "--fix", "delay=1"), "--delay VALUE"),
-    "a fixed word": (("--poles", 1, "--fix", "a1"), "NAME=VALUE"),
-    "an unknown name": (("--poles", 1, "--fix", "a2=1"), "there are a1 and b0"),
-    "a mean of an integrating output": (
-        ("--poles", 1, "--integrators", 1, "--offset", "remove"),
-        "use --offset estimate",
-    ),
-    "nothing left": (("--poles", 1, "--fix", "a1=1", "--fix", "b0=1"), "nothing to estimate"),
-    "the other half": (("--poles", 1, "--loop", "loop.yaml"), "add --reference COLUMN"),
-    "no loop": (("--poles", 1, "--direct"), "add --loop FILE or --loop unknown"),
-    "a delay to search without the controller": (
-        ("--poles", 1, "--reference", "r", "--delay", "0:1"),
-        "give one value",
-    ),
-    "a known coefficient in a loop": (("--poles", 1, *KNOWN_LOOP, "--fix", "a1=1"), "--model additive"),
-    "a loop that repeats": (("--poles", 1, *KNOWN_LOOP, "--initial-state", "periodic"), "use rest or estimate"),
-    "a drift in a loop": (("--poles", 1, *KNOWN_LOOP, "--offset", "drift"), "use estimate, remove or none"),
-    "a loss in a loop": (("--poles", 1, *KNOWN_LOOP, "--loss", "huber"), "drop --loss"),
-    "as many zeros as poles": (
-        ("--poles", 1, "--zeros", 1, *KNOWN_LOOP, "--delay", "0:1"),
-        "while the delay is estimated",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_options_that_do_not_go_together_are_one_sentence(ctid, tmp_path, case):
-    options, said = REFUSED[case]
-    file = record(tmp_path / "one.csv", MODES, n=100)
-    done = ctid("fit", file, *options, "--out", tmp_path / "out", code=2)
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-LOOPS = {
-    "an input of another origin": ("v", "r", LOOP, "the input is not what the controller makes"),
-    "a reference that is the output": ("u", "y", LOOP, "cannot be both the output and the reference"),
-    "a column that is not there": ("u", "q", LOOP, "there is no column 'q'"),
-    "a reference in another unit": ("u", "v", LOOP, "is in V, and the output"),
-    "a relay": ("u", "r", "loop: {controller: {relay: {amplitude: 1.0}}}\n", "no relay"),
-    "no loop in the file": ("u", "r", "experiment: x\n", "there is no section loop"),
-    "another sign": ("u", "r", LOOP.replace("0.8", "-0.8"), "the input is not what the controller makes"),
-    "a key that is not there": ("u", "r", "loop:\n  control: {}\n", "controller"),
-}
-
-
-@pytest.mark.parametrize("case", LOOPS)
-def test_a_loop_that_does_not_fit_the_record_is_refused(ctid, closed, tmp_path, case):
-    column, reference, text, said = LOOPS[case]
-    (tmp_path / "loop.yaml").write_text(text, encoding="utf-8")
-    options = ("--input", column, "--output", "y", "--poles", 1, "--loop", tmp_path / "loop.yaml")
-    done = ctid("fit", closed, *options, "--reference", reference, "--out", tmp_path / "out", code=2)
-    assert said in done.stderr
-    assert not (tmp_path / "out").exists()

@@ -39,19 +39,3 @@ def test_noise_has_no_order(ctid, tmp_path):
     content = json.loads(done.stdout)
     assert content["recommended"] is None
     assert content["reason"].startswith("There is no model here")
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--poles", "0:2", "--integrators", "0"], "--poles must be LOW:HIGH or one number, from 1 to 12"),
-        (["--zeros", "2:1"], "--zeros must be LOW:HIGH"),
-        (["--delay", "x"], "--delay must be LOW:HIGH"),
-        (["--input-before", "x"], "--input-before must be a number or first"),
-        (["--poles", "2", "--zeros", "5"], "no structure has at least 5 zeros and at most 2 poles"),
-    ],
-)
-def test_what_cannot_be_is_refused(ctid, record, tmp_path, options, sentence):
-    done = ctid("order", record, *options, "--out", tmp_path / "new", code=2)
-    assert sentence in done.stderr
-    assert not (tmp_path / "new").exists()

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from ctid_cli.cli.main import app
 from ctid_cli.errors import ExitCode
 from tests.cli.conftest import contents
-from tests.cli.records import COMMANDS, TINY
+from tests.cli.records import COMMANDS, LOOP, TINY, in_loop
 
 MISSPELT = TINY.replace("clock_period", "clok_period").replace("interval: 0.1", "interval: -1")
 FILES = {
@@ -27,6 +27,10 @@ FILES = {
     "ms.csv": "t [ms],u [V],y [mm]\n" + "".join(f"{k},{k % 3},{k % 5}\n" for k in range(50)),
     "order.json": '{"kind": "ctid order"}',
     "newer.json": '{"kind": "ctid fit", "format": 99, "ctid": "9.0"}',
+    "loop.yaml": LOOP,
+    "sign.yaml": LOOP.replace("0.8", "-0.8"),
+    "relay.yaml": "loop: {controller: {relay: {amplitude: 1.0}}}\n",
+    "nokey.yaml": "loop:\n  control: {}\n",
     "changed.json": '{"kind": "ctid fit", "format": 2, "checksum": "0"}',
 }
 
@@ -39,6 +43,7 @@ def prepared(used):
     for name, text in FILES.items():
         (used / name).write_text(text, encoding="utf-8")
     (used / "modes.yaml").write_text("mine", encoding="utf-8")
+    in_loop(used / "closed.csv")
     shutil.copy(used / "other.csv", used / "p1" / "comparison.csv")
     shutil.copytree(used / "results" / "measured-tiny", used / "taken" / "tiny")
     for name in ("newer", "damaged"):

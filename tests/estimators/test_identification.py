@@ -6,6 +6,7 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import LIMITS
 from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.identification import costs_about_delay
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.identify import identify
@@ -103,7 +104,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
     assert np.isnan(delay.standard_error)
     assert delay.high == 0.4
     assert np.isfinite(by_name(result)["a1"].standard_error)
-    assert "The delay lies at the end of its range, 0.4: with --delay 0:" in result.warnings[0]
+    assert "The delay lies at the end of its range, 0.4 s: with --delay 0:" in result.warnings[0]
 
 
 def test_a_zero_beside_a_delay_is_undetermined():
@@ -243,3 +244,15 @@ def test_two_experiments_are_tested_one_by_one():
     result = identify([record_of(), record_of(seed=1, colour=0.9)], OPTIONS)
     assert [test.white for test in result.tests] == [True, False]
     assert result.tests[0].level == pytest.approx(0.975)
+
+
+def test_the_cost_about_the_delay_is_least_at_the_estimate():
+    result = identify([record_of()], OPTIONS)
+    near = costs_about_delay(result)
+    assert near.delays[np.argmin(near.costs)] == pytest.approx(result.fit.model.delay, abs=1e-9)
+    assert near.costs.min() == pytest.approx(near.least, rel=1e-9)
+    inside = near.delays[near.costs <= near.allowed]
+    item = next(item for item in result.estimates if item.name == "delay")
+    step = np.diff(near.delays).max()
+    assert abs(inside[0] - item.low) <= 1.5 * step
+    assert abs(inside[-1] - item.high) <= 1.5 * step

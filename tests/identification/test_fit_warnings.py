@@ -75,11 +75,11 @@ MENDED = {
         "with --poles 4 --zeros",
     ),
     "an integrator": (record_of(INTEGRATING), KNOWN, "with --integrators 1 the held-back fit is"),
-    "a delay that is not searched": (record_of(LATE), KNOWN, "The delay is taken as 0: with --delay 0:20 "),
+    "a delay that is not searched": (record_of(LATE), KNOWN, "The delay is taken as 0 s: with --delay 0:20 "),
     "a delay outside the range": (
         record_of(LATE),
         SEARCHED,
-        "The delay lies at the end of its range, 1: with --delay ",
+        "The delay lies at the end of its range, 1 s: with --delay ",
     ),
     "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
     "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4, ...)"),

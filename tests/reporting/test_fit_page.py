@@ -2,7 +2,6 @@
 
 import re
 import shlex
-from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,13 +9,12 @@ import numpy as np
 import pytest
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, identify, simulate
-from ctid_cli.estimators.identification import costs_about_delay
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.pages.page import bibtex
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.storage.fit_file import read_fit
-from tests.reporting.parsed_page import Page
+from tests.reporting.parsed_page import alone
 
 HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
@@ -52,26 +50,15 @@ def page_of(result, measured, other, folder):
 def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
     text, again = page_of(*fitted, tmp_path)
     assert text == again  # what is read from the file draws the same page, to the byte
-    page = Page(text)
+    page = alone(text)
     titles = ["Before using it", "Data", "Model", "Output", "Residuals", "Responses", "Poles", "Delay", "Provenance"]
-    for title in [*titles, "How to cite"]:
-        assert title in page.text
+    assert all(title in page.text for title in [*titles, "How to cite", FitResult.fine])
     assert page.tags["svg"] == 8
     assert not fitted[0].warnings
-    assert "The search ended well, the residuals pass their tests, and no change" in page.text
     for words in ("natural_frequency_1", "95 % low", "without a model", "cost above the least", "@software{ctid"):
         assert words in page.text or words in text
-    assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
-    places = [value for name, value in page.attributes if name in ("href", "xlink:href", "src", "action")]
-    assert all(value.startswith("#") for value in places)
-    names = Counter(value for name, value in page.attributes if name == "id")
-    assert max(names.values()) == 1
-    assert {value[1:] for value in places} <= names.keys()
-    assert not [name for name, _ in page.attributes if name.startswith("on")]
     assert page.text.count(HOSTILE) >= 5  # title, columns, note, units
     assert shlex.join(["ctid", "fit", HOSTILE, "away.csv"]) in page.text
-    assert "url(http" not in text
-    assert len(text) < 2_000_000
 
 
 def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
@@ -88,18 +75,6 @@ def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
     assert str(tmp_path) not in page
 
 
-def test_the_cost_about_the_delay_is_least_at_the_estimate(fitted):
-    result = fitted[0]
-    near = costs_about_delay(result)
-    assert near.delays[np.argmin(near.costs)] == pytest.approx(result.fit.model.delay, abs=1e-9)
-    assert near.costs.min() == pytest.approx(near.least, rel=1e-9)
-    inside = near.delays[near.costs <= near.allowed]
-    item = next(item for item in result.estimates if item.name == "delay")
-    step = np.diff(near.delays).max()
-    assert abs(inside[0] - item.low) <= 1.5 * step
-    assert abs(inside[-1] - item.high) <= 1.5 * step
-
-
 def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
     rng = np.random.default_rng(3)
     t = 0.1 * np.arange(200)
@@ -108,9 +83,8 @@ def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
     result = identify([record], DelayProfile(1, 0, (0.5, 0.5)))
     text, again = page_of(result, measured, None, tmp_path)
     assert text == again
-    page = Page(text)
     assert '<section id="delay">' not in text
-    assert "no answer" in page.text.lower()
+    assert "no answer" in alone(text).text.lower()
 
 
 def test_what_a_fit_used_is_cited(fitted):

@@ -153,11 +153,6 @@ def test_parameters_and_derived_quantities_have_the_units_of_the_record(results)
     assert "natural_frequency_1_hz" not in {row.name for row in derived_of(fitted, Units("fortnight"))}
 
 
-def test_units_of_states_and_offsets():
-    units = ["out", "out/s", "out/s^2", "out", "out/in/s^3"]
-    assert [Units().of(name, 3, 1) for name in ("x1", "x2_2", "x3", "offset_1", "b1")] == units
-
-
 def test_units_of_several_files():
     assert Records([measurement(), measurement(units=(None, None, None))]).units == UNITS
     assert Records([measurement(units=(None, None, None))]).units == Units("s", "in", "out")

@@ -1,18 +1,15 @@
 """The page of a track: complete in itself, and safe whatever names files and columns have."""
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
-from ctid_cli.tones.residual import left_over
 from ctid_cli.tones.track import MissingLine, Track
-from tests.reporting.parsed_page import Page
+from tests.reporting.parsed_page import alone
 
 HOSTILE = "<script>alert(1)</script>&$x_{$\"'"
 T = 0.002 * np.arange(3000)
@@ -46,28 +43,15 @@ def page_of(followed, name=HOSTILE):
 
 def test_a_page_says_all_and_needs_nothing_but_itself():
     text = page_of(track())
-    page = Page(text)
-    for title in ("Before using it", "Data", "Tones", "Signal", "What the tones leave", "Provenance", "How to cite"):
-        assert title in page.text
+    page = alone(text)
+    titles = ("Before using it", "Data", "Tones", "Signal", "What the tones leave", "Provenance", "How to cite")
+    assert all(title in page.text for title in titles)
     assert page.tags["svg"] == 3
-    assert page.tags["script"] == page.tags["link"] == page.tags["img"] == page.tags["iframe"] == 0
-    places = [value for name, value in page.attributes if name in ("href", "xlink:href", "src", "action")]
-    assert all(value.startswith(("#", "data:image/png;base64,")) for value in places)
-    names = Counter(value for name, value in page.attributes if name == "id")
-    assert max(names.values()) == 1
-    assert not [name for name, _ in page.attributes if name.startswith("on")]
     assert page.text.count(HOSTILE) >= 4  # title, line of the record, note, reason
     assert "/far" not in text
     assert "ctid track away.csv" in page.text
-    for words in (
-        "19 Hz (amplitude 0.1",
-        "--tones 2",
-        "line that is missing",
-        "@article{rife1976",
-        "17.2 %",
-    ):
+    for words in ("19 Hz (amplitude 0.1", "--tones 2", "line that is missing", "@article{rife1976", "17.2 %"):
         assert words in text
-    assert len(text) < 2_000_000
     assert text == page_of(track())
 
 
@@ -76,12 +60,3 @@ def test_a_record_without_tones_and_one_of_unknown_phases_have_pages_too():
     assert "No tone was asked for" in page_of(nothing, "a.csv")
     unknown = page_of(track(phase=np.full((ROWS.size, 1), np.nan)), "a.csv")
     assert "Nowhere are all tones known" in unknown
-
-
-def test_what_is_left_is_the_line_that_is_missing():
-    left = left_over(signal().samples, signal().interval, track())
-    assert left.hertz[np.argmax(left.residual_spectrum)] == pytest.approx(19.0, abs=0.2)
-    assert left.residual_spectrum.max() == pytest.approx(0.1, rel=0.02)
-    assert left.signal_spectrum.max() == pytest.approx(2.0, rel=0.02)
-    assert left.root_mean_squares[1] == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.01), rel=0.03)
-    assert left.unknown.mean() < 0.05

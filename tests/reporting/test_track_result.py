@@ -9,24 +9,13 @@ import pandas as pd
 import pytest
 
 from ctid_cli.canonical import plain
-from ctid_cli.frequency.flags import Flag, flag_names
+from ctid_cli.frequency.flags import Flag
 from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
 from ctid_cli.reporting.track_plot import track_drawing
 from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
-from ctid_cli.tones.summary import summarise
-from ctid_cli.tones.track import MissingLine, Track
-
-ROWS = 40
-HERTZ = np.column_stack((np.linspace(9.0, 11.0, ROWS), np.full(ROWS, 30.0)))
-
-
-def make_track(flags=None, **known):
-    flags = np.zeros(ROWS, np.uint16) if flags is None else flags
-    omega = 2 * np.pi * HERTZ
-    omega[(flags & int(Flag.GAP)) > 0] = np.nan
-    amplitudes = np.full((ROWS, 2), [2.0, 0.5])
-    return Track.of(0.1 * np.arange(ROWS), omega, flags, 0.1, amplitudes=amplitudes, **known)
+from ctid_cli.tones.track import Track
+from tests.tones.made_tracks import HERTZ, ROWS, coming_later, make_track, some_invalid
 
 
 @pytest.fixture(scope="module")
@@ -34,26 +23,6 @@ def chosen():
     t = 0.002 * np.arange(2000)
     y = 2 * np.sin(2 * np.pi * 10 * t) + 0.5 * np.sin(2 * np.pi * 30 * t)
     return SampledSignal(y, 0.002, 5.0, "string.csv", "y", "t", "s", "Pa", ("A note.",))
-
-
-def some_invalid():
-    flags = np.zeros(ROWS, np.uint16)
-    flags[:10] = int(Flag.GAP)
-    flags[10:12] = int(Flag.UNCERTAIN | Flag.COMPLEX_ROOTS)
-    return flags
-
-
-def coming_later():
-    """Tones of which one is there for a part, with a line left over."""
-    flags = np.zeros((ROWS, 2), np.uint16)
-    flags[:20, 1] = int(Flag.ABSENT)
-    flags[20:25, 1] = int(Flag.LINE_LEFT)
-    lines = (MissingLine(2 * np.pi * 85.0, 0.9, 0.1), MissingLine(2 * np.pi * 120.0, 0.25, 0.02))
-    track = make_track(error=np.full((ROWS, 2), 0.01), window=np.full((ROWS, 2), 0.2))
-    omega = track.omega.copy()
-    omega[:20, 1] = np.nan
-    parts = {"error": track.error, "amplitudes": track.amplitudes, "window": track.window, "missing": lines}
-    return Track.of(track.t, omega, flags, 0.1, **parts)
 
 
 @pytest.mark.parametrize(
@@ -70,18 +39,6 @@ def test_printed(chosen, track, snapshot):
     assert result.summary() == snapshot
     json.dumps(plain(result.content()), allow_nan=False)
     assert result.drawing().saved().startswith(b"<?xml")
-
-
-def test_a_summary_is_over_valid_rows():
-    first, second = summarise(make_track(some_invalid()))
-    assert first.frequency_hz == pytest.approx(np.median(HERTZ[12:, 0]))
-    assert first.omega == pytest.approx(2 * np.pi * first.frequency_hz)
-    low, high = np.percentile(HERTZ[12:, 0], [16, 84])
-    assert first.spread_hz == pytest.approx((high - low) / 2)
-    assert (second.frequency_hz, second.spread_hz, second.amplitude) == (pytest.approx(30.0), 0.0, 0.5)
-    assert first.valid_percent == pytest.approx(70.0)
-    _, later = summarise(coming_later())
-    assert (later.valid_percent, later.begins, later.ends) == (75.0, pytest.approx(2.0), pytest.approx(3.9))
 
 
 def test_csv_and_hdf5_hold_the_same(chosen):
@@ -111,10 +68,6 @@ def test_csv_and_hdf5_hold_the_same(chosen):
         assert store["flags_1"].asstr()[()].tolist() == frame["flags_1"].fillna("").tolist()
 
 
-def test_names_of_flags():
-    assert flag_names(np.array([int(Flag.STARTING | Flag.GAP), 0], np.uint16)).tolist() == ["starting gap", ""]
-
-
 @pytest.mark.parametrize("tones", [1, 2, 7])
 def test_figure(tones):
     flags = some_invalid()
@@ -126,28 +79,3 @@ def test_figure(tones):
     assert b"#e4e4e4" in one  # the shade of what is not valid
     plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
     assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()
-
-
-def test_the_error_of_the_mean_counts_common_samples_once():
-    """One window as long as the record in all rows: the mean is as good as one row; windows apart: as sqrt(N) rows."""
-    error = np.full((ROWS, 2), 2 * np.pi * 0.01)
-    one = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.1 * ROWS)))
-    assert [tone.standard_error_hz for tone in one] == pytest.approx([0.01, 0.01])
-    apart = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.05)))
-    assert apart[0].standard_error_hz == pytest.approx(0.01 / np.sqrt(ROWS))
-    # Half of the windows in common with each neighbour: the variance of the mean is twice as large.
-    half = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.2)))
-    assert half[1].standard_error_hz == pytest.approx(0.01 * np.sqrt(2 / ROWS))
-    assert np.isnan(summarise(make_track())[0].standard_error_hz)
-
-
-@pytest.mark.parametrize(("accuracy", "bad"), [(None, [0, 1]), (0.011, [0, 0]), (0.005, [1, 1])])
-def test_a_row_whose_standard_error_is_too_large_is_not_valid(accuracy, bad):
-    hertz = np.full((ROWS, 2), 0.01)
-    hertz[:, 1] = 0.031 if accuracy is None else 0.01
-    track = make_track(error=2 * np.pi * hertz).of_accuracy(accuracy)
-    late = slice(25, None)  # the first tone is above 10 Hz there
-    assert (~track.valid[late]).mean(axis=0).tolist() == bad
-    assert (track.flags[late] & int(Flag.INACCURATE) > 0).mean(axis=0).tolist() == bad
-    assert track.of_accuracy(1.0).valid.all()
-    assert make_track().of_accuracy(accuracy).valid.all()  # nothing is known to be too large

@@ -90,3 +90,18 @@ def test_noise_steps_and_pulses_are_no_spikes():
     assert not find_spikes(y).any()
     assert not find_spikes(np.full(100, np.nan)).any()
     assert not find_spikes(np.full(100, 3.0)).any()
+
+
+def test_what_is_left_is_the_line_that_is_missing():
+    y = 2.0 * np.sin(2 * np.pi * 12.0 * T) + 0.1 * np.sin(2 * np.pi * 19.0 * T) + NOISE
+    rows = 0.1 + 0.05 * np.arange(396)
+    shape = (rows.size, 1)
+    parts = {"error": np.full(shape, 0.01), "amplitudes": np.full(shape, 2.0), "window": np.full(shape, 0.2)}
+    phase = (2 * np.pi * 12.0 * rows)[:, None]
+    omega = np.full(shape, 2 * np.pi * 12.0)
+    left = left_over(y, INTERVAL, Track.of(rows, omega, np.zeros(rows.size, np.uint16), 0.05, phase=phase, **parts))
+    assert left.hertz[np.argmax(left.residual_spectrum)] == pytest.approx(19.0, abs=0.2)
+    assert left.residual_spectrum.max() == pytest.approx(0.1, rel=0.02)
+    assert left.signal_spectrum.max() == pytest.approx(2.0, rel=0.02)
+    assert left.root_mean_squares[1] == pytest.approx(np.hypot(0.1 / np.sqrt(2), 0.01), rel=0.03)
+    assert left.unknown.mean() < 0.05
