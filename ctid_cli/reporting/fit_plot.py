@@ -47,9 +47,10 @@ class FitFigures:
                 output = figure.add_subplot(grid[2 * k, :])
                 self.draw_output(output, k)
                 output.tick_params(labelbottom=False)
-                output.margins(x=0.0)
                 error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
                 self.draw_residuals(error, k)
+                for axes in (output, error):
+                    axes.margins(x=0.0)
                 self._name_panels(output, error, k)
             self.draw_autocorrelation(figure.add_subplot(grid[-1, 0]))
             self.draw_profile(figure.add_subplot(grid[-1, 1]))
@@ -157,7 +158,7 @@ class FitFigures:
             axes.set_ylim(low, high * (high / low) ** 0.35)
         else:
             axes.set_ylim(low, high + 0.35 * (high - low))
-        name_axes(axes, f"delay [{units.time}]", units.label("cost", units.square), legend="upper right")
+        name_axes(axes, f"delay [{units.time}]", units.label("cost", f"({units.output})²"), legend="upper right")
 
 
 def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals: Array, units: Units) -> None:
