@@ -12,10 +12,8 @@ from ctid_cli.cli._options import FormatOptions, RecordOptions, flag
 from ctid_cli.signals.treatment import Hold, InitialState, Offset
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ctid_cli.reporting.compare_result import NamedFit
     from ctid_cli.signals.measurement import Measurement
+    from ctid_cli.storage.fit_file import StoredFit
 
 
 @guarded
@@ -35,29 +33,31 @@ def compare(
     """
     from ctid_cli.estimators import model_comparison
     from ctid_cli.reporting.column_file import frame_bytes
-    from ctid_cli.reporting.compare_result import ModelComparison, named_fits
+    from ctid_cli.reporting.compare_result import ModelComparison, short_names
+    from ctid_cli.storage.fit_file import read_fits
 
     written = [out / "comparison.csv", out / "comparison.svg"]
     refuse_overwriting([*files, on], written)
-    models = named_fits(files)
-    measurement = _record(models, on, columns, hold)
-    fits = [each.fit for each in models]
-    found = model_comparison.compare(fits, measurement.record, initial_state=initial_state, offset=offset)
-    result = ModelComparison(models, measurement, found)
+    short_names(files)  # refuses a file that is given twice
+    fits = read_fits(files)
+    measurement = _record(fits[0], on, columns, hold)
+    models = [each.result for each in fits]
+    found = model_comparison.compare(models, measurement.record, initial_state=initial_state, offset=offset)
+    result = ModelComparison(fits, measurement, found)
     write_files({written[0]: frame_bytes(result.to_frame()), written[1]: result.drawing().saved()})
     emit(result, form.form, written)
 
 
-def _record(models: Sequence[NamedFit], file: Path, columns: RecordOptions, hold: Hold | None) -> Measurement:
-    """Read a record: by the column names of the fits where the file has them and none are named."""
+def _record(fit: StoredFit, file: Path, columns: RecordOptions, hold: Hold | None) -> Measurement:
+    """Read a record: by the column names of the fit where the file has them and none are named."""
     from dataclasses import replace
 
-    from ctid_cli.reporting.compare_result import require_units
     from ctid_cli.signals.measurement import open_table
 
-    own = models[0].columns
+    own = fit.content["records"][0]["columns"]
     if not (columns.time or columns.input or columns.output) and set(own.values()) <= set(open_table(file).names):
         columns = replace(columns, time=own["time"], input=own["input"], output=own["output"])
-    found = columns.read(file, hold or models[0].hold)
-    require_units(found.record.name, models[0], found.time_unit, found.input_unit, found.output_unit)
+    found = columns.read(file, hold or fit.content["settings"]["hold"])
+    units = {"time": found.time_unit, "input": found.input_unit, "output": found.output_unit}
+    fit.units.require_same(found.record.name, units)
     return found

@@ -1,8 +1,10 @@
 """Units of a record, and those that follow for the parameters of a model."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.sampled_signal import SECONDS
@@ -20,6 +22,13 @@ class Units:
     time: str = "s"
     input: str = INPUT
     output: str = OUTPUT
+
+    def require_same(self, where: str, others: Mapping[str, str | None], what: str = "the model is") -> None:
+        """Refuse signals in other units than a model has; a label that is missing contradicts nothing."""
+        for role, unit in others.items():
+            own = getattr(self, role)
+            if unit not in (None, own) and self.is_known(own) and self.is_known(str(unit)):
+                raise DataError(f"{where}: the {role} is in {unit}, and {what} in {own}; convert one of them")
 
     @property
     def gain(self) -> str:

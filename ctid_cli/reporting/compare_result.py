@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from ctid_cli.errors import DataError, UsageError
+from ctid_cli.errors import UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
-from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.units import Units
 from ctid_cli.reporting.document import Column, Result, Section
 from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, name_axes, outline, plain
 from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.storage.fit_file import read_fit
+from ctid_cli.storage.fit_file import StoredFit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,30 +33,6 @@ MEANING = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class NamedFit:
-    """A stored fit with the name that tells it from others."""
-
-    name: str
-    path: Path
-    fit: FittedModel
-    units: Units
-    hold: Any
-    columns: Mapping[str, str]
-
-
-def named_fits(files: Sequence[Path]) -> list[NamedFit]:
-    """Read stored fits; all must have the same units."""
-    found = []
-    for file, name in zip(files, short_names(files), strict=True):
-        stored = read_fit(file)
-        content = stored.content
-        units, columns = Units(**content["units"]), content["records"][0]["columns"]
-        found.append(NamedFit(name, file, stored.result, units, content["settings"]["hold"], columns))
-        require_units(file.name, found[0], units.time, units.input, units.output, "the models")
-    return found
-
-
 def short_names(files: Sequence[Path]) -> list[str]:
     """Return file names where they differ, with folders where they do not."""
     # A file that is called fit.json, as most are, goes by its folder.
@@ -70,31 +45,29 @@ def short_names(files: Sequence[Path]) -> list[str]:
     raise UsageError(f"{twice} is given twice; a model is compared with others")
 
 
-def require_units(
-    where: str, model: NamedFit, time: str | None, input: str | None, output: str | None, what: str = "the model"
-) -> None:
-    """Refuse signals in other units than a model has; a label that is missing contradicts nothing."""
-    for role, unit in {"time": time, "input": input, "output": output}.items():
-        own = getattr(model.units, role)
-        known = unit is not None and model.units.is_known(own) and model.units.is_known(unit)
-        if known and unit != own:
-            verb = "is" if what == "the model" else "are"
-            raise DataError(f"{where}: the {role} is in {unit}, and {what} {verb} in {own}; convert one of them")
-
-
 @dataclass(frozen=True, eq=False)
 class ModelComparison(Result):
     """Stored fits on the same samples of one record."""
 
     schema = "ctid-compare-1"
 
-    models: Sequence[NamedFit]
+    fits: Sequence[StoredFit]
     measurement: Measurement
     found: Sequence[ModelOnRecord]
 
+    @property
+    def units(self) -> Units:
+        """Units that all models share."""
+        return self.fits[0].units
+
+    @property
+    def names(self) -> list[str]:
+        """Names that tell the fits apart."""
+        return short_names([fit.path for fit in self.fits])
+
     def sections(self) -> list[Section]:
         """Return the models, the best fit first, and the samples that they are compared on."""
-        record, one, unit = self.measurement.record, self.found[0], self.models[0].units
+        record, one, unit = self.measurement.record, self.found[0], self.units
         every = "all" if one.count == record.n_samples else f"{one.count} of"
         samples = (
             f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
@@ -122,34 +95,38 @@ class ModelComparison(Result):
         """Return what is told of each model."""
         return [
             {
-                "name": model.name,
-                "file": str(model.path),
+                "name": name,
+                "file": str(fit.path),
                 **picked(one, ("fit_percent", "r2", "rms")),
                 "samples": one.count,
                 **picked(one, ("initial_state", "offset")),
                 **(dict.fromkeys(VERDICTS) if one.tests is None else picked(one.tests, VERDICTS)),
             }
-            for model, one in zip(self.models, self.found, strict=True)
+            for name, fit, one in zip(self.names, self.fits, self.found, strict=True)
         ]
 
     def to_frame(self) -> pd.DataFrame:
         """Return the measured output, and that of each model, at the samples that all of them have."""
-        units, first = self.models[0].units, self.found[0]
+        units, first = self.units, self.found[0]
         columns = {f"t [{units.time}]": first.t, units.label("measured", units.output): first.measured}
-        for model, one in zip(self.models, self.found, strict=True):
-            columns[units.label(f"simulated {model.name}", units.output)] = one.simulated
+        for name, one in zip(self.names, self.found, strict=True):
+            columns[units.label(f"simulated {name}", units.output)] = one.simulated
         return pd.DataFrame(columns)
 
     def content(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
         t = self.found[0].t
         used = {"count": t.size, "first": float(t[0]), "last": float(t[-1])}
-        units = asdict(self.models[0].units)
-        return {"record": self.measurement.record.name, "units": units, "samples": used, "models": self._rows()}
+        return {
+            "record": self.measurement.record.name,
+            "units": asdict(self.units),
+            "samples": used,
+            "models": self._rows(),
+        }
 
     def drawing(self) -> Drawing:
         """Return the figure of the outputs above the residuals."""
-        units, record = self.models[0].units, self.measurement.record
+        units, record, names = self.units, self.measurement.record, self.names
 
         def draw(figure: Figure) -> None:
             upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.8, 1.0])
@@ -157,7 +134,7 @@ class ModelComparison(Result):
             for k in np.argsort([-one.fit_percent for one in self.found], kind="stable").tolist():
                 one, style = self.found[k], {**look(k), "marker": "none", "linewidth": 1.2}
                 used = np.searchsorted(record.t, one.t)
-                label = f"{plain(self.models[k].name)}: {one.fit_percent:.4g} %"
+                label = f"{plain(names[k])}: {one.fit_percent:.4g} %"
                 upper.plot(*curve(record.t, used, one.simulated), label=label, **style)
                 lower.plot(*curve(record.t, used, one.residuals), **style | {"linewidth": 0.7})
             lower.axhline(0.0, color=DARK, linewidth=0.6)

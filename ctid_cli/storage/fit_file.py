@@ -7,7 +7,7 @@ for.
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -17,6 +17,7 @@ import numpy as np
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.identification import Identification, laid_out_validation
 from ctid_cli.inference.robust_loss import Weighting
+from ctid_cli.inference.units import Units
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.measurement import Measurement, read_measurement
@@ -116,6 +117,11 @@ class StoredFit:
     result: Identification
     sources: tuple[RecordSource, ...]
     validation_source: RecordSource | None
+
+    @property
+    def units(self) -> Units:
+        """Units of the records."""
+        return Units(**self.content["units"])
 
     @cached_property
     def measurements(self) -> tuple[Measurement, ...]:
@@ -220,6 +226,14 @@ def read_fit(
     if result.validation is not None:
         result.validation.leave_out(stored._applied)
     return stored
+
+
+def read_fits(files: Sequence[Path]) -> list[StoredFit]:
+    """Return several files; all must have the same units."""
+    found = [read_fit(file) for file in files]
+    for fit in found:
+        found[0].units.require_same(fit.path.name, asdict(fit.units), "the models are")
+    return found
 
 
 def _require_sources(content: Mapping[str, Any]) -> None:
