@@ -1,100 +1,17 @@
 """``ctid accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
 
-import json
 import re
-from pathlib import Path
 
-import numpy as np
 import pytest
-import yaml
 
-from ctid_cli.inference.bounds import cramer_rao_bound, limiting_accuracy
-from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.controller import DiscreteController
-from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.plan import build_plan
-from ctid_cli.specification.load import load_spec
-
-HERE = Path(__file__).parent
-#: The simulation examples of Gonzalez, Classens, Rojas, Welsh and Oomen, sections 6.1 and 6.2, and a single mode.
-BASES = {
-    name: (HERE / "specifications" / f"{name}.yaml").read_text(encoding="utf-8") for name in ("open", "closed", "one")
-}
-CASES = yaml.safe_load((HERE / "accuracy.yaml").read_text(encoding="utf-8"))
+from tests.running.accuracy_cases import CASES, specification
 
 #: Warnings about what these experiments do on purpose.
 EXPECTED = re.compile("direct: ignores the loop|: is taken as |can only come near|do not hold the delay")
 
 
-@pytest.fixture
-def accuracy(ctid, tmp_path):
-    """What the command prints of a specification with changes."""
-
-    def call(case, *options):
-        content = BASES[CASES[case]["of"]]
-        for old, new in CASES[case].get("change", ()):
-            assert content.count(old) == 1
-            content = content.replace(old, new)
-        (tmp_path / "spec.yaml").write_text(content, encoding="utf-8")
-        done = ctid("accuracy", tmp_path / "spec.yaml", *options)
-        assert all(EXPECTED.search(line) for line in done.stderr.splitlines())
-        return json.loads(done.stdout)["estimates"] if options else done.stdout
-
-    return call
-
-
 @pytest.mark.parametrize("case", CASES)
-def test_printed(accuracy, snapshot, case):
-    assert accuracy(case) == snapshot
-
-
-def errors(estimates, estimator, k=-1):
-    """Standard errors of an estimator at one of the lengths, with the number of samples."""
-    entry = [entry for entry in estimates if entry["estimator"] == estimator][k]
-    return np.array([p["standard_error"] for p in entry["parameters"]]), entry["samples"]
-
-
-def variances(estimates, estimator, letter, k=-1):
-    """N times the variances of the parameters whose name ends so."""
-    found, samples = errors(estimates, estimator, k)
-    names = next(entry for entry in estimates if entry["estimator"] == estimator)["parameters"]
-    return [samples * e**2 for e, p in zip(found, names, strict=True) if p["name"].endswith(letter)]
-
-
-def test_the_printed_variances_of_the_paper(accuracy):
-    found = accuracy("open loop, coloured noise", "--json")
-    for k in (1, 2):
-        np.testing.assert_allclose(variances(found, "sum", "b0", k), [35.60, 2.700, 0.4405, 0.2240], rtol=3e-4)
-    np.testing.assert_allclose(variances(found, "srivc", "b0"), [36.75, 3.645, 0.5341, 0.2322], rtol=3e-4)
-    # Of short records from data sets, which is another way.
-    ratios = np.array(variances(found, "sum", "b0", 0)) / variances(found, "sum", "b0")
-    assert 1e-3 < np.abs(ratios - 1).max() < 0.4
-    found = accuracy("closed loop", "--json")
-    np.testing.assert_allclose(variances(found, "sum", "a2"), [0.035010, 1.52180e-5], rtol=1e-4)
-    np.testing.assert_allclose(variances(found, "clsrivc", "a2"), [0.090118, 2.49911e-5], rtol=1e-4)
-    direct, closed = variances(found, "direct", "b0"), variances(found, "clsrivc", "b0")
-    np.testing.assert_allclose(1.01 * np.array(direct), closed, rtol=1e-6)
-
-
-def test_where_the_reference_enters(accuracy):
-    plant = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
-    controller = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
-    signals = {"standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 19650, "enters": "input"}
-    expected = limiting_accuracy(plant, 0.05, controller, **signals).standard_errors
-    np.testing.assert_allclose(errors(accuracy("enters at the input", "--json"), "sum")[0], expected)
-
-
-def test_different_ways_to_the_same_numbers(accuracy, tmp_path):
-    """A bound averaged over data sets; white noise of another kind; as many parameters in both forms."""
-    found, _ = errors(accuracy("an estimated delay", "--json"), "known")
-    bounds = []
-    plan = build_plan(load_spec(tmp_path / "spec.yaml"))
-    for replicate in range(3):
-        record = plan.data_cells[0].dataset(replicate).record
-        level = np.sqrt(np.mean(record.noise_free**2) / 10)
-        bounds.append(cramer_rao_bound(TransferFunction([2.0], [0.25, 0.7, 1.0], 0.35), record, level, 2.0))
-    np.testing.assert_allclose(found, np.sqrt(np.diag(np.mean(bounds, axis=0))), rtol=1e-6)
-    limit, levels = (errors(accuracy(case, "--json"), "known")[0] for case in ("many lengths", "an input of levels"))
-    np.testing.assert_allclose(limit * np.sqrt(20000 / 6000), levels, rtol=0.05)
-    both = accuracy("a fraction and its submodels", "--json")
-    np.testing.assert_allclose(errors(both, "known")[0], errors(both, "sum")[0])
+def test_printed(ctid, tmp_path, snapshot, case):
+    done = ctid("accuracy", specification(case, tmp_path))
+    assert all(EXPECTED.search(line) for line in done.stderr.splitlines())
+    assert done.stdout == snapshot
