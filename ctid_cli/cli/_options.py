@@ -5,8 +5,10 @@ A parameter of a command whose type is a dataclass stands for the options that i
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -59,9 +61,25 @@ def flag(name: str, help: str, metavar: str | None = None, **more: Any) -> Any:
     return typer.Option(name, help=help, metavar=metavar, **more)
 
 
+def finite(text: str) -> float:
+    """A finite number."""
+    with contextlib.suppress(ValueError):
+        if math.isfinite(float(text)):
+            return float(text)
+    raise typer.BadParameter(f"must be a finite number, not {text!r}")
+
+
+def positive(text: str) -> float:
+    """A positive number whose reciprocal is finite too."""
+    value = finite(text)
+    if not (value > 0 and math.isfinite(1.0 / value)):
+        raise typer.BadParameter(f"must be a positive number, not {text!r}")
+    return value
+
+
 TimeColumn = Annotated[str | None, flag("--time", "Column of the times.", "NAME")]
-From = Annotated[float | None, flag("--from", "First instant to use [unit of the file].", "TIME")]
-To = Annotated[float | None, flag("--to", "Last instant to use.", "TIME")]
+From = Annotated[float | None, flag("--from", "First instant to use [unit of the file].", "TIME", parser=finite)]
+To = Annotated[float | None, flag("--to", "Last instant to use.", "TIME", parser=finite)]
 Records = Annotated[
     list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,31 +53,30 @@ class JudgingOptions:
 
     validate: Validate = None
     bootstrap: Annotated[
-        int | None, flag("--bootstrap", "Compute bootstrap intervals from this number of draws.", "DRAWS")
+        int | None, flag("--bootstrap", "Intervals from this number of simulated noises.", "DRAWS")
     ] = None
-    predict: Annotated[int | None, flag("--predict", "Fit of predictions K samples ahead, with --noise.", "K")] = None
+    predict: Annotated[
+        int | None, flag("--predict", "Fit of predictions K samples ahead, with --noise.", "K", min=1)
+    ] = None
 
     @property
     def draws(self) -> dict[str, Any]:
         """The intervals that are asked for, as options of a fit."""
         return {} if self.bootstrap is None else {"covariance": "bootstrap", "bootstrap_draws": self.bootstrap}
 
-    def check(self, noise: str) -> None:
-        """Refuse too few draws, and predictions of what cannot be predicted."""
+    def check(self, noise: str, lengths: Mapping[str, int]) -> None:
+        """Refuse too few draws, predictions of white noise, and those farther ahead than a record is long."""
         from ctid_cli.estimation.common import LEAST_DRAWS
 
         if self.bootstrap is not None and self.bootstrap < LEAST_DRAWS:
             found = f"got {self.bootstrap}"
             raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; {found}")
-        if self.predict is not None and self.predict < 1:
-            raise UsageError(f"--predict must be at least 1 sample, for example 10; got {self.predict}")
-        if self.predict is not None and noise == "white":
+        if self.predict is None:
+            return
+        if noise == "white":
             raise UsageError("--predict needs a noise model: white noise cannot be predicted; add --noise auto")
-
-    def check_records(self, lengths: dict[str, int]) -> None:
-        """Refuse predictions farther ahead than a record is long."""
         for name, n in lengths.items():
-            if self.predict is not None and self.predict >= n:
+            if self.predict >= n:
                 wrong = f"--predict {self.predict} is as long as {name} with its {n} samples or longer"
                 raise UsageError(f"{wrong}; give a smaller number, for example 10")
 
@@ -102,7 +102,7 @@ def fit(
     from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 
-    judging.check(treatment.noise)
+    judging.check(treatment.noise, {})
     loop.check()
     asked = Asked(model, treatment, loop.use)
     options = options_of(asked)
@@ -110,7 +110,7 @@ def fit(
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
     hold = "zoh" if treatment.hold == "auto" else treatment.hold
     records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
-    judging.check_records({record.name: record.n_samples for record in records.all})
+    judging.check(treatment.noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
         draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
         found = identify(records.data, options, records.validation_record, **draws)

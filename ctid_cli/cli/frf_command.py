@@ -10,6 +10,9 @@ from ctid_cli.cli._options import FormatOptions, RecordOptions, flag
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import Hold, ResponseMethod
 
+#: The option of each method.
+OPTIONS = {"periodic": "--period", "local-polynomial": "--width", "welch": "--segment"}
+
 
 @guarded
 def frf(
@@ -20,9 +23,13 @@ def frf(
     columns: RecordOptions,
     form: FormatOptions,
     method: Annotated[ResponseMethod, flag("--method", "How the response is estimated.")] = "auto",
-    period: Annotated[int | None, flag("--period", "Period of the input, if it is not found.", "SAMPLES")] = None,
-    width: Annotated[int | None, flag("--width", "Half-width of the local polynomials, 4 or more.", "LINES")] = None,
-    segment: Annotated[int | None, flag("--segment", "Length of the segments of Welch's method.", "SAMPLES")] = None,
+    period: Annotated[
+        int | None, flag("--period", "Period of the input, if it is not found.", "SAMPLES", min=2)
+    ] = None,
+    width: Annotated[int | None, flag("--width", "Half-width of the local polynomials.", "LINES", min=4)] = None,
+    segment: Annotated[
+        int | None, flag("--segment", "Length of the segments of Welch's method.", "SAMPLES", min=1)
+    ] = None,
     hold: Annotated[Hold, flag("--hold", "The input between its samples.")] = "zoh",
     out: Annotated[Path, flag("--out", "Folder for frf.csv and frf.svg.", "DIR")] = Path("."),
 ) -> None:
@@ -54,21 +61,12 @@ def frf(
 
 
 def _method(method: ResponseMethod, period: int | None, width: int | None, segment: int | None) -> ResponseMethod:
-    """Return the method that the options belong to, and refuse those of two methods and values that are too small."""
-    options: tuple[tuple[str, ResponseMethod, int | None, int], ...] = (
-        ("--period", "periodic", period, 2),
-        ("--width", "local-polynomial", width, 4),
-        ("--segment", "welch", segment, 1),
-    )
-    owners: list[ResponseMethod] = []
-    for name, owner, value, least in options:
-        if value is None:
-            continue
+    """Return the method that the options belong to, and refuse those of two methods."""
+    values: dict[ResponseMethod, int | None] = {"periodic": period, "local-polynomial": width, "welch": segment}
+    owners = [owner for owner, value in values.items() if value is not None]
+    for owner in owners:
         if method not in ("auto", owner):
-            raise UsageError(f"{name} belongs to --method {owner}, not to {method}")
-        if value < least:
-            raise UsageError(f"{name} must be {least} or more, not {value}")
-        owners.append(owner)
+            raise UsageError(f"{OPTIONS[owner]} belongs to --method {owner}, not to {method}")
     if len(owners) > 1:
         raise UsageError(f"--period, --width and --segment belong to different methods: {' and '.join(owners)}")
     return owners[0] if owners else method

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
-from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To, flag
+from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To, flag, positive
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from ctid_cli.signals.sampled_signal import SampledSignal
     from ctid_cli.storage.track_file import Reading
     from ctid_cli.tones.track import Track
@@ -28,8 +25,8 @@ class SignalOptions:
 
     time: TimeColumn = None
     signal: Annotated[str | None, flag("--signal", "Column or channel to use.", "NAME")] = None
-    interval: Annotated[float | None, flag("--interval", "Sampling interval.", "SECONDS")] = None
-    rate: Annotated[float | None, flag("--rate", "In place of the interval.", "HERTZ")] = None
+    interval: Annotated[float | None, flag("--interval", "Sampling interval.", "SECONDS", parser=positive)] = None
+    rate: Annotated[float | None, flag("--rate", "In place of the interval.", "HERTZ", parser=positive)] = None
     start: From = None
     stop: To = None
 
@@ -39,10 +36,6 @@ class SignalOptions:
 
         if self.interval is not None and self.rate is not None:
             raise UsageError("--interval and --rate say the same; give one of them")
-        _require_positive("number", {"--interval": self.interval, "--rate": self.rate})
-        for name, value in (("--from", self.start), ("--to", self.stop)):
-            if value is not None and not math.isfinite(value):
-                raise UsageError(f"{name} must be an instant, not {value:g}")
         interval = self.interval if self.rate is None else 1.0 / self.rate
         return Reading(self.time, self.signal, interval, self.start, self.stop)
 
@@ -52,26 +45,24 @@ class ToneOptions:
     """How tones are followed; None where it is chosen from the record."""
 
     tones: Annotated[str, flag("--tones", "Number of sinusoids, or auto.", "N")] = "auto"
-    every: Annotated[float | None, flag("--every", "Time between rows; about 1000 rows by default.", "SECONDS")] = None
-    window: Annotated[float | None, flag("--window", "Length of the windows.", "SECONDS")] = None
+    every: Annotated[
+        float | None, flag("--every", "Time between rows; about 1000 rows by default.", "SECONDS", parser=positive)
+    ] = None
+    window: Annotated[float | None, flag("--window", "Length of the windows.", "SECONDS", parser=positive)] = None
     accuracy: Annotated[
         float | None,
-        flag("--accuracy", "Largest standard error of a valid row; .001 of the tone's frequency if not given.", "HZ"),
+        flag(
+            "--accuracy", "Largest standard error of a valid row; .001 of its tone if not given.", "HZ", parser=positive
+        ),
     ] = None
-
-    def require_sensible(self) -> None:
-        """Refuse what no tones can be followed with."""
-        from ctid_cli.tones.constants import MOST_ASKED
-
-        _require_positive("number of seconds", {"--every": self.every, "--window": self.window})
-        _require_positive("number of hertz", {"--accuracy": self.accuracy})
-        if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_ASKED):
-            raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {self.tones!r}")
 
     def follow(self, record: SampledSignal) -> Track:
         """Return the track of a record."""
+        from ctid_cli.tones.constants import MOST_ASKED
         from ctid_cli.tones.track import track as follow
 
+        if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_ASKED):
+            raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {self.tones!r}")
         tones = None if self.tones == "auto" else int(self.tones)
         try:
             with RecordProgress(Path(record.file).name) as tell:
@@ -97,7 +88,6 @@ def track(
     a page of. All the rest is chosen from the record, and printed.
     """
     reading = part.reading()
-    options.require_sensible()
     written = [out / f"track.{'h5' if hdf5 else 'csv'}", out / "track.svg", out / "track.json"]
     refuse_overwriting([file], written)
     record = reading.read(file)
@@ -122,13 +112,6 @@ def track(
     table = (hdf5_bytes if hdf5 else frame_bytes)(result.to_frame())
     write_files(dict(zip(written, (table, drawn.result(), text.encode() + b"\n"), strict=True)))
     emit(result, form.form, written)
-
-
-def _require_positive(what: str, options: Mapping[str, float | None]) -> None:
-    """Refuse options that are not positive, or so small that their reciprocal is infinite."""
-    for name, value in options.items():
-        if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
-            raise UsageError(f"{name} must be a positive {what}, not {value:g}")
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
