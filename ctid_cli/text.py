@@ -21,6 +21,13 @@ def count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
+def probability(p: float) -> str:
+    """A p-value: of a tiny one nobody believes the digits, and of none there is a dash."""
+    if p != p:
+        return "p = -"
+    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+
+
 def wrapped(text: str, indent: str = "", hanging: str | None = None, width: int = WIDTH) -> str:
     """Return a paragraph, with another indent for all lines but the first if one is given."""
     return textwrap.fill(

@@ -64,7 +64,8 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            error.message = error.message.removeprefix("Value error, ")
+            said = error.message.removeprefix("Value error, ")
+            error.message = said.replace("Input should be greater than or equal to", "must be at least")
             raise
 
 

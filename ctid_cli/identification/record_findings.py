@@ -11,7 +11,7 @@ from ctid_cli.inference.record_facts import FEWEST_SAMPLES, HIGHEST_ORDER, LONG_
 from ctid_cli.inference.record_tests import LEVEL, SlowTerm
 from ctid_cli.inference.response_estimates import Estimate
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
-from ctid_cli.text import count, listed
+from ctid_cli.text import count, listed, probability
 
 Level = Literal["ok", "note", "warning", "problem"]
 #: From the best to the worst.
@@ -40,10 +40,6 @@ def findings(facts: RecordFacts, time: str, input: str, output: str) -> list[Fin
 def _digits(x: float, digits: int) -> str:
     """Rounded, without an exponent that is not needed."""
     return f"{float(f'{x:.{digits}g}'):.12g}"
-
-
-def _probability(p: float) -> str:
-    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
 
 
 @dataclass(frozen=True)
@@ -149,7 +145,7 @@ class _Sentences:
 
     def _response(self) -> Finding:
         f = self.facts
-        p = _probability(f.answer_p_value)
+        p = probability(f.answer_p_value)
         if f.answer_p_value > NO_RESPONSE:
             text = (
                 f"No response of the output to the input is seen: noise of its colour follows the input as much ({p})."
@@ -188,10 +184,10 @@ class _Sentences:
         for topic, term, words in named:
             size = self._interval(term, self.output)
             if term.detected:
-                yield Finding("warning", topic, f"{words} {size}, {_probability(term.p_value)}.")
+                yield Finding("warning", topic, f"{words} {size}, {probability(term.p_value)}.")
             else:
                 missed.append(f"{topic} {size}")
-        p = _probability(beside.feedback_p_value)
+        p = probability(beside.feedback_p_value)
         if beside.feedback_p_value <= LEVEL:
             yield Finding("warning", "feedback", f"The input goes with the noise of the output, as in a loop ({p}).")
         else:

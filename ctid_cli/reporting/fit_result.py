@@ -37,7 +37,7 @@ from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.storage.fit_file import fit_text
-from ctid_cli.text import count
+from ctid_cli.text import count, probability
 from ctid_cli.written_files import write_file
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
@@ -233,7 +233,7 @@ class FitResult(PagedResult):
         ratios = zip(fit.parameter_names, estimate.error_ratios(fit.covariance).tolist(), strict=True)
         each = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in ratios if np.isfinite(ratio))
         text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {each}"
-        test = f"Hausman's test of the difference: p = {number(estimate.test.p_value, 2)}"
+        test = f"Hausman's test of the difference: {probability(estimate.test.p_value)}"
         yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
@@ -330,7 +330,7 @@ def _tested(test: ResidualTests) -> str:
     """Return the outcome of the tests of residuals; the warnings say what to do."""
     white = "white" if test.white else "not white"
     free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
-    return f"{white} (p = {number(test.whiteness_p_value, 2)}), {free} (p = {number(test.cross_p_value, 2)})"
+    return f"{white} ({probability(test.whiteness_p_value)}), {free} ({probability(test.cross_p_value)})"
 
 
 def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:
