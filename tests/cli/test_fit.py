@@ -35,16 +35,11 @@ def test_fit_prints_a_table_and_writes_two_files_here(ctid, record, tmp_path, mo
     text = ctid(*arguments).stdout
     assert sorted(path.name for path in Path().iterdir()) == ["fit.json", "fit.svg"]
     assert Path("fit.svg").read_bytes().startswith(b"<?xml")
-    for part in ("standard error", "delay", "at rest before the record", "\n\nWritten: fit.json, fit.svg\n"):
-        assert part in text
+    assert text.endswith("\n\nWritten: fit.json, fit.svg\n")
     stored = Path("fit.json").read_text(encoding="utf-8")
     # JSON is what is written, every time the same.
     assert ctid(*arguments, "--json").stdout == stored == Path("fit.json").read_text(encoding="utf-8")
-    content = json.loads(stored)
-    check_model(content["model"])
-    assert content["settings"]["delay_bounds"] == [0, 3]
-    assert {"r2", "status", "initial_state", "offset", "modes", "warnings"} <= content.keys()
-    assert {"name", "estimate", "standard_error", "low", "high", "unit", "status"} <= content["parameters"][0].keys()
+    check_model(json.loads(stored)["model"])
 
 
 def test_every_option_reaches_the_fit(ctid, tmp_path):
@@ -74,9 +69,6 @@ def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
     file = write(tmp_path / "noisy.csv", values)
     noise = ("--noise", "arma:1,1", "--predict", 5, "--validate", file)
     arguments = ("fit", file, "--poles", 2, "--delay", "0:3", *noise, "--out", tmp_path)
-    text = " ".join(ctid(*arguments).stdout.split())
-    for part in ("ARMA(1,1): v = C/D e", "fit 1 ahead", "fit 5 ahead", "Hausman's test", "innovations white (p ="):
-        assert part in text
     content = json.loads(ctid(*arguments, "--json").stdout)
     check_model(content["model"], 0.1)
     noise = content["noise_model"]
