@@ -126,23 +126,22 @@ class ModelComparison(Result):
 
     def drawing(self) -> Drawing:
         """Return the figure of the outputs above the residuals."""
+        return Drawing(8.0, 5.0, self._draw)
+
+    def _draw(self, figure: Figure) -> None:
         units, record, names = self.units, self.measurement.record, self.names
-
-        def draw(figure: Figure) -> None:
-            upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.8, 1.0])
-            upper.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.4, label="measured")
-            for k in np.argsort([-one.fit_percent for one in self.found], kind="stable").tolist():
-                one, style = self.found[k], {**look(k), "marker": "none", "linewidth": 1.2}
-                used = np.searchsorted(record.t, one.t)
-                label = f"{plain(names[k])}: {one.fit_percent:.4g} %"
-                upper.plot(*curve(record.t, used, one.simulated), label=label, **style)
-                lower.plot(*curve(record.t, used, one.residuals), **style | {"linewidth": 0.7})
-            lower.axhline(0.0, color=DARK, linewidth=0.6)
-            name_axes(upper, y=units.column(self.measurement, "output"), legend="best")
-            name_axes(lower, units.column(self.measurement, "time"), units.label("residual", units.output))
-            upper.margins(x=0.0)
-
-        return Drawing(8.0, 5.0, draw)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.8, 1.0])
+        upper.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.4, label="measured")
+        for k in np.argsort([-one.fit_percent for one in self.found], kind="stable").tolist():
+            one, style = self.found[k], {**look(k), "marker": "none", "linewidth": 1.2}
+            used = np.searchsorted(record.t, one.t)
+            label = f"{plain(names[k])}: {one.fit_percent:.4g} %"
+            upper.plot(*curve(record.t, used, one.simulated), label=label, **style)
+            lower.plot(*curve(record.t, used, one.residuals), **style | {"linewidth": 0.7})
+        lower.axhline(0.0, color=DARK, linewidth=0.6)
+        name_axes(upper, y=units.column(self.measurement, "output"), legend="best")
+        name_axes(lower, units.column(self.measurement, "time"), units.label("residual", units.output))
+        upper.margins(x=0.0)
 
 
 def _verdict(passed: bool | None, p_value: float | None) -> bool | None:

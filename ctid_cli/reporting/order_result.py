@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.judged import JudgedCandidate, judged_candidates
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.reporting.document import Column, Result, Section
-from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
 from ctid_cli.reporting.layout import picked
-from ctid_cli.reporting.order_plot import order_drawing
 from ctid_cli.reporting.records import Records
+from ctid_cli.text import count
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Rows of the printed table.
 ROWS = 12
@@ -53,8 +57,35 @@ class OrderSearchResult(Result):
 
     def drawing(self) -> Drawing:
         """Return the figure of what each structure gains."""
-        title = ", ".join(Path(each.record.name).name for each in self.records.measurements)
-        return order_drawing(self.choice, title)
+        return Drawing(7.5, 3.7, self._draw)
+
+    def _draw(self, figure: Figure) -> None:
+        """Draw error and criterion over all poles, a line for each number of zeros; with an integrator open marks."""
+        error, criterion = figure.subplots(1, 2)
+        best = self.choice.ranking.best
+        by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
+        for family in sorted({(each.options.zeros, each.options.integrators) for each in by_size}):
+            zeros, integrators = family
+            own = [each for each in by_size if (each.options.zeros, each.options.integrators) == family]
+            poles = [each.options.order for each in own]
+            look = dict(LOOKS[zeros % len(LOOKS)], markersize=5, linewidth=1.0)
+            look |= {"fillstyle": "none", "linestyle": ":"} if integrators else {}
+            label = f"{count(zeros, 'zero')}{', integrator' * bool(integrators)}"
+            error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
+            criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
+        if self.choice.seen:
+            chosen = {"color": MARK, "markersize": 13, "fillstyle": "none", "label": "chosen"}
+            criterion.plot(best.options.order, 0.0, "o", **chosen)
+        error.set_yscale("log")
+        # Linear where structures differ by little, logarithmic beyond.
+        criterion.set_yscale("symlog", linthresh=10.0)
+        for axes, name in ((error, "root mean square output error"), (criterion, "criterion above the least")):
+            name_axes(axes, "poles, integrators included", name)
+            axes.set_xticks(sorted({each.options.order for each in by_size}))
+        handles, labels = criterion.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 6), frameon=False)
+        names = ", ".join(Path(each.record.name).name for each in self.records.measurements)
+        error.set_title(plain(names), loc="left")
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each structure, the best first; the criterion is relative to that of the first row."""
