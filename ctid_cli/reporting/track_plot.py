@@ -54,7 +54,8 @@ def track_drawing(track: Track, start: float, unit: str | None, title: str) -> D
             name_axes(axes[-1], y=f"amplitude [{unit}]" if unit else "amplitude")
         axes[0].set_title(plain(title), loc="left")
         name_axes(axes[-1], "t [s]")
-        axes[-1].margins(x=0.0)
+        for panel in axes:
+            panel.margins(x=0.0)
 
     return Drawing(7.2, 1.1 + sum(heights), draw)
 
