@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ctid_cli import DelayProfile, Record, compare, identify, load_fit, read_record
+from ctid_cli import load_fit
 
 
 def test_models_are_compared_on_the_same_samples(ctid, home, tmp_path):
@@ -51,20 +51,3 @@ def test_exported_code_builds_the_model(ctid, home, tmp_path, options):
     np.testing.assert_allclose(np.ravel(b), model.numerator, rtol=1e-12)
     np.testing.assert_allclose(np.ravel(a), model.denominator, rtol=1e-12)
     assert built["delay"] == model.delay
-
-
-def test_models_are_compared_from_python_with_one_treatment(home):
-    record, other = read_record("record.csv"), read_record("other.csv")
-    options = DelayProfile(2, 0, (0.0, 3.0), offset="estimate")
-    fits = [identify([record], options), options.fit(record, None)]
-    own, plain = compare(fits, other)
-    assert (own.offset, plain.offset) == ("estimate", "none")
-    assert own.fit_percent > plain.fit_percent + 20
-    same = compare(fits, other, offset="estimate")
-    assert same[0].fit_percent == same[1].fit_percent == own.fit_percent
-    from_rest, treated = compare(fits[1:], other, initial_state="rest")[0], compare(fits[1:], other, offset="remove")[0]
-    assert treated.rms < from_rest.rms
-    states = compare([fits[0], options.fit(record, None)], other, initial_state="estimate")
-    assert (states[0].t == states[1].t).all()
-    gaps = Record(other.t, np.where(other.t == 2.0, np.nan, other.y), other.input)
-    assert compare(fits, gaps)[0].count == other.n_samples - 1
