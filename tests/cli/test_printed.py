@@ -51,6 +51,8 @@ def test_json(ctid, home, snapshot, command):
         found = json.loads(shown)
     except ValueError:
         found = [json.loads(line) for line in shown.splitlines()]
+    if "result" in found:
+        del found["result"]  # the fit as it is in Python, to be read again
     assert structure(found) == snapshot
 
 

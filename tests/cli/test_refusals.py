@@ -27,7 +27,7 @@ FILES = {
     "ms.csv": "t [ms],u [V],y [mm]\n" + "".join(f"{k},{k % 3},{k % 5}\n" for k in range(50)),
     "order.json": '{"kind": "ctid order"}',
     "newer.json": '{"kind": "ctid fit", "format": 99, "ctid": "9.0"}',
-    "loop.yaml": LOOP,
+    "controller.yaml": LOOP,
     "sign.yaml": LOOP.replace("0.8", "-0.8"),
     "relay.yaml": "loop: {controller: {relay: {amplitude: 1.0}}}\n",
     "nokey.yaml": "loop:\n  control: {}\n",
