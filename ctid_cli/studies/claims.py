@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import picked
-from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.reporting.study import last_part
+from ctid_cli.studies.catalogue import StudyResults
 
 if TYPE_CHECKING:
     import pandas as pd

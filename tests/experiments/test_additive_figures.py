@@ -9,9 +9,10 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.reporting.study import all_studies, find_study
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
+from ctid_cli.studies.catalogue import find_figures, require_results
 from experiments.additive import frequency_plot
 from experiments.additive.measures import errors_of
 from experiments.additive.parameter_plot import labelled, mse_svg, symbol

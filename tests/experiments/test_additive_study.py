@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.study import data_folder
+from ctid_cli.reporting.study import data_folder, find_study
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
+from ctid_cli.studies.catalogue import StudyResults, read_study
 from ctid_cli.studies.claims import check_claims, near, within
 from ctid_cli.studies.publishing import published_texts
 from tests.reporting.ideal_results import ideal_results
