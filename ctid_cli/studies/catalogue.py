@@ -1,16 +1,21 @@
 """Results of studies, and their figures by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
 from ctid_cli.reporting.study import DEFAULT_STUDY, Study, all_studies, find_study, last_part
 from ctid_cli.text import did_you_mean
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +49,17 @@ class StudyList(Result):
         """Return the studies for JSON."""
         return [{"study": each.name, "title": each.title, "experiments": dict(each.configs)} for each in self.studies]
 
-    def sections(self) -> list[Section]:
-        """Return a list of experiments for each study."""
+    def to_frame(self) -> pd.DataFrame:
+        """Return a row for each experiment."""
         import pandas as pd
 
-        return [
-            Section(
-                each.name,
-                [f"{each.title}. Specifications are in configs."],
-                frame=pd.DataFrame(each.configs.items(), columns=["experiment", "specification"]),
-            )
-            for each in self.studies
-        ]
+        rows = [item for each in self.studies for item in each.configs.items()]
+        return pd.DataFrame(rows, columns=["experiment", "specification"])
+
+    def sections(self) -> list[Section]:
+        """Return what each study is about, and the experiments of all."""
+        titles = [f"- {each.name}: {each.title}" for each in self.studies]
+        return [Section("", titles, self.to_frame(), notes=["Specifications are in configs."])]
 
 
 @dataclass(frozen=True)

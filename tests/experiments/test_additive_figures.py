@@ -58,10 +58,6 @@ def test_figure_2_is_the_sum_of_its_submodels(drawn):
     assert peaks == pytest.approx([1.39, 3.16, 5.77, 9.99], rel=0.04)
 
 
-def test_figure_2_is_drawn_the_same_every_time():
-    assert additive.figure_2() == additive.figure_2()
-
-
 def test_figure_6_says_that_it_is_simulated_and_ends_at_the_truth(drawn):
     additive.figure_6()
     assert "SIMULATED" in drawn[0].get_suptitle()

@@ -30,20 +30,6 @@ def source_of(file):
     return build_plan(published(file)).data_cells[0].source
 
 
-def test_there_are_as_many_specifications_as_the_study_has():
-    there = {file.name for file in (data_folder("configs") / "additive").glob("*.yaml")}
-    assert there >= set(FILES)
-
-
-@pytest.mark.parametrize("file", FILES)
-def test_specifications_are_warned_of_nothing_but_what_is_their_point(file):
-    ignoring = {"closed_loop.yaml": 1, "closed_loop_coloured.yaml": 2}
-    # Estimates are what the publication is about; intervals for white noise have an experiment of their own.
-    warnings = [said for said in published(file).warnings if "covariance: is for white noise" not in said]
-    assert len(warnings) == ignoring.get(file, 0)
-    assert all("ignores the loop" in warning for warning in warnings)
-
-
 @pytest.mark.parametrize("file", ["open_loop.yaml", "coverage_open_loop.yaml"])
 def test_the_open_loop_system_has_the_printed_poles(file):
     source = source_of(file)
