@@ -51,6 +51,14 @@ _STOPPED = {
 }
 
 
+Dask = Annotated[
+    str | None,
+    typer.Option(
+        "--dask", metavar="ADDRESS", help="Compute with the workers of the dask scheduler at tcp://host:port."
+    ),
+]
+
+
 class Failure(StrEnum):
     """How a stored estimate failed."""
 
@@ -140,12 +148,7 @@ def run(
         str | None,
         typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
     ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            "--dask", metavar="ADDRESS", help="Compute with the workers of the dask scheduler at tcp://host:port."
-        ),
-    ] = None,
+    dask: Dask = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would be computed, without computing it.")
     ] = False,

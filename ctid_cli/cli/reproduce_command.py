@@ -17,7 +17,7 @@ from ctid_cli.errors import MismatchError, UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ctid_cli.studies.catalogue import StudyFolder
+    from ctid_cli.reporting.study import Study
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def reproduce(
     computed all results. A study runs the code that its own specifications name, as part of the repository.
     """
     from ctid_cli.cli.experiment_commands import EndOptions, PlaceOptions, SpecOptions, run
-    from ctid_cli.studies.catalogue import all_studies, find_study, last_part
+    from ctid_cli.reporting.study import all_studies, find_study, last_part
 
     studies = [find_study(name) for name in names or all_studies()]
     match actions.chosen:
@@ -84,13 +84,13 @@ def reproduce(
             _compute_first(studies, jobs, update=first == "update_first")
 
 
-def _list(studies: Sequence[StudyFolder], form: FormatOptions) -> None:
+def _list(studies: Sequence[Study], form: FormatOptions) -> None:
     from ctid_cli.studies.catalogue import StudyList
 
     emit(StudyList(studies), form.form)
 
 
-def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> None:
+def _check(studies: Sequence[Study], out: Path, form: FormatOptions) -> None:
     """Test the claims of studies, and compare the tables of the one that has any."""
     from ctid_cli.reporting.comparison_result import check_tables
     from ctid_cli.reporting.study import DEFAULT_STUDY
@@ -110,9 +110,9 @@ def _check(studies: Sequence[StudyFolder], out: Path, form: FormatOptions) -> No
         raise MismatchError("; ".join(failed))
 
 
-def _publish(studies: Sequence[StudyFolder], out: Path) -> None:
+def _publish(studies: Sequence[Study], out: Path) -> None:
     """Publish studies, also those of which a claim does not hold."""
-    from ctid_cli.studies.catalogue import published_folder, read_study
+    from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.claims import check_claims
     from ctid_cli.studies.publishing import publish
 
@@ -120,13 +120,13 @@ def _publish(studies: Sequence[StudyFolder], out: Path) -> None:
     for study in studies:
         found = check_claims(read_study(study, out))
         publish(found, out)
-        typer.echo(published_folder(study))
+        typer.echo(study.published)
         failed += [f"does not hold: {claim.experiment}, {claim.claim}" for claim in found.failed]
     if failed:
         raise MismatchError("\n".join(failed))
 
 
-def _compute_first(studies: Sequence[StudyFolder], jobs: int | None, *, update: bool) -> None:
+def _compute_first(studies: Sequence[Study], jobs: int | None, *, update: bool) -> None:
     """Compute the first data sets of studies, and compare them with those committed or commit to them."""
     from ctid_cli.studies.first_estimates import compare, compute_first, read_first, write_first
 

@@ -16,7 +16,7 @@ from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import number, percent
 from ctid_cli.reporting.measures import records_of, settings_of
 from ctid_cli.reporting.results import shown_path
-from ctid_cli.reporting.study import Study, load_study
+from ctid_cli.reporting.study import Study, find_study
 from ctid_cli.reporting.study_table import build_tables, committed_tables, made_by, read_tables
 from ctid_cli.reporting.table_result import labels_of
 from ctid_cli.text import count, listed
@@ -123,7 +123,7 @@ class ComparisonResult(Result):
 
 def check_tables(names: Sequence[str], out: Path) -> ComparisonResult:
     """Compare tables of a results folder with the committed ones and with the article."""
-    study, file, tables = load_study(), committed_tables(), build_tables(names, out)
+    study, file, tables = find_study(), committed_tables(), build_tables(names, out)
     notes = list(tables.remarks)
     if file is not None and (maker := made_by(file.parent)):
         notes.append(f"the percentages in {shown_path(file)} were {maker}")

@@ -258,11 +258,8 @@ class VerificationResult(Result):
     def sections(self) -> list[Section]:
         """Return a line for each file."""
         verdict = "intact" if self.found.is_intact else "DAMAGED"
-        return [Section(f"{self.content()['experiment']}: {verdict}", frame=self.to_frame())]
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return what was found of each file."""
-        return pd.DataFrame([asdict(finding) for finding in self.found.findings])
+        files = pd.DataFrame([asdict(finding) for finding in self.found.findings])
+        return [Section(f"{self.content()['experiment']}: {verdict}", frame=files)]
 
     def content(self) -> dict[str, Any]:
         """Return what was found for JSON."""

@@ -1,16 +1,22 @@
-"""Published studies: their tables, and which experiments fill them."""
+"""The studies that are shipped with the program: one folder each, with its ``study.yaml``."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+import importlib
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
 from ctid_cli.custom_code import DATA
+from ctid_cli.errors import UsageError
+from ctid_cli.running.plan import Plan, build_plan
+from ctid_cli.specification.load import load_spec
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,6 +25,8 @@ InitialDelay = float | Literal["random"] | None
 
 #: The study that a bare table number means.
 DEFAULT_STUDY = "useful-redundancy"
+#: Name under which modules of studies are imported, whatever the working directory holds.
+_PACKAGE = "ctid_experiments"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,20 +46,104 @@ class StudyTable:
         return list(self.published["experiment"].unique())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Study:
-    """A published study."""
+    """One study; its fields are the keys of ``study.yaml``."""
 
-    name: str
-    source: str
-    success: str
-    published_data_sets: int
-    methods: Mapping[str, str]
-    must_reach: tuple[str, ...]
-    fields: Mapping[str, str]
-    #: ``config`` and ``sampling`` of every experiment.
+    study: str
+    title: str
+    #: Of every experiment ``config``, its specification relative to ``configs``, and ``sampling`` where tables show it.
     experiments: Mapping[str, Mapping[str, str]]
-    tables: Mapping[int, StudyTable]
+    #: Experiments that each figure is drawn from, by the last parts of their names; none where it is computed.
+    figures: Mapping[str, Sequence[str]]
+    #: Function in ``tables.py`` that writes each published text.
+    texts: Mapping[str, str]
+    #: Published numbers by file: a function in ``tables.py`` that makes ``rows`` of the results of one experiment, its
+    #: ``columns`` if not all keys, and its ``experiments`` if not all.
+    numbers: Mapping[str, Mapping[str, Any]]
+    #: Experiments that each function in ``claims.py`` is asked about, one call for each list.
+    claims: Mapping[str, Sequence[Sequence[str]]]
+    #: Settings with which the first data set of an experiment is computed again by a small reproduction.
+    first: Mapping[str, Sequence[str]]
+    #: ``authors``, ``title`` and ``identifier`` of the article that is reproduced.
+    source: Mapping[str, str] = field(default_factory=dict)
+    #: What the percentages of its tables count, and from how many data sets the published ones are.
+    success: str = ""
+    published_data_sets: int = 0
+    #: What each method does, and those that must reach the published percentages.
+    methods: Mapping[str, str] = field(default_factory=dict)
+    must_reach: Sequence[str] = ()
+    #: Key path in a specification of every setting that is a column of the tables.
+    fields: Mapping[str, str] = field(default_factory=dict)
+    printed_tables: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Name by which commands know it."""
+        return self.study
+
+    @property
+    def citation(self) -> str:
+        """The article that is reproduced; empty where there is none."""
+        return "{authors}: {title} ({identifier})".format(**self.source) if self.source else ""
+
+    @property
+    def folder(self) -> Path:
+        """Where its files lie."""
+        return data_folder("experiments") / self.name.replace("-", "_")
+
+    @property
+    def published(self) -> Path:
+        """The folder that it is published in, also in an installed package."""
+        return data_folder("results/published") / self.folder.name
+
+    @property
+    def configs(self) -> dict[str, str]:
+        """Specification of every experiment, relative to ``configs``."""
+        return {name: item["config"] for name, item in self.experiments.items()}
+
+    def experiment(self, short: str) -> str:
+        """An experiment by the last part of its name."""
+        return f"{self.name}/{short}"
+
+    def config(self, short: str) -> Path:
+        """Specification of one of its experiments."""
+        return data_folder("configs") / self.configs[self.experiment(short)]
+
+    def plan(self, short: str, overrides: Sequence[str] = ()) -> Plan:
+        """Plan of one of its experiments."""
+        return build_plan(load_spec(self.config(short), overrides))
+
+    def module(self, name: str) -> Any:
+        """One of its modules, always from the folder that is shipped with the program."""
+        if _PACKAGE not in sys.modules:
+            package = ModuleType(_PACKAGE)
+            package.__path__ = [str(data_folder("experiments"))]
+            sys.modules[_PACKAGE] = package
+        return importlib.import_module(f"{_PACKAGE}.{self.folder.name}.{name}")
+
+    @cached_property
+    def tables(self) -> dict[int, StudyTable]:
+        """Its published tables."""
+        return {number: self._table(number, table) for number, table in self.printed_tables.items()}
+
+    def _table(self, number: int, content: Mapping[str, Any]) -> StudyTable:
+        import pandas as pd
+
+        delays = tuple(delay if delay == "random" else float(delay) for delay in content["initial_delays"])
+        published = [
+            {
+                "experiment": row["experiment"],
+                **{field: float(row[field]) for field in self.fields},
+                "method": method,
+                "initial_delay": delay,
+                "published_percent": float(value),
+            }
+            for row in content["rows"]
+            for method, values in row["published"].items()
+            for delay, value in zip(delays, values, strict=True)
+        ]
+        return StudyTable(number, content["title"], delays, pd.DataFrame(published, dtype=object))
 
 
 def data_folder(name: str) -> Path:
@@ -60,48 +152,29 @@ def data_folder(name: str) -> Path:
 
 
 @cache
-def study_contents() -> dict[str, dict[str, Any]]:
-    """What ``study.yaml`` says of every study that is shipped with the program, by its name."""
+def all_studies() -> dict[str, Study]:
+    """Every study by its name."""
     files = sorted(data_folder("experiments").glob("*/study.yaml"))
     # Written in C where PyYAML was built with it: every run looks here for its tables.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    contents = [yaml.load(file.read_text(encoding="utf-8"), loader) for file in files]
-    return {content["study"]: content for content in contents}
+    studies = [Study(**yaml.load(file.read_text(encoding="utf-8"), loader)) for file in files]
+    return {study.name: study for study in studies}
 
 
-def load_study() -> Study:
-    """The study whose tables are published."""
-    content = study_contents()[DEFAULT_STUDY]
-    source = content["source"]
-    return Study(
-        name=DEFAULT_STUDY,
-        source=f"{source['authors']}: {source['title']} ({source['identifier']})",
-        must_reach=tuple(content["must_reach"]),
-        tables={number: _table(number, table, content["fields"]) for number, table in content["tables"].items()},
-        **{name: content[name] for name in ("success", "published_data_sets", "methods", "fields", "experiments")},
-    )
+def find_study(name: str = DEFAULT_STUDY) -> Study:
+    """A study by its name."""
+    studies = all_studies()
+    if name not in studies:
+        raise UsageError(f"there is no study named {name!r}; there are {', '.join(studies)}")
+    return studies[name]
+
+
+def last_part(experiment: str) -> str:
+    """An experiment's name without that of its study."""
+    return experiment.rpartition("/")[2]
 
 
 def tables_of(experiment: str) -> list[int]:
     """Numbers of the default study's tables that an experiment fills."""
-    tables = study_contents()[DEFAULT_STUDY]["tables"]
+    tables = find_study().printed_tables
     return [number for number, table in tables.items() if experiment in {row["experiment"] for row in table["rows"]}]
-
-
-def _table(number: int, content: dict[str, Any], fields: Mapping[str, str]) -> StudyTable:
-    import pandas as pd
-
-    delays = tuple(delay if delay == "random" else float(delay) for delay in content["initial_delays"])
-    published = [
-        {
-            "experiment": row["experiment"],
-            **{field: float(row[field]) for field in fields},
-            "method": method,
-            "initial_delay": delay,
-            "published_percent": float(value),
-        }
-        for row in content["rows"]
-        for method, values in row["published"].items()
-        for delay, value in zip(delays, values, strict=True)
-    ]
-    return StudyTable(number, content["title"], delays, pd.DataFrame(published, dtype=object))

@@ -22,7 +22,7 @@ from ctid_cli.reporting.results import (
     read_results,
     shown_path,
 )
-from ctid_cli.reporting.study import DEFAULT_STUDY, Study, StudyTable, data_folder, load_study
+from ctid_cli.reporting.study import Study, StudyTable, data_folder, find_study
 from ctid_cli.reporting.surprises import surprises
 from ctid_cli.reporting.table_result import (
     NOT_RUN,
@@ -36,6 +36,7 @@ from ctid_cli.reporting.table_result import (
     named,
     notes_of,
     percent_text,
+    pivot,
     time_of,
 )
 from ctid_cli.specification.load import load_spec
@@ -51,7 +52,7 @@ def build_tables(
     names: Sequence[str], out: Path, *, committed: bool = False, measures: Sequence[str] = ()
 ) -> TableResult:
     """Return the tables asked for; committed ones stand in for those of which nothing was run, if they may."""
-    study, tables = load_study(), []
+    study, tables = find_study(), []
     if measures:
         names = [results.experiment for results in experiments(names, out, "--measure")]
     for name in names or [study.name]:
@@ -175,7 +176,7 @@ def _sorted(study: Study, frame: pd.DataFrame) -> pd.DataFrame:
 
 def study_sections(study: Study, table: StudyTable, frame: pd.DataFrame, options: Sequence[str] = ()) -> list[Section]:
     """Return a published table, all its cells together, and what its columns mean."""
-    published = f"Published: {study.published_data_sets} data sets, {study.source}."
+    published = f"Published: {study.published_data_sets} data sets, {study.citation}."
     foot = f"{RULE} {TIME}. {published}"
     if startless := frame["method"][frame["initial_delay"].isna()].unique().tolist():
         shown = "one estimate per data set, shown under every initial delay"
@@ -202,19 +203,21 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
         "published": ["" if row["published_percent"] is None else number(row["published_percent"]) for row in rows],
         "time": [seconds(time_of(row)) if row["n"] else "" for row in rows],
     }
-    cells = labels.assign(n=place.map(frame["n"].groupby(place).agg(_sizes)), **texts)
-    down = [*labels, "n"]
-    order = pd.MultiIndex.from_tuples([(*one, line) for one in cells.set_index(down).index.unique() for line in LINES])
     delays = sorted(set(frame["initial_delay"].dropna()), key=lambda delay: (isinstance(delay, str), delay))
-    across = {}
-    for delay in delays or [None]:
-        own = cells[(frame["initial_delay"] == delay) | startless].set_index(down)[list(LINES)].stack()
-        across[delay_label(delay)] = own.reindex(order)
-    lines = pd.DataFrame(across, index=order).fillna("")
-    lines = lines[(lines != "").any(axis=1)].reset_index(names=[*down, "line"])
+    titles = [delay_label(delay) for delay in delays or [None]]
+    # An estimate without a start is shown under every initial delay.
+    under = [
+        titles if none else [delay_label(delay)] for delay, none in zip(frame["initial_delay"], startless, strict=True)
+    ]
+    cells = labels.assign(n=place.map(frame["n"].groupby(place).agg(_sizes)), under=under, **texts)
+    keys = [*labels, "n"]
+    one_line_each = cells.explode("under").set_index([*keys, "under"])[[*LINES]].stack()
+    long = one_line_each.rename_axis([*keys, "under", "line"]).reset_index(name="text")
+    lines = pivot(long, [*keys, "line"], "under", ["text"])[[*keys, "line", *titles]]
+    lines = lines[(lines[titles] != "").any(axis=1)].reset_index(drop=True)
     # A label that the line above has already said is left out, as in a printed table.
-    repeated = lines[down].eq(lines[down].shift()).cummin(axis=1)
-    lines[down] = lines[down].mask(repeated, "")
+    repeated = lines[keys].eq(lines[keys].shift()).cummin(axis=1)
+    lines[keys] = lines[keys].mask(repeated, "")
     return lines.rename(columns={"line": "initial delay"})
 
 
@@ -265,10 +268,10 @@ def _span(times: Iterable[float | None]) -> str:
 # --- committed tables -----------------------------------------------------------------------------------------------
 
 
-def committed_tables(study: str = DEFAULT_STUDY) -> Path | None:
-    """Return the file of a study's committed tables, None if there is none."""
-    folder = data_folder("results/published") / study.replace("-", "_")
-    return folder / "tables.csv" if (folder / "tables.csv").is_file() else None
+def committed_tables() -> Path | None:
+    """Return the file of the committed tables, None if there is none."""
+    file = find_study().published / "tables.csv"
+    return file if file.is_file() else None
 
 
 def read_tables(file: Path) -> pd.DataFrame:

@@ -1,77 +1,28 @@
-"""The studies that are shipped with the program, one folder each with its ``study.yaml``, and their figures by name."""
+"""Results of studies, and their figures by name."""
 
-import importlib
-import sys
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.results import Results, experiments_in, find_results, out_option, read_results
-from ctid_cli.reporting.study import DEFAULT_STUDY, data_folder, study_contents
-from ctid_cli.running.plan import Plan, build_plan
-from ctid_cli.specification.load import load_spec
+from ctid_cli.reporting.study import DEFAULT_STUDY, Study, all_studies, find_study, last_part
 from ctid_cli.text import did_you_mean
 
-#: Name under which modules of studies are imported, whatever the working directory holds.
-_PACKAGE = "ctid_experiments"
-
-
-@dataclass(frozen=True, eq=False)
-class StudyFolder:
-    """One study, as its ``study.yaml`` describes it."""
-
-    name: str
-    title: str
-    #: Specification of every experiment, relative to ``configs``.
-    configs: Mapping[str, str]
-    #: Experiments that each figure is drawn from, by the last parts of their names; none where it is computed.
-    figures: Mapping[str, Sequence[str]]
-    #: Function in ``tables.py`` that writes each published text.
-    texts: Mapping[str, str]
-    #: Published numbers by file: a function in ``tables.py`` that makes ``rows`` of the results of one experiment, its
-    #: ``columns`` if not all keys, and its ``experiments`` if not all.
-    numbers: Mapping[str, Mapping[str, Any]]
-    #: Experiments that each function in ``claims.py`` is asked about, one call for each list.
-    claims: Mapping[str, Sequence[Sequence[str]]]
-    #: Settings with which the first data set of an experiment is computed again by a small reproduction.
-    first: Mapping[str, Sequence[str]]
-
-    @property
-    def folder(self) -> Path:
-        """Where its files lie."""
-        return data_folder("experiments") / self.name.replace("-", "_")
-
-    def experiment(self, short: str) -> str:
-        """An experiment by the last part of its name."""
-        return f"{self.name}/{short}"
-
-    def module(self, name: str) -> Any:
-        """One of its modules, always from the folder that is shipped with the program."""
-        if _PACKAGE not in sys.modules:
-            package = ModuleType(_PACKAGE)
-            package.__path__ = [str(data_folder("experiments"))]
-            sys.modules[_PACKAGE] = package
-        return importlib.import_module(f"{_PACKAGE}.{self.folder.name}.{name}")
-
-    def plan(self, short: str, overrides: Sequence[str] = ()) -> Plan:
-        """Plan of one of its experiments."""
-        return build_plan(load_spec(self.config(short), overrides))
-
-    def config(self, short: str) -> Path:
-        """Specification of one of its experiments."""
-        return data_folder("configs") / self.configs[self.experiment(short)]
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
 class StudyResults:
     """What was found in the experiments of a study that were run."""
 
-    study: StudyFolder
+    study: Study
     out: Path
     experiments: Mapping[str, Results] = field(default_factory=dict)
 
@@ -82,75 +33,40 @@ class StudyResults:
         return self.experiments[short]
 
 
-def published_folder(study: StudyFolder) -> Path:
-    """Return the folder that a study is published in, also in an installed package."""
-    return data_folder("results/published") / study.folder.name
-
-
-def last_part(experiment: str) -> str:
-    """An experiment's name without that of its study."""
-    return experiment.rpartition("/")[2]
-
-
-def read_study(study: StudyFolder, out: Path) -> StudyResults:
+def read_study(study: Study, out: Path) -> StudyResults:
     """Results of a study, by the last parts of its experiments' names."""
     found = {last_part(name): find_results(out, name) for name in study.configs}
     return StudyResults(study, out, {name: results for name, results in found.items() if results is not None})
-
-
-@cache
-def all_studies() -> dict[str, StudyFolder]:
-    """Every study by its name."""
-    return {name: _study(content) for name, content in study_contents().items()}
-
-
-def find_study(name: str) -> StudyFolder:
-    """A study by its name."""
-    studies = all_studies()
-    if name not in studies:
-        raise UsageError(f"there is no study named {name!r}; there are {', '.join(studies)}")
-    return studies[name]
-
-
-def _study(content: Mapping[str, Any]) -> StudyFolder:
-    return StudyFolder(
-        name=content["study"],
-        title=content["title"],
-        configs={name: item["config"] for name, item in content["experiments"].items()},
-        figures={str(name): parts for name, parts in content["figures"].items()},
-        **{name: content[name] for name in ("texts", "numbers", "claims", "first")},
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class StudyList(Result):
     """The studies with their experiments."""
 
-    studies: Sequence[StudyFolder]
+    studies: Sequence[Study]
 
     def content(self) -> list[dict[str, Any]]:
         """Return the studies for JSON."""
         return [{"study": each.name, "title": each.title, "experiments": dict(each.configs)} for each in self.studies]
 
-    def sections(self) -> list[Section]:
-        """Return a list of experiments for each study."""
+    def to_frame(self) -> pd.DataFrame:
+        """Return a row for each experiment."""
         import pandas as pd
 
-        return [
-            Section(
-                each.name,
-                [f"{each.title}. Specifications are in configs."],
-                frame=pd.DataFrame(each.configs.items(), columns=["experiment", "specification"]),
-            )
-            for each in self.studies
-        ]
+        rows = [item for each in self.studies for item in each.configs.items()]
+        return pd.DataFrame(rows, columns=["experiment", "specification"])
+
+    def sections(self) -> list[Section]:
+        """Return what each study is about, and the experiments of all."""
+        titles = [f"- {each.name}: {each.title}" for each in self.studies]
+        return [Section("", titles, self.to_frame(), notes=["Specifications are in configs."])]
 
 
 @dataclass(frozen=True)
 class StudyFigure:
     """A figure that can be drawn: a function ``figure_<number>`` of its study."""
 
-    study: StudyFolder
+    study: Study
     number: str
 
     @property
@@ -181,39 +97,36 @@ class StudyFigure:
 
 def sorted_names(names: Sequence[str], out: Path) -> tuple[list[str], list[str]]:
     """Names of experiments with results, and all others: those of figures come first where both have a name."""
-    taken, known = set(_figure_names()), experiments_in(out)
-    own = [name for name in names if name in known and name not in taken]
-    return list(dict.fromkeys(own)), [name for name in names if name not in own]
+    known = set(experiments_in(out)) - _named_figures().keys()
+    own = [name for name in dict.fromkeys(names) if name in known]
+    return own, [name for name in names if name not in known]
 
 
-def _figure_names() -> list[str]:
-    """Everything that names published figures."""
-    studies = [study for study in all_studies().values() if study.figures]
-    names = [*find_study(DEFAULT_STUDY).figures]
-    return names + [entry for s in studies for entry in (s.name, *(f"{s.name}/{k}" for k in s.figures))]
+@cache
+def _named_figures() -> dict[str, list[StudyFigure]]:
+    """Return the figures by every name that they have: one or all of a study, and by number of the default study."""
+    of_studies = {name: [StudyFigure(study, k) for k in study.figures] for name, study in all_studies().items()}
+    named = {figure.number: [figure] for figure in of_studies[DEFAULT_STUDY]}
+    for name, figures in of_studies.items():
+        named |= {name: figures, **{f"{name}/{each.number}": [each] for each in figures}} if figures else {}
+    return named
 
 
 def find_figures(names: Sequence[str], out: Path | None = None) -> list[StudyFigure]:
     """The figures that were asked for."""
-    studies = {name: study for name, study in all_studies().items() if study.figures}
-    found: list[StudyFigure] = []
-    for name in names or [DEFAULT_STUDY]:
+    named = _named_figures()
+    for name in names:
         place, _, number = name.rpartition("/")
         place = place or DEFAULT_STUDY
-        if name in studies:
-            found += [StudyFigure(studies[name], number) for number in studies[name].figures]
-        elif place in studies and number in studies[place].figures:
-            found.append(StudyFigure(studies[place], number))
-        elif place in studies and number.isdigit():
-            raise UsageError(f"{place} has no figure {number}; it has {', '.join(studies[place].figures)}")
-        else:
-            own = [] if out is None else experiments_in(out)
-            known = [*_figure_names(), *own]
+        if name not in named and place in named and number.isdigit():
+            raise UsageError(f"{place} has no figure {number}; it has {', '.join(find_study(place).figures)}")
+        if name not in named:
+            known = [*named, *([] if out is None else experiments_in(out))]
             hint = did_you_mean(name, known) or "."
             wrong = f"{name!r} is neither a figure nor a study with figures"
             wrong += f", nor an experiment with results in the folder {out}" if out else ""
             raise UsageError(f"{wrong}{hint} Known: {', '.join(known)}")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(figure for name in names or [DEFAULT_STUDY] for figure in named[name]))
 
 
 def require_results(figures: Iterable[StudyFigure], out: Path) -> None:

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import picked
-from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.reporting.study import last_part
+from ctid_cli.studies.catalogue import StudyResults
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
 @dataclass(frozen=True)
@@ -67,21 +68,18 @@ class CheckedClaims(Result):
         tested = [claim.holds for claim in self.claims if claim.holds is not None]
         return f"{sum(tested)} of {len(tested)} hold"
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return a row for each claim."""
-        import pandas as pd
-
-        columns = ("experiment", "claim", "measured", "required")
-        rows = [{**picked(claim, columns), "holds": claim.verdict} for claim in self.claims]
-        return pd.DataFrame(rows, columns=[*columns, "holds"])
-
     def content(self) -> dict[str, Any]:
         """Return the claims for JSON."""
         return {"study": self.results.study.name, "claims": [asdict(claim) for claim in self.claims]}
 
     def sections(self) -> list[Section]:
         """Return the claims."""
-        return [Section(self.results.study.name, frame=self.to_frame(), notes=[self.counted])]
+        import pandas as pd
+
+        columns = ("experiment", "claim", "measured", "required")
+        rows = [{**picked(claim, columns), "holds": claim.verdict} for claim in self.claims]
+        frame = pd.DataFrame(rows, columns=[*columns, "holds"])
+        return [Section(self.results.study.name, frame=frame, notes=[self.counted])]
 
 
 def check_claims(found: StudyResults) -> CheckedClaims:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctid_cli.reporting.results import read_results
+from ctid_cli.reporting.study import Study
 from ctid_cli.running.engine import run_experiment
 from ctid_cli.running.plan import Plan
-from ctid_cli.studies.catalogue import StudyFolder
 from ctid_cli.written_files import write_file
 
 #: Largest difference of an estimated parameter [standard errors of it]. Newton's method ends where the squared error
@@ -44,7 +44,7 @@ Estimates = dict[str, dict[str, Any]]
 FILE = "first_estimates.json"
 
 
-def compute_first(study: StudyFolder, out: Path, jobs: int | None = None) -> Estimates:
+def compute_first(study: Study, out: Path, jobs: int | None = None) -> Estimates:
     """Run the first data sets of a study, and read them back by experiment, settings, estimator and start."""
     found: Estimates = {}
     for short, overrides in study.first.items():
@@ -76,12 +76,12 @@ def _numbers(content: Any, name: str = "") -> Iterator[tuple[str, float]]:
         yield name, float(content)
 
 
-def read_first(study: StudyFolder) -> Estimates:
+def read_first(study: Study) -> Estimates:
     """The committed estimates of a study."""
     return dict(json.loads((study.folder / FILE).read_text(encoding="utf-8")))
 
 
-def write_first(study: StudyFolder, found: Estimates) -> None:
+def write_first(study: Study, found: Estimates) -> None:
     """Commit to these estimates: one line for each, so that a change can be read."""
     lines = [f"{json.dumps(name)}: {json.dumps(found[name])}" for name in found]
     write_file(study.folder / FILE, ("{\n" + ",\n".join(lines) + "\n}\n").encode())

@@ -12,7 +12,7 @@ from ctid_cli.reporting.document import Section, render_markdown
 from ctid_cli.running.plan import build_plan, current_version
 from ctid_cli.specification.load import spec_from_canonical
 from ctid_cli.storage.status import public_sessions
-from ctid_cli.studies.catalogue import StudyFigure, StudyResults, published_folder
+from ctid_cli.studies.catalogue import StudyFigure, StudyResults
 from ctid_cli.studies.claims import CheckedClaims
 from ctid_cli.written_files import write_file
 
@@ -67,7 +67,7 @@ def published_texts(found: StudyResults) -> dict[str, str]:
 
 def publish(checked: CheckedClaims, out: Path) -> None:
     """Write everything that is published of a study, in place of what was published before."""
-    found, target = checked.results, published_folder(checked.results.study)
+    found, target = checked.results, checked.results.study.published
     commit = commit_of(found)
     texts = published_texts(found)
     claims = Section(frame=checked.to_frame(), notes=[checked.counted])

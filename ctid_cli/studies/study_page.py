@@ -1,8 +1,7 @@
 """The page of a reproduced study: its question, claims, tables and figures, from its results or as published."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import ctid_cli
 from ctid_cli.errors import UsageError
@@ -10,9 +9,9 @@ from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
 from ctid_cli.reporting.results import experiments_in, out_option, read_results
-from ctid_cli.reporting.study import study_contents
+from ctid_cli.reporting.study import Study, all_studies
 from ctid_cli.reporting.study_table import environment_of
-from ctid_cli.studies.catalogue import StudyFigure, StudyFolder, all_studies, published_folder, read_study
+from ctid_cli.studies.catalogue import StudyFigure, read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
 from ctid_cli.text import count, did_you_mean
@@ -33,9 +32,9 @@ def page_of(name: str, out: Path) -> tuple[str, Path]:
     raise UsageError(f"{wrong} Known: {', '.join([*known, *studies])}")
 
 
-def study_page(study: StudyFolder, out: Path) -> str:
+def study_page(study: Study, out: Path) -> str:
     """Return the page as HTML: of the results in a folder where all experiments were run, else of what is published."""
-    published = published_folder(study)
+    published = study.published
     own = set(study.configs) <= set(experiments_in(out))
     if own:
         texts = {name: text for name, text in published_texts(read_study(study, out)).items() if name.endswith(".md")}
@@ -45,14 +44,13 @@ def study_page(study: StudyFolder, out: Path) -> str:
         texts = {file.name: file.read_text(encoding="utf-8") for file in sorted(published.glob("*.md"))}
         claims = sections_of(texts.pop(CLAIMS)) if CLAIMS in texts else []
         origin = list(_published_origin(published))
-    source = study_contents()[study.name].get("source")
-    cited = f" {source['authors']}: {source['title']} ({source['identifier']})." if source else ""
+    cited = f" {study.citation}." if study.citation else ""
     again = [
         f"- to compute it again: `ctid reproduce {study.name}`",
         f"- to check it: `ctid reproduce --check {study.name}`",
     ]
     chapters = [
-        Chapter("Question", list(_question(study, study_contents()[study.name]))),
+        Chapter("Question", list(_question(study))),
         Chapter("Claims", claims),
         Chapter("Tables", [section for text in texts.values() for section in sections_of(text)]),
         Chapter("Figures", list(_figures(study, out, published, own=own))),
@@ -63,18 +61,18 @@ def study_page(study: StudyFolder, out: Path) -> str:
     return write_page(study.title, f"The study {study.name} of ctid {ctid_cli.__version__}{after}", chapters)
 
 
-def _question(study: StudyFolder, content: Mapping[str, Any]) -> Iterator[Section]:
+def _question(study: Study) -> Iterator[Section]:
     import pandas as pd
 
-    if content.get("success"):
-        yield Section(sentences=[f"Counted: {content['success']}."])
-    if content.get("methods"):
-        yield Section(frame=pd.DataFrame(content["methods"].items(), columns=["method", "what it does"]))
+    if study.success:
+        yield Section(sentences=[f"Counted: {study.success}."])
+    if study.methods:
+        yield Section(frame=pd.DataFrame(study.methods.items(), columns=["method", "what it does"]))
     rows = [(name, f"configs/{config}") for name, config in study.configs.items()]
     yield Section(frame=pd.DataFrame(rows, columns=["experiment", "specification"]))
 
 
-def _figures(study: StudyFolder, out: Path, published: Path, *, own: bool) -> Iterator[Section]:
+def _figures(study: Study, out: Path, published: Path, *, own: bool) -> Iterator[Section]:
     """Return its figures as published, but for those that its own results have."""
     for number, needed in study.figures.items():
         file = published / "figures" / f"figure_{number}.svg"

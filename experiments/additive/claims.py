@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.studies.catalogue import last_part
+from ctid_cli.reporting.study import last_part
 from ctid_cli.studies.claims import Claim, within
 
 from .measures import REFERENCE, errors_of, groups_of, is_misused, mse_ratio

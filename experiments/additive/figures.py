@@ -10,8 +10,8 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.reporting.figures.style import DARK, LIGHT, MARK, MIDDLE, ramp
 from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.study import find_study
 from ctid_cli.signals.record import Record
-from ctid_cli.studies.catalogue import find_study
 
 from .frequency_plot import Response, dense_frequencies, response_svg
 from .measures import errors_of, parameters

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ctid_cli.reporting.figures.style import DARK, MARK, MIDDLE, Drawing
+from ctid_cli.reporting.figures.style import DARK, MARK, MIDDLE, Drawing, legend_of, panels_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,25 +35,26 @@ def mse_svg(errors: pd.DataFrame, methods: Methods, parameters: Sequence[str], c
     def draw(figure: Figure) -> None:
         from matplotlib.ticker import NullFormatter
 
-        panels = figure.subplots(lines, columns, sharex=True, squeeze=False)
-        for axes, parameter in zip(panels.flat, parameters, strict=False):
+        panels = panels_of(figure, len(parameters), columns, sharex=True)
+        for k, (axes, parameter) in enumerate(zip(panels, parameters, strict=True)):
             for method, look in zip(methods, LOOKS, strict=False):
                 own = errors[(errors["estimator"] == method) & (errors["parameter"] == parameter)]
-                N, style = own["samples"], look | {"linestyle": "none"}
-                theory = own["theory"] / N
+                N, theory = own["samples"], own["theory"] / own["samples"]
                 axes.plot(N, theory, color=look["color"], linestyle=look["linestyle"], linewidth=0.9)
-                axes.plot(N, own["mse"], **style, markersize=3.2, markeredgewidth=0.8)
+                axes.plot(N, own["mse"], **look | {"linestyle": "none"}, markersize=3.2, markeredgewidth=0.8)
             axes.set(xscale="log", yscale="log")
             for axis in (axes.xaxis, axes.yaxis):
                 axis.set_minor_formatter(NullFormatter())
             axes.set_title(symbol(parameter), loc="left")
-        for axes in panels[:, 0]:
-            axes.set_ylabel("mean-square error")
-        for axes in panels[-1]:
-            axes.set_xlabel("number of samples $N$")
-        for axes in list(panels.flat)[len(parameters) :]:
-            axes.set_visible(False)
-        _legend(figure, methods, errors)
+            if k % columns == 0:
+                axes.set_ylabel("mean-square error")
+            if k // columns == lines - 1:
+                axes.set_xlabel("number of samples $N$")
+        labels = [labelled(label, errors[errors["estimator"] == method]) for method, label in methods.items()]
+        wide = max(map(len, labels)) > 40 or len(labels) > 3
+        note = "simulated (marker), theory for long records (line)"
+        looks = dict(zip(labels, LOOKS, strict=False))
+        legend_of(figure, looks, 2 if wide else 3, title=note, title_fontsize=8)
         runs = " to ".join(map(str, sorted({errors["runs"].min(), errors["runs"].max()})))
         several = " a point" if errors["samples"].nunique() > 1 else ""
         figure.suptitle(f"{title} ({runs} data sets{several})")
@@ -69,17 +70,3 @@ def labelled(label: str, groups: pd.DataFrame) -> str:
     notes = [f"{unfinished} of {sums['runs']} not converged"] if unfinished else []
     notes += [f"{sums['valueless']} without a value"] if sums["valueless"] else []
     return f"{label} ({', '.join(notes)})" if notes else label
-
-
-def _legend(figure: Figure, methods: Methods, errors: pd.DataFrame) -> None:
-    from matplotlib.lines import Line2D
-
-    labels = [labelled(label, errors[errors["estimator"] == method]) for method, label in methods.items()]
-    handles = [
-        Line2D([], [], **look, markersize=4, linewidth=0.9, label=label)
-        for label, look in zip(labels, LOOKS, strict=False)
-    ]
-    wide = max(len(str(handle.get_label())) for handle in handles) > 40 or len(handles) > 3
-    place: dict[str, Any] = {"loc": "outside lower center", "ncols": 2 if wide else 3, "frameon": False}
-    note = "simulated (marker), theory for long records (line)"
-    figure.legend(handles=handles, title=note, title_fontsize=8, **place)

@@ -9,8 +9,9 @@ import pandas as pd
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.study import last_part
 from ctid_cli.reporting.table_result import pivot
-from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.studies.catalogue import StudyResults
 
 from .measures import errors_of, groups_of, is_misused, ratios
 

@@ -10,9 +10,10 @@ from ctid_cli.inference import monte_carlo
 from ctid_cli.inference.monte_carlo import Sample
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.results import Results
+from ctid_cli.reporting.study import last_part
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.studies.catalogue import StudyResults
 
 #: Rows of the table by experiment: letter, and what the data are.
 ROWS = {

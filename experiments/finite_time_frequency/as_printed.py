@@ -10,7 +10,7 @@ import pandas as pd
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_regression import theta_of
 from ctid_cli.reporting.layout import number
-from ctid_cli.studies.catalogue import find_study
+from ctid_cli.reporting.study import find_study
 
 from .measures import settle
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.studies.catalogue import last_part
+from ctid_cli.reporting.study import last_part
 from ctid_cli.studies.claims import Claim, near, within
 
 from .measures import READINGS, efficiency, followed, larger_error, recovery, residuals, settling

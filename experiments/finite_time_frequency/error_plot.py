@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array
+from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing
 
 if TYPE_CHECKING:
@@ -31,39 +31,26 @@ WHOLE: dict[str, Any] = {"color": MIDDLE, "linewidth": 0.8}
 ROUNDING = 1e-16
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
+class Curve(NamedTuple):
     """Frequencies as one estimator found them."""
 
     label: str
-    #: Instants [s], shape (N,).
-    t: Array
-    #: Estimated and true frequencies [rad/s], shape (N, n).
-    omega: Array
+    track: FrequencyTrack
+    #: True frequencies [rad/s], shape (N, n).
     true: Array
-    #: Whether the estimator itself calls them valid, shape (N,).
-    valid: BoolArray
 
     @property
     def error(self) -> Array:
         """Larger one of the errors of all tones, no smaller than rounding [rad/s], shape (N,)."""
-        return np.asarray(np.maximum(np.abs(self.omega - self.true).max(axis=1), ROUNDING))
+        return np.asarray(np.maximum(np.abs(self.track.frequencies - self.true).max(axis=1), ROUNDING))
 
 
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Estimators that share a column."""
-
-    title: str
-    curves: Sequence[Curve]
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """The same experiment seen by all groups: a row of panels with frequencies, and one with errors."""
+class Row(NamedTuple):
+    """The same experiment seen by all groups of estimators: a row of panels with frequencies, and one with errors."""
 
     title: str
-    groups: Sequence[Group]
+    #: Estimators that share a column, by its title.
+    groups: Mapping[str, Sequence[Curve]]
     #: Length of the record [s].
     duration: float
     #: From here on a finite-time estimator can be exact [s].
@@ -83,20 +70,20 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
         shape: dict[str, Any] = {"squeeze": False, "height_ratios": [1.0, 1.15] * len(rows)}
         panels = figure.subplots(2 * len(rows), columns, sharex=True, sharey="row", **shape)
         for k, row in enumerate(rows):
-            for above, below, group in zip(panels[2 * k], panels[2 * k + 1], row.groups, strict=True):
-                _draw_frequencies(above, group.curves)
-                _draw_errors(below, group.curves, row)
+            for above, below, curves in zip(panels[2 * k], panels[2 * k + 1], row.groups.values(), strict=True):
+                _draw_frequencies(above, curves)
+                _draw_errors(below, curves, row)
                 above.set_ylim(*frequencies)
                 below.set(yscale="log", ylim=errors)
             panels[2 * k, 0].set_ylabel(f"{row.title}\nfrequency [rad/s]".strip())
             panels[2 * k + 1, 0].set_ylabel(f"{row.title}\nlarger error [rad/s]".strip())
-        for axes, group in zip(panels[0], rows[0].groups, strict=True):
-            axes.set_title(group.title, loc="left", fontsize=8)
-        for axes, group in zip(panels[-1], rows[0].groups, strict=True):
+        for axes, title in zip(panels[0], rows[0].groups, strict=True):
+            axes.set_title(title, loc="left", fontsize=8)
+        for axes, curves in zip(panels[-1], rows[0].groups.values(), strict=True):
             axes.set(xlabel="time [s]", xlim=(0.0, rows[0].duration))
             axes.xaxis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 1.5, 2, 3, 5, 10]))
             place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (-0.03, -0.27), "frameon": False}
-            lines = zip(group.curves, LOOKS, strict=False)
+            lines = zip(curves, LOOKS, strict=False)
             handles = [Line2D([], [], **look | FIRM, label=curve.label) for curve, look in lines]
             axes.legend(handles=handles, handlelength=2.8, borderpad=0.0, labelspacing=0.35, **place)
         figure.legend(handles=_common_handles(rows), loc="outside lower center", ncols=2, frameon=False)
@@ -106,10 +93,9 @@ def errors_svg(rows: Sequence[Row], frequencies: tuple[float, float], errors: tu
 
 
 def _draw_frequencies(axes: Any, curves: Sequence[Curve]) -> None:
-    for true in curves[0].true.T:
-        axes.plot(curves[0].t, true, **TRUTH, zorder=1)
+    axes.plot(curves[0].track.t, curves[0].true, **TRUTH, zorder=1)
     for curve, look in zip(curves, LOOKS, strict=False):
-        for omega in curve.omega.T:
+        for omega in curve.track.frequencies.T:
             _draw_line(axes, curve, omega, look)
 
 
@@ -122,8 +108,8 @@ def _draw_errors(axes: Any, curves: Sequence[Curve], row: Row) -> None:
 
 
 def _draw_line(axes: Any, curve: Curve, values: Array, look: dict[str, Any]) -> None:
-    axes.plot(curve.t, values, **look | FAINT)
-    axes.plot(curve.t, np.where(curve.valid, values, np.nan), **look | FIRM)
+    axes.plot(curve.track.t, values, **look | FAINT)
+    axes.plot(curve.track.t, np.where(curve.track.valid, values, np.nan), **look | FIRM)
 
 
 def _common_handles(rows: Sequence[Row]) -> list[Any]:

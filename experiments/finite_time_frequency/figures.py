@@ -16,7 +16,7 @@ from ctid_cli.running.job import DataCell, EstimatorCell
 from ctid_cli.running.plan import Plan, build_plan
 from ctid_cli.specification.load import spec_from_canonical
 
-from .error_plot import Curve, Group, Row, errors_svg
+from .error_plot import Curve, Row, errors_svg
 
 #: What estimators are called that the paper compares with, but that are not theirs.
 DERIVED = "derived, not the published algorithm"
@@ -71,15 +71,13 @@ def _row(results: Results, title: str = "", *, reference: bool = False, **swept:
     plan = plan_of(results)
     cell = next(cell for cell in plan.data_cells if cell.swept.items() >= swept.items())
     parts, source = {part.name: part for part in plan.estimators}, cell.source
-    groups = []
-    for name, members in GROUPS.items():
-        curves = []
-        for estimator in (member for member in members if member in parts):
-            track = track_of(cell, 0, parts[estimator], DRAWN_INTERVAL)
-            true = source.signal.frequencies_at(track.t)
-            curves.append(Curve(members[estimator], track.t, track.frequencies, true, track.valid))
-        groups.append(Group(name, curves))
-    options = next(part.estimator.options for part in plan.estimators if part.name == "finite_time")
+    groups: dict[str, list[Curve]] = {}
+    for group, labels in GROUPS.items():
+        tracks = {name: track_of(cell, 0, parts[name], DRAWN_INTERVAL) for name in labels if name in parts}
+        groups[group] = [
+            Curve(labels[name], track, source.signal.frequencies_at(track.t)) for name, track in tracks.items()
+        ]
+    options = parts["finite_time"].estimator.options
     exact_from = options.tones * (2 * options.h + options.d)
     whole = _whole_record_error(results) if reference else None
     return Row(title, groups, source.sampling.samples * source.sampling.interval, exact_from, whole)

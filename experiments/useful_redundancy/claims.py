@@ -6,7 +6,7 @@ import pandas as pd
 
 from ctid_cli.reporting.comparison_result import compare
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study import find_study
 from ctid_cli.reporting.study_table import study_frame
 from ctid_cli.studies.claims import Claim, within
 
@@ -17,7 +17,7 @@ ALWAYS = 99.0
 
 def reaches_the_paper(results: Results) -> Iterator[Claim]:
     """Ours converges as often as the published method was published to, in every cell."""
-    study, found = load_study(), {results.experiment: results}
+    study, found = find_study(), {results.experiment: results}
     rows = pd.concat([study_frame(study, table, found) for table in study.tables.values()], ignore_index=True)
     against = compare(rows[rows["experiment"] == results.experiment], None, study).decisive
     if len(against):

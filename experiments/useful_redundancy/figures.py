@@ -19,9 +19,9 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.estimators.useful_redundancy import UsefulRedundancy
 from ctid_cli.filtering.filter_set import FilterCheck, FilterSet, check_filters, convergence_region, extrema, ideal_cost
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, pointed, ramp, spread
+from ctid_cli.reporting.study import find_study
 from ctid_cli.signals.record import Record
 from ctid_cli.simulation.dataset import DataSet
-from ctid_cli.studies.catalogue import find_study
 
 from .search_plot import Landscape, costs_svg, landscape, trajectory_svg
 

@@ -5,8 +5,9 @@ import pandas as pd
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.measures import ALWAYS
 from ctid_cli.reporting.results import Results, lookup
+from ctid_cli.reporting.study import last_part
 from ctid_cli.reporting.study_table import build_tables
-from ctid_cli.studies.catalogue import StudyResults, last_part
+from ctid_cli.studies.catalogue import StudyResults
 
 #: Methods whose failures are not listed one by one: from most initial delays this one is meant to fail.
 UNLISTED = ("existing",)

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from ctid_cli.studies.catalogue import find_study
+from ctid_cli.reporting.study import find_study
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import yaml
 
 from ctid_cli.cli import experiment_commands
 from ctid_cli.reporting.comparison_result import check_tables
-from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study import find_study
 from ctid_cli.studies import first_estimates, publishing
-from ctid_cli.studies.catalogue import find_study, read_study
+from ctid_cli.studies.catalogue import read_study
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "useful_redundancy"
@@ -58,7 +58,7 @@ def test_one_data_set_fills_its_cells(ctid, tmp_path, case, tables):
     ctid("run --runs 1 --quiet --out", tmp_path, CONFIGS / f"{case}.yaml", *overrides)
     rows = json.loads(ctid(f"table {tables} --json --out", tmp_path).stdout)
     starts = {cell.name: cell.estimator.start_from == "delay" for cell in plan.estimators}
-    methods = sorted(starts, key=list(load_study().methods).index)
+    methods = sorted(starts, key=list(find_study().methods).index)
     mine = [row for row in rows if row["sampling"] == case.partition("_")[2] and row["n"]]
     assert [(row["table"], row["snr_db"], row["initial_delay"], row["method"]) for row in mine] == [
         (int(table), 15, delay if starts[method] else None, method)

@@ -9,9 +9,10 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.reporting.study import all_studies, find_study
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
-from ctid_cli.studies.catalogue import all_studies, find_figures, find_study, require_results
+from ctid_cli.studies.catalogue import find_figures, require_results
 from experiments.additive import frequency_plot
 from experiments.additive.measures import errors_of
 from experiments.additive.parameter_plot import labelled, mse_svg, symbol
@@ -55,10 +56,6 @@ def test_figure_2_is_the_sum_of_its_submodels(drawn):
     )
     peaks = frequencies[1:-1][(np.diff(magnitude)[:-1] > 0) & (np.diff(magnitude)[1:] < 0)]
     assert peaks == pytest.approx([1.39, 3.16, 5.77, 9.99], rel=0.04)
-
-
-def test_figure_2_is_drawn_the_same_every_time():
-    assert additive.figure_2() == additive.figure_2()
 
 
 def test_figure_6_says_that_it_is_simulated_and_ends_at_the_truth(drawn):

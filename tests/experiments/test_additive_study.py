@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ctid_cli.reporting.results import Results
-from ctid_cli.reporting.study import data_folder
+from ctid_cli.reporting.study import data_folder, find_study
 from ctid_cli.running.plan import build_plan
 from ctid_cli.specification.load import load_spec
-from ctid_cli.studies.catalogue import StudyResults, find_study, read_study
+from ctid_cli.studies.catalogue import StudyResults, read_study
 from ctid_cli.studies.claims import check_claims, near, within
 from ctid_cli.studies.publishing import published_texts
 from tests.reporting.ideal_results import ideal_results
@@ -28,20 +28,6 @@ def published(file, overrides=()):
 
 def source_of(file):
     return build_plan(published(file)).data_cells[0].source
-
-
-def test_there_are_as_many_specifications_as_the_study_has():
-    there = {file.name for file in (data_folder("configs") / "additive").glob("*.yaml")}
-    assert there >= set(FILES)
-
-
-@pytest.mark.parametrize("file", FILES)
-def test_specifications_are_warned_of_nothing_but_what_is_their_point(file):
-    ignoring = {"closed_loop.yaml": 1, "closed_loop_coloured.yaml": 2}
-    # Estimates are what the publication is about; intervals for white noise have an experiment of their own.
-    warnings = [said for said in published(file).warnings if "covariance: is for white noise" not in said]
-    assert len(warnings) == ignoring.get(file, 0)
-    assert all("ignores the loop" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize("file", ["open_loop.yaml", "coverage_open_loop.yaml"])

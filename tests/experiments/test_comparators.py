@@ -8,8 +8,8 @@ from scipy import signal
 
 from ctid_cli import DataError, Flag
 from ctid_cli.custom_code import STUDIES, find_class
+from ctid_cli.reporting.study import find_study
 from ctid_cli.specification.load import spec_from_canonical
-from ctid_cli.studies.catalogue import find_study
 from tests.frequency.signals import INTERVAL, NO_TWO_TONES, NOISE, OMEGA, T, tones
 
 STUDY = find_study("finite-time-frequency")

@@ -5,7 +5,8 @@ import pytest
 from scipy import stats
 
 from benchmarks import interval_defaults as defaults
-from ctid_cli.studies.catalogue import find_study, read_study
+from ctid_cli.reporting.study import find_study
+from ctid_cli.studies.catalogue import read_study
 from tests.reporting.frequency_results import run_here
 
 STUDY = find_study("coverage")

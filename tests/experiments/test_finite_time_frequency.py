@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from ctid_cli import DremFiniteTime, DremGradient
-from ctid_cli.reporting.study import data_folder
-from ctid_cli.specification.load import load_spec
 from ctid_cli.studies.catalogue import read_study
 from ctid_cli.studies.claims import check_claims
 from ctid_cli.studies.publishing import published_texts
@@ -25,14 +23,6 @@ def test_the_bound_is_that_of_a_single_tone_where_tones_are_far_apart():
 
 
 # Specifications ------------------------------------------------------------------------------------------
-
-
-def test_the_folder_holds_the_specifications_of_the_study():
-    folder = data_folder("configs") / "finite_time_frequency"
-    assert {f"finite_time_frequency/{file.name}" for file in folder.glob("*")} == set(STUDY.configs.values())
-    for experiment, config in STUDY.configs.items():
-        spec = load_spec(data_folder("configs") / config)
-        assert (spec.warnings, spec.experiment) == ((), experiment)
 
 
 @pytest.mark.parametrize(("name", "signal"), [("two-tones", "A"), ("harmonic", "B"), ("step", "D"), ("recovery", "D")])

@@ -1,14 +1,9 @@
 """Figures of the study of finite-time frequency estimation: what is drawn is what was found."""
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from ctid_cli.errors import UsageError
-from ctid_cli.studies.catalogue import find_figures, require_results
-from experiments.finite_time_frequency.error_plot import Curve, Group, Row, errors_svg
+from ctid_cli.studies.catalogue import find_figures
 from tests.reporting.frequency_results import STUDY, run_here
 
 figures = STUDY.module("figures")
@@ -56,29 +51,6 @@ def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):
         item.svg(out)
         (band,) = drawn[-1].axes[3].patches
         assert (band.get_x(), band.get_width()) == pytest.approx((0.0, end))
-
-
-def test_an_svg_file_is_the_same_every_time():
-    t = np.arange(5.0)
-    curve = Curve("one", t, np.full((5, 1), 2.0), np.full((5, 1), 2.0), t > 1)
-    assert curve.error.tolist() == [1e-16] * 5
-    row = Row("", [Group("group", [curve])], 5.0, 1.0)
-    once, again = (errors_svg([row], (1.0, 3.0), (1e-17, 1.0), "title") for _ in range(2))
-    assert once == again
-    assert once.startswith(b"<?xml")
-    assert once != errors_svg([replace(row, reference=0.1)], (1.0, 3.0), (1e-17, 1.0), "title")
-
-
-def test_missing_results_name_the_command(tmp_path, monkeypatch):
-    drawn = find_figures(["finite-time-frequency"])
-    assert [figure.number for figure in drawn] == ["1", "2", "3", "4"]
-    assert drawn[0].place == Path("finite_time_frequency_figures/figure_1.svg")
-    monkeypatch.chdir(tmp_path)
-    command = " ".join(f"configs/finite_time_frequency/{name.replace('-', '_')}.yaml" for name in NAMES)
-    with pytest.raises(UsageError, match=rf"run first: ctid run {command}$"):
-        require_results(drawn, Path("results"))
-    with pytest.raises(UsageError, match=r"run first: ctid run configs/finite_time_frequency/harmonic\.yaml$"):
-        drawn[1].svg(Path("results"))
 
 
 def test_figures_are_those_of_the_specifications():

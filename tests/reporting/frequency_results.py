@@ -2,8 +2,8 @@
 
 import itertools
 
+from ctid_cli.reporting.study import find_study
 from ctid_cli.storage.identity import Origin
-from ctid_cli.studies.catalogue import find_study
 from tests.running.fakes import outcomes_of
 from tests.storage.made_results import export_image
 

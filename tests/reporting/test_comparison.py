@@ -9,9 +9,9 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.paired import fisher, holm, smallest_detectable
 from ctid_cli.reporting.comparison_result import LEVEL, check_tables, compare
-from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study import find_study
 
-STUDY = load_study()
+STUDY = find_study()
 
 
 def table(*rows):

@@ -5,12 +5,12 @@ import pytest
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import render_markdown, render_text
 from ctid_cli.reporting.measures import records_of
-from ctid_cli.reporting.study import load_study
+from ctid_cli.reporting.study import find_study
 from ctid_cli.reporting.study_table import build_tables, pooled_frame, study_frame, study_sections
 from experiments.useful_redundancy.tables import failures, searches
 
 RANDOM = "uniform(0, 9)"
-STUDY = load_study()
+STUDY = find_study()
 
 # Ha, Welsh and Alamir, arXiv:1703.09344, Tables 1 and 3 (initial delays 0, 1, 3, 5, 7, 9 s) and 2 and 4 (random),
 # existing method: case, sampling, SNR, six fixed delays, random delay.

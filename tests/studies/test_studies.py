@@ -6,8 +6,9 @@ import json
 import pytest
 
 from ctid_cli.errors import RefusedError, UsageError
-from ctid_cli.studies import catalogue, claims, first_estimates, publishing
-from ctid_cli.studies.catalogue import all_studies, find_study, read_study
+from ctid_cli.reporting.study import Study, all_studies, find_study, last_part
+from ctid_cli.studies import claims, first_estimates, publishing
+from ctid_cli.studies.catalogue import read_study
 from ctid_cli.studies.claims import Claim
 from tests.reporting.frequency_results import run_here
 
@@ -20,7 +21,7 @@ def small():
     """A study of one experiment, with a single short record."""
     return dataclasses.replace(
         find_study("finite-time-frequency"),
-        configs={"finite-time-frequency/two-tones": "finite_time_frequency/two_tones.yaml"},
+        experiments={"finite-time-frequency/two-tones": {"config": "finite_time_frequency/two_tones.yaml"}},
         figures={"1": ["two-tones"]},
         texts={},
         numbers={"settling.csv": {"rows": "settling"}},
@@ -37,7 +38,7 @@ def out(tmp_path_factory):
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=list(STUDIES))
 def test_every_study_is_complete(study):
-    shorts = {catalogue.last_part(name) for name in study.configs}
+    shorts = {last_part(name) for name in study.configs}
     for short in shorts:
         assert study.plan(short).experiment == study.experiment(short)
         # What ignores the loop, or the edges of the input, is there to show what that costs.
@@ -130,7 +131,7 @@ def clean(monkeypatch, tmp_path):
     monkeypatch.setattr(publishing, "spec_from_canonical", lambda content, folder: content)
     monkeypatch.setattr(publishing, "build_plan", lambda spec: spec)
     monkeypatch.setattr(publishing, "current_version", lambda plan: answers.get("version", "c"))
-    monkeypatch.setattr(publishing, "published_folder", lambda study: tmp_path / "published")
+    monkeypatch.setattr(Study, "published", tmp_path / "published")
     return answers
 
 

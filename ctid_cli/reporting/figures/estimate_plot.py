@@ -12,7 +12,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.monte_carlo import quantile
 from ctid_cli.reporting.figures.measure_plot import PANELS
 from ctid_cli.reporting.figures.settings import Scale, Settings, placed, value_text
-from ctid_cli.reporting.figures.style import MIDDLE, Drawing, columns_for, look, panels_of, plain, size_for
+from ctid_cli.reporting.figures.style import MIDDLE, Drawing, columns_for, legend_of, look, panels_of, plain, size_for
 from ctid_cli.reporting.measures import label_frame, parameter_unit
 from ctid_cli.reporting.results import Results
 
@@ -50,7 +50,8 @@ def box_drawing(results: Results, asked: Sequence[str] = ()) -> Drawing:
             axes.set_ylabel(f"error of {plain(name)}" + ("" if unit == "-" else f" [{unit}]"))
             scale.apply(axes)
             axes.set_xlabel(", ".join(settings.titles))
-        _legend(figure, settings)
+        looks = {name: look(k) | {"linestyle": "none"} for k, name in enumerate(settings.methods)}
+        legend_of(figure, looks, min(len(looks), 4))
         how = "box: quartiles; whiskers: 5 and 95 %; mark: median with its 95 % interval"
         figure.suptitle(f"{results.experiment}: errors of parameters\n{how}; number at an edge: errors beyond it")
 
@@ -101,13 +102,3 @@ def _draw_box(axes: Axes, at: float, width: float, errors: Array, style: dict[st
     if median.low is not None and median.high is not None:
         axes.vlines(at, median.low, median.high, color=color, linewidth=2.4)
     axes.plot(at, np.median(errors), **{**style, "linestyle": "none"}, markersize=3.5)
-
-
-def _legend(figure: Figure, settings: Settings) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], **{**look(k), "linestyle": "none"}, markersize=4, label=method)
-        for k, method in enumerate(settings.methods)
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4), frameon=False)

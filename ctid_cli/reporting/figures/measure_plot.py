@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctid_cli.reporting.figures.settings import Scale, Settings, placed, scale_of, value_text
-from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, panels_of, plain, size_for
+from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, legend_of, look, panels_of, plain, size_for
 from ctid_cli.reporting.layout import count, number
 from ctid_cli.reporting.measures import measure_frame, measure_of
 from ctid_cli.reporting.results import Results
@@ -60,7 +60,9 @@ def measure_drawing(results: Results, measure: str) -> Drawing:
             own = rows[rows["parameter"] == name] if isinstance(name, str) else rows
             _draw_panel(axes, own, settings, scale)
             _label(axes, own, measure)
-        _legend(figure, frame, settings)
+        labels = [method + _lost(frame[frame["method"] == method]) for method in settings.methods]
+        columns = max(1, min(len(labels), 90 // (max(map(len, labels)) + 8)))
+        legend_of(figure, {label: look(k) for k, label in enumerate(labels)}, columns)
         figure.suptitle(_title(results, measure, frame))
 
     return Drawing(*((7.5, 1.2 + NESTED * len(names) + FLIGHT * flights) if flights else size_for(len(names))), draw)
@@ -135,19 +137,6 @@ def _draw_stairs(axes: Axes, settings: Settings) -> None:
     axes.grid(False)
     for side in axes.spines.values():
         side.set_color(LIGHT)
-
-
-def _legend(figure: Figure, rows: pd.DataFrame, settings: Settings) -> None:
-    """Estimators, and how many of their estimates have no value."""
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], **look(k), markersize=4, linewidth=0.9, label=method + _lost(rows[rows["method"] == method]))
-        for k, method in enumerate(settings.methods)
-    ]
-    longest = max(len(str(handle.get_label())) for handle in handles)
-    columns = max(1, min(len(handles), 90 // (longest + 8)))
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def _lost(rows: pd.DataFrame) -> str:

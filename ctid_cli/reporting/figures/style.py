@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -169,6 +169,15 @@ def columns_for(n: int) -> int:
 def size_for(n: int, columns: int | None = None) -> tuple[float, float]:
     """Width and height of a figure with n panels, a title and a legend [inch]."""
     return (7.5, 1.2 + 2.2 * -(-n // (columns or columns_for(n)))) if n > 1 else (5.5, 4.2)
+
+
+def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: int, **others: Any) -> None:
+    """Name series below a figure by their looks."""
+    from matplotlib.lines import Line2D
+
+    style = {"markersize": 4, "linewidth": 0.9}
+    handles = [Line2D([], [], **style | look, label=label) for label, look in looks.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, **others)
 
 
 def pointed(axes: Any, text: str, point: ArrayLike, place: ArrayLike, arrow: dict[str, Any], **style: Any) -> None:
