@@ -67,7 +67,7 @@ def test_every_option_has_a_check():
         (Multisine, BAND | {"highest_frequency": 2e9, "period": 9.0}, "is filled up to harmonic 10000"),
         (Multisine, BAND | {"highest_frequency": 1.1, "period": 1.0}, "no harmonic of 6.28319 rad/s in the band"),
         (Multisine, {"frequencies": (1.0, 2.0), "tones": 2}, "tones is of a band, and frequencies are given"),
-        (Multisine, {"frequencies": (1.0,), "spacing": "logarithmic"}, "spacing is how a band is filled"),
+        (Multisine, {"frequencies": (1.0,), "spacing": "logarithmic"}, "spacing is of a band"),
         (Multisine, {"frequencies": (1.0,), "period": 1e300}, "up to harmonic 1000000 of the period"),
         (Multisine, {"frequencies": (1.0, 1.0)}, "two of the frequencies are the same; leave"),
         (Multisine, {"frequencies": (1.0, 1.1), "period": 6.0}, "the same harmonic of the period"),
