@@ -384,22 +384,3 @@ def keep_readings(
                     best = k
             kept[best] = True
     return kept
-
-
-@njit(cache=True, nogil=True)
-def refute(
-    omega: Array, error: Array, window: IndexArray, comb: Array, bounds: IndexArray, covered: float
-) -> NDArray[np.bool_]:
-    """Return which readings are lines of a comb where a shorter window shows one tone that is elsewhere."""
-    refuted = np.zeros(omega.size, np.bool_)
-    gap, low, high = comb
-    for row in range(bounds.size - 1):
-        for k in range(bounds[row], bounds[row + 1]):
-            best = -1
-            if gap[k] > 0.0:
-                for j in range(bounds[row], bounds[row + 1]):
-                    shorter = window[j] < window[k] and window[j] * gap[k] < 2.0 * math.pi
-                    if shorter and low[k] < omega[j] < high[k] and (best < 0 or error[j] < error[best]):
-                        best = j
-            refuted[k] = best >= 0 and abs(omega[k] - omega[best]) > covered * error[best]
-    return refuted
