@@ -96,21 +96,15 @@ def track(
 
     load_matplotlib()
     found = options.follow(record)
-    from concurrent.futures import ThreadPoolExecutor
-
     from ctid_cli.canonical import plain
     from ctid_cli.reporting.column_file import frame_bytes, hdf5_bytes
     from ctid_cli.reporting.track_result import TrackResult
     from ctid_cli.storage.track_file import track_file_text
-    from ctid_cli.tones.residual import with_lines_left
 
-    with ThreadPoolExecutor(1) as thread:
-        drawn = thread.submit(TrackResult(found, record).drawing().saved)
-        found = with_lines_left(found, record.samples, record.interval)
     result = TrackResult(found, record, options.accuracy)
     text = track_file_text(found, plain(result.content()), file, reading, out, given_command(context))
     table = (hdf5_bytes if hdf5 else frame_bytes)(result.to_frame())
-    write_files(dict(zip(written, (table, drawn.result(), text.encode() + b"\n"), strict=True)))
+    write_files(dict(zip(written, (table, result.drawing().saved(), text.encode() + b"\n"), strict=True)))
     emit(result, form.form, written)
 
 

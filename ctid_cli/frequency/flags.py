@@ -24,12 +24,10 @@ class Flag(IntFlag):
     OUT_OF_BOUNDS = 64
     INCONSISTENT = 128
     NOT_CONVERGED = 256
-    LINE_LEFT = 512
     CHANGE = 1024
     UNRESOLVED = 2048
     INACCURATE = 4096
     ABSENT = 8192
-    UNCONFIRMED = 16384
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -54,12 +52,10 @@ MEANINGS: dict[Flag, str] = {
         "smaller h), or the estimate lags behind a change."
     ),
     Flag.NOT_CONVERGED: "The iterations did not converge; start closer, or use a longer record.",
-    Flag.LINE_LEFT: "A further line is near that the tones do not explain; ask for more tones.",
     Flag.CHANGE: "Frequency, amplitude or phase change here faster than any window can follow.",
     Flag.UNRESOLVED: "Another tone is so near that no window tells the two apart; use a longer record.",
     Flag.INACCURATE: "The standard error is larger than the accuracy that was asked for; allow more with --accuracy.",
     Flag.ABSENT: "The tone is not there, or not beyond doubt, at this instant.",
-    Flag.UNCONFIRMED: "No window around this instant in which nothing changes shows such a tone.",
 }
 
 

@@ -212,7 +212,7 @@ class Step(checks.Checked, Excitation):
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the step, which must come before the last instant; nothing is drawn."""
-        return _staircase(sample_times, (self.time,), (self.amplitude,))
+        return Steps((self.time,), (self.amplitude,)).generate(sample_times, rng)
 
 
 @dataclass(frozen=True)
@@ -250,22 +250,16 @@ class Steps(checks.Checked, Excitation):
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
         """Return the staircase, whose first step must come before the last instant; nothing is drawn."""
-        return _staircase(sample_times, self.times, self.levels)
-
-
-def _staircase(sample_times: Array, times: tuple[float, ...], levels: tuple[float, ...]) -> HeldSignal:
-    """Return values that are held from given instants on, over one record; zero before the first of them."""
-    start, end = float(sample_times[0]), float(sample_times[-1])
-    if times[0] >= end:
-        which = f"the {'first ' * (len(times) > 1)}step at {times[0]:g} s"
-        raise DataError(f"{which} comes too late for a record that ends at {end:g} s")
-    # What begins after the record, or ends before it, is not applied.
-    first = max(int(np.searchsorted(times, start, side="right")) - 1, 0)
-    last = int(np.searchsorted(times, end, side="right"))
-    breaks, values = np.maximum(times[first:last], start), np.array(levels[first:last], dtype=float)
-    if breaks[0] > start:
-        breaks, values = np.concatenate(([start], breaks)), np.concatenate(([0.0], values))
-    return HeldSignal(breaks, values)
+        start, end = float(sample_times[0]), float(sample_times[-1])
+        if self.times[0] >= end:
+            which = f"the {'first ' * (len(self.times) > 1)}step at {self.times[0]:g} s"
+            raise DataError(f"{which} comes too late for a record that ends at {end:g} s")
+        # What begins after the record, or ends before it, is not applied.
+        times = np.array([-np.inf, *self.times])
+        used = slice(
+            int(np.searchsorted(times, start, side="right")) - 1, int(np.searchsorted(times, end, side="right"))
+        )
+        return HeldSignal(np.maximum(times[used], start), np.array([0.0, *self.levels])[used])
 
 
 @dataclass(frozen=True)

@@ -107,10 +107,8 @@ class Multisine(checks.Checked, Excitation):
             raise OptionError("period", f"{what} up to harmonic {most} of the period; give a shorter one.")
 
     def _check_no_band(self) -> None:
-        if self.spacing != "linear":
-            raise OptionError("spacing", "spacing is how a band is filled, and frequencies are given; leave it out.")
-        for name in ("lowest_frequency", "highest_frequency", "tones"):
-            if getattr(self, name) is not None:
+        for name in ("lowest_frequency", "highest_frequency", "tones", "spacing"):
+            if getattr(self, name) != getattr(type(self), name):
                 raise OptionError(name, f"{name} is of a band, and frequencies are given; keep one of the two.")
 
     def _check_band(self) -> None:

@@ -152,7 +152,7 @@ class UniformIntervals(checks.Checked, Sampling):
 
     def times(self, rng: np.random.Generator) -> Array:
         """Return instants at intervals that are drawn."""
-        return _from_zero(rng.uniform(self.low, self.high, self.samples - 1))
+        return np.concatenate(([0.0], np.cumsum(rng.uniform(self.low, self.high, self.samples - 1))))
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class IrregularSampling(OfInterval):
     def times(self, rng: np.random.Generator) -> Array:
         """Return instants at intervals that are drawn."""
         low, high = (1 - self.spread) * self.interval, (1 + self.spread) * self.interval
-        return _from_zero(rng.uniform(low, high, self.samples - 1))
+        return UniformIntervals(low, high, self.samples).times(rng)
 
 
 @dataclass(frozen=True)
@@ -281,8 +281,3 @@ class InstantsFile(GivenInstants):
         if instants.size < 2:
             raise DataError(f"{self.file}: there is one instant, and a record has two or more")
         return instants
-
-
-def _from_zero(intervals: Array) -> Array:
-    """Return instants at given intervals [s], the first 0."""
-    return np.concatenate(([0.0], np.cumsum(intervals)))

@@ -129,11 +129,8 @@ class Columns:
 
     def _require_scale(self, what: str, values: Array, first: int, *limit: float) -> None:
         """Refuse a column in a unit in which nothing can be computed, and name the row of the largest value."""
-        try:
-            require_scale(f"{self.file}: {what}", values, *limit)
-        except DataError:
-            largest = first + int(np.nanargmax(np.abs(values)))
-            require_scale(f"{self.place(largest)}: {what}", values, *limit)
+        largest = first + int(np.nanargmax(np.abs(values)))
+        require_scale(f"{self.place(largest)}: {what}", values, *limit)
 
 
 @dataclass(frozen=True, eq=False)

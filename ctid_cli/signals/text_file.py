@@ -164,21 +164,18 @@ def _fields(line: str, separator: str) -> list[str]:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the separator that gives most lines one field for each of several columns."""
-    sizes, single = {}, []
-    agreeing = {}
-    for separator in SEPARATORS:
+    """Return the separator that gives most lines one field for each of several columns.
+
+    Where none does, there is one column, or the lines are refused where their fields are counted.
+    """
+
+    def fitness(separator: str) -> tuple[int, bool, bool, int]:
         names, *rows = (_fields(line, separator) for line in lines)
-        sizes[separator] = len(names)
-        agreeing[separator] = sum(len(row) == len(names) for row in rows) if len(names) > 1 else 0
-        if len(names) == 1 and all(_all_numbers(row) for row in rows):
-            single.append(separator)
-    best = max(SEPARATORS, key=lambda separator: agreeing[separator])
-    if agreeing[best]:
-        return best
-    # A file of one column has no separator; what fits none is refused where its fields are counted.
-    marked = [separator for separator in SEPARATORS if separator in lines[0] and separator != " "]
-    return single[0] if single and not marked else max(marked or SEPARATORS, key=lambda separator: sizes[separator])
+        agreeing = sum(len(row) == len(names) for row in rows) if len(names) > 1 else 0
+        one_column = len(names) == 1 and all(map(_all_numbers, rows))
+        return agreeing, separator in lines[0] and separator != " ", one_column, len(names)
+
+    return max(SEPARATORS, key=fitness)
 
 
 def _decimal(fields: Iterable[str]) -> str:
@@ -233,10 +230,10 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Columns:
     doubtful = set(np.flatnonzero(missing.all(axis=0)).tolist()) | ({last} if missing[:, last:].any() else set())
     left_out, notes = [], []
     for k, line in _lines(layout, doubtful):
-        fields = _fields(line, layout.separator)
-        if not fields:
+        cut = k == last and not line.endswith(("\r", "\n"))
+        if not _fields(line, layout.separator):
             left_out.append(k)
-        elif k == last and not line.endswith(("\r", "\n")) and _is_short(line, layout):
+        elif cut and len(_split(line, layout.separator)) < len(layout.columns):
             left_out.append(k)
             notes.append(f"Line {layout.first + k}, the last, breaks off before its last field; it was left out.")
     lines: Any = range(layout.first, layout.first + last + 1)
@@ -254,22 +251,15 @@ def _lines(layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
             yield from ((k, line) for k, line in enumerate(text) if k in rows)
 
 
-def _is_short(line: str, layout: Layout) -> bool:
-    """Return whether a line has fewer fields, empty ones included, than there are columns."""
-    fields = _fields(line, " ") if layout.separator == " " else line.split(layout.separator)
-    return len(fields) < len(layout.columns)
-
-
 class _Widened:
-    """A text with a line in front that has a field more than there are columns.
+    """A text with a line of names in front, one more than there are columns.
 
-    pandas then gives all lines that many: the last column is empty unless a line has too many fields.
+    pandas then gives all lines that many fields: the last one is empty unless a line has too many.
     """
 
     def __init__(self, text: io.TextIOBase, layout: Layout) -> None:
         self._text = text
-        fields = len(layout.columns) + 1
-        self._front = ("nan " * fields if layout.separator == " " else layout.separator * (fields - 1)) + "\n"
+        self._front = layout.separator.join(map(str, range(len(layout.columns) + 1))) + "\n"
 
     def read(self, size: int = -1) -> str:
         """Read the line in front, then the text."""
@@ -285,14 +275,13 @@ def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
     import pandas as pd  # a second of start-up time that only a command that reads a file should pay
 
     width = len(layout.columns)
-    options: Any = {"header": None, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
+    options: Any = {"header": 0, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
     options |= {"sep": r"\s+" if layout.separator == " " else layout.separator, "decimal": layout.decimal}
     options |= {"na_values": list(MISSING), "keep_default_na": False, "skip_blank_lines": False}
     options |= {"skipinitialspace": True, "dtype": float, "chunksize": ROWS, "engine": "c"}
     with layout.opened() as text:
         widened: Any = _Widened(text, layout)
-        for k, frame in enumerate(pd.read_csv(widened, **options)):
-            yield frame if k else frame.iloc[1:]
+        yield from pd.read_csv(widened, **options)
 
 
 def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:

@@ -6,7 +6,6 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.tones import constants as c
-from ctid_cli.tones.tone_kernels import refute
 from ctid_cli.tones.window_fit import WindowTones
 
 
@@ -197,9 +196,17 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
 
 def moving(r: Readings, bounds: IndexArray) -> BoolArray:
     """Return which readings are lines that one moving tone makes, as shorter windows show."""
-    if not (r.gap > 0.0).any():
-        return np.zeros(r.row.size, np.bool_)
-    refuted = refute(r.omega, r.error, r.window, np.stack((r.gap, r.low, r.high)), bounds, c.COVERED)
+    refuted = np.zeros(r.row.size, np.bool_)
+    for k in np.flatnonzero(r.gap > 0.0):
+        row = slice(bounds[r.row[k]], bounds[r.row[k] + 1])
+        omega, error, window = r.omega[row], r.error[row], r.window[row]
+        shorter = (window < r.window[k]) & (window * r.gap[k] < 2.0 * np.pi)
+        shorter &= (r.low[k] < omega) & (omega < r.high[k])
+        if shorter.any():
+            best = np.where(shorter, error, np.inf).argmin()
+            refuted[k] = abs(r.omega[k] - omega[best]) > c.COVERED * error[best]
+    if not refuted.any():
+        return refuted
     line = np.unique(np.column_stack((r.window, r.middle, r.tone)), axis=0, return_inverse=True)[1].ravel()
     share: Array = np.bincount(line, refuted) / np.bincount(line)
     return np.asarray(refuted | (share[line] > c.REFUTED))

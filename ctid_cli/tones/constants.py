@@ -186,20 +186,5 @@ SHORTEST_SPECTRUM = 64
 LONGEST_SPECTRUM = 2**15
 SPECTRUM_PADDING = 4
 UNKNOWN = 0.1
-#: A peak stands so many times (in amplitude) above the median of so many bins on each side, and above what leaks from
-#: larger ones; two peaks are so many bins apart, and so is the lowest one from zero. Below the last share of the
-#: largest is rounding of the transform.
-ABOVE_FLOOR = 5.0
-AROUND = 12
-ABOVE_LEAKAGE = 2.0
-CLOSEST = 1.5
-ROUNDING = 1e-9
-#: A line so many bins from where a tone has been may be what its rows do not follow of it; where that is leaves out so
-#: much on both sides [%]. A line of the signal is left if one is there so few bins away that is no more
-#: than so many times smaller.
-BESIDE_TONE = 4.0
-ASIDE = 1.0
-SAME_LINE = 0.5
-MOST_SHRUNK = 2.0
 #: The logarithm of an amplitude changes by no more than this on the way from its row.
 MOST_GROWN = 1.0

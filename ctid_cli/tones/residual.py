@@ -1,8 +1,5 @@
-"""What the tones of a track leave of its record, and the lines that stand out of it."""
+"""What the tones of a track leave of its record."""
 
-from collections.abc import Iterator
-from dataclasses import replace
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +9,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.tones import constants as c
 from ctid_cli.tones.condition import find_spikes
-from ctid_cli.tones.track import MissingLine, Track
+from ctid_cli.tones.track import Track
 
 
 class LeftOver(NamedTuple):
@@ -82,29 +79,6 @@ def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
     return None
 
 
-def with_lines_left(track: Track, samples: Array, interval: float) -> Track:
-    """Return a track that names no lines with those that stand out of what its tones leave."""
-    left = None if track.missing else left_over(samples, interval, track)
-    return track if left is None else replace(track, missing=tuple(islice(_lines(left, interval, track), 5)))
-
-
-def _lines(left: LeftOver, interval: float, track: Track) -> Iterator[MissingLine]:
-    """Return lines of what is left that the signal has too, the strongest first: rows that are wrong leave others."""
-    turn = 2.0 * np.pi / (left.size * interval)
-    bins, amplitudes = significant(left.residual_spectrum)
-    own_bins, own_amplitudes = significant(left.signal_spectrum)
-    ranges = [
-        np.percentile(column[np.isfinite(column)], [c.ASIDE, 100.0 - c.ASIDE]) / turn
-        for column in track.omega.T
-        if np.isfinite(column).any()
-    ]
-    for place, amplitude in zip(bins.tolist(), amplitudes.tolist(), strict=True):
-        near = any(low - c.BESIDE_TONE <= place <= high + c.BESIDE_TONE for low, high in ranges)
-        same = (np.abs(own_bins - place) < c.SAME_LINE) & (own_amplitudes < c.MOST_SHRUNK * amplitude)
-        if same.any() and not near:
-            yield MissingLine(place * turn, np.nan, amplitude)
-
-
 def synthesised(track: Track, t: Array) -> Array:
     """Return the sum of the tones of a track at some instants [s], shape (N,); NaN where a tone or its row is unknown.
 
@@ -146,30 +120,3 @@ def median_spectrum(values: Array, begins: Array, size: int) -> Array:
     # The mean of a segment, with the weights of the window.
     tapered -= tapered.sum(axis=1, keepdims=True) * taper
     return np.asarray(np.median(2.0 * np.abs(rfft(tapered, c.SPECTRUM_PADDING * size)), axis=0))
-
-
-def significant(spectrum: Array) -> tuple[Array, Array]:
-    """Return places [bins] and amplitudes of the peaks that are neither noise nor leakage, the largest first."""
-    coarse = spectrum[:: c.SPECTRUM_PADDING]
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(coarse, c.AROUND, mode="reflect"), 2 * c.AROUND + 1)
-    floor = np.repeat(np.median(around, axis=1), c.SPECTRUM_PADDING)
-    inner = spectrum[1:-1]
-    places = 1 + np.flatnonzero((inner > spectrum[:-2]) & (inner >= spectrum[2:]))
-    high = spectrum[places] > np.maximum(c.ABOVE_FLOOR * floor[places], c.ROUNDING * spectrum.max())
-    places = places[(places >= c.CLOSEST * c.SPECTRUM_PADDING) & high]
-    bins: list[float] = []
-    amplitudes: list[float] = []
-    for place in places[np.argsort(-spectrum[places])]:
-        # The top of a parabola. (That through the logarithms would be far off near a zero of the spectrum.)
-        left, top, right = spectrum[place - 1 : place + 2]
-        shift = 0.5 * (left - right) / (left - 2.0 * top + right)
-        bin_, amplitude = float(place + shift) / c.SPECTRUM_PADDING, float(top - 0.25 * (left - right) * shift)
-        distance = np.abs(np.array(bins) - bin_)
-        if bins and distance.min() < c.CLOSEST:
-            continue
-        # Envelope of the side lobes of the Hann window.
-        leakage = np.array(amplitudes) / (np.pi * distance * (distance**2 - 1.0))
-        if amplitude > c.ABOVE_LEAKAGE * leakage.sum():
-            bins.append(bin_)
-            amplitudes.append(amplitude)
-    return np.array(bins), np.array(amplitudes)

@@ -1,13 +1,12 @@
 """Compiled loops over the samples of windows: the fit of decaying chirps, and changes within a window."""
 
-import cmath
 import math
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.arrays import Array, BoolArray, ComplexArray, IndexArray
 
 #: Parameters of a tone over u in [-1, 1], the window: amplitudes a and b of ``exp(g u) (a cos + b sin)(w u + c u^2)``,
 #: then g, w and c.
@@ -48,83 +47,83 @@ def _product(one: Array, other: Array, count: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _first_phasors(tone: Array, du: float, phasors: Array) -> complex:
+def _phasor(growth: float, angle: float) -> complex:
+    """Return ``exp(growth + i angle)``; that of cmath takes longer to compile."""
+    size = math.exp(growth)
+    return complex(size * math.cos(angle), size * math.sin(angle))
+
+
+@njit(cache=True, nogil=True)
+def _first_phasors(tone: Array, du: float, phasors: ComplexArray) -> complex:
     """Fill in the phasors of the first chunk and their factors to the next one, and return the factor of those."""
     growth, turn, bend = tone[2], tone[3], tone[4]
     chunk = phasors.shape[1]
     ahead = chunk * du
     # phi(u + d) - phi(u) = w d + c (2 u d + d^2), at u = -1 to the next sample, and to the next chunk
-    z = cmath.exp(complex(-growth, bend - turn))
-    q = cmath.exp(complex(growth * du, turn * du + bend * (du * du - 2.0 * du)))
-    p = cmath.exp(complex(0.0, 2.0 * bend * du * du))
-    leap = cmath.exp(complex(growth * ahead, turn * ahead + bend * (ahead * ahead - 2.0 * ahead)))
-    longer = cmath.exp(complex(0.0, 2.0 * bend * ahead * du))
+    z = _phasor(-growth, bend - turn)
+    q = _phasor(growth * du, turn * du + bend * (du * du - 2.0 * du))
+    p = _phasor(0.0, 2.0 * bend * du * du)
+    leap = _phasor(growth * ahead, turn * ahead + bend * (ahead * ahead - 2.0 * ahead))
+    longer = _phasor(0.0, 2.0 * bend * ahead * du)
     for j in range(chunk):
-        phasors[0, j], phasors[1, j] = z.real, z.imag
-        phasors[2, j], phasors[3, j] = leap.real, leap.imag
+        phasors[0, j], phasors[1, j] = z, leap
         z *= q
         q *= p
         leap *= longer
-    return complex(cmath.exp(complex(0.0, 2.0 * bend * ahead * ahead)))
+    return _phasor(0.0, 2.0 * bend * ahead * ahead)
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
-def _take_tone(tone: Array, phasors: Array, there: Array, u: Array, rows: Array, left: Array) -> None:
-    """Take a tone from what is left of a chunk; ``rows`` are its derivatives by its parameters.
+def _take_tone(
+    tone: Array, phasors: ComplexArray, further: complex, there: Array, u: Array, rows: Array, left: Array
+) -> None:
+    """Take a tone from what is left of a chunk, and turn its phasors into those of the next one.
 
-    Short loops over few arrays each, which the compiler turns into vector instructions.
+    ``rows`` are its derivatives by its parameters. Short loops become vector instructions.
     """
-    real, imag = phasors[0], phasors[1]
+    now, leap = phasors[0], phasors[1]
     of_cosine, of_sine, of_growth, of_turn, of_bend = rows[0], rows[1], rows[2], rows[3], rows[4]
     cosine, sine = tone[0], tone[1]
     for j in range(left.size):
-        of_cosine[j] = there[j] * real[j]
-        of_sine[j] = there[j] * imag[j]
+        of_cosine[j] = there[j] * now[j].real
+        of_sine[j] = there[j] * now[j].imag
+        now[j] *= leap[j]
+        leap[j] *= further
     for j in range(left.size):
-        left[j] -= cosine * of_cosine[j] + sine * of_sine[j]
-    for j in range(left.size):
-        of_growth[j] = u[j] * (cosine * of_cosine[j] + sine * of_sine[j])
-    for j in range(left.size):
+        value = cosine * of_cosine[j] + sine * of_sine[j]
+        left[j] -= value
+        of_growth[j] = u[j] * value
         of_turn[j] = u[j] * (sine * of_cosine[j] - cosine * of_sine[j])
-    for j in range(left.size):
         of_bend[j] = u[j] * of_turn[j]
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _turn(phasors: Array, further: complex, scratch: Array) -> None:
-    """Turn the phasors of a chunk into those of the next one."""
-    for k in (0, 2):
-        real, imag = phasors[k], phasors[k + 1]
-        by_real, by_imag = phasors[2], phasors[3]
-        if k == 2:
-            for j in range(scratch.size):
-                scratch[j] = real[j] * further.real - imag[j] * further.imag
-            for j in range(scratch.size):
-                imag[j] = real[j] * further.imag + imag[j] * further.real
-        else:
-            for j in range(scratch.size):
-                scratch[j] = real[j] * by_real[j] - imag[j] * by_imag[j]
-            for j in range(scratch.size):
-                imag[j] = real[j] * by_imag[j] + imag[j] * by_real[j]
-        for j in range(scratch.size):
-            real[j] = scratch[j]
 
 
 @njit(cache=True, nogil=True)
 def _equations(
-    y: Array, there: Array, tones: Array, constant: float, gram: Array, right: Array, left: Array, work: Array
+    y: Array,
+    there: Array,
+    tones: Array,
+    constant: float,
+    gram: Array,
+    right: Array,
+    left: Array,
+    rows: Array,
+    phasors: ComplexArray,
 ) -> float:
-    """Normal equations ``gram step = right`` of all parameters, the constant last; what is left, and its squares."""
+    """Normal equations ``gram step = right`` of all parameters, the constant last; what is left, and its squares.
+
+    ``rows`` and ``phasors`` are working memory for a chunk of samples.
+    """
     length, n = y.size, tones.shape[0]
     last = PARAMETERS * n
-    chunk = work.shape[1]
-    rows, phasors, u, scratch = work[: last + 1], work[last + 1 : last + 1 + 4 * n], work[-2], work[-1]
+    chunk, u = rows.shape[1], rows[-1]
     du = 2.0 / (length - 1)
     further = np.empty(n, np.complex128)
     for k in range(n):
-        further[k] = _first_phasors(tones[k], du, phasors[4 * k : 4 * k + 4])
-    gram[: last + 1, : last + 1] = 0.0
-    right[: last + 1] = 0.0
+        further[k] = _first_phasors(tones[k], du, phasors[k])
+    for a in range(last + 1):
+        right[a] = 0.0
+        for b in range(a + 1):
+            gram[a, b] = 0.0
     total = 0.0
     for first in range(0, length, chunk):
         here = min(chunk, length - first)
@@ -132,14 +131,10 @@ def _equations(
         for j in range(here):
             u[j] = (first + j) * du - 1.0
             rest[j] = y[first + j] - constant * known[j]
+            rows[last, j] = known[j]
         for k in range(n):
             of_tone = rows[PARAMETERS * k : PARAMETERS * (k + 1)]
-            _take_tone(tones[k], phasors[4 * k : 4 * k + 4], known, u, of_tone, rest)
-            if first + chunk < length:
-                _turn(phasors[4 * k : 4 * k + 4], further[k], scratch)
-        # Assigning an array to a slice would take seconds to compile.
-        for j in range(here):
-            rows[last, j] = known[j]
+            _take_tone(tones[k], phasors[k], further[k], known, u, of_tone, rest)
         total += _product(rest, rest, here)
         for a in range(last + 1):
             right[a] += _product(rows[a], rest, here)
@@ -201,28 +196,21 @@ def _solve(factor: Array, scales: Array, right: Array, free: BoolArray, step: Ar
 
 
 @njit(cache=True, nogil=True)
-def _covariances(gram: Array, factor: Array, scales: Array, covariances: Array) -> None:
+def _covariances(
+    gram: Array, free: BoolArray, factor: Array, scales: Array, right: Array, column: Array, covariances: Array
+) -> None:
     """Compute the blocks of the inverse of the equations that belong to one tone each, shape (n, 5, 5)."""
-    size = scales.size
-    if not _factorise(gram, np.ones(size, np.bool_), RIDGE, factor, scales):
-        covariances[:] = np.nan
-        return
-    # Columns of the inverse of the factor; they are zero above the diagonal.
-    columns = np.empty((PARAMETERS, size))
-    for k in range(size // PARAMETERS):
-        begin = PARAMETERS * k
+    for i in range(scales.size):
+        free[i], right[i] = True, 0.0
+    known = _factorise(gram, free, RIDGE, factor, scales)
+    for i in range(scales.size - 1):
+        right[i] = 1.0
+        if known:
+            _solve(factor, scales, right, free, column)
+        right[i] = 0.0
+        k = i // PARAMETERS
         for a in range(PARAMETERS):
-            for i in range(begin, size):
-                value = 1.0 if i == begin + a else 0.0
-                for j in range(begin, i):
-                    value -= factor[i, j] * columns[a, j]
-                columns[a, i] = value / factor[i, i]
-            for b in range(a + 1):
-                total = 0.0
-                for i in range(begin, size):
-                    total += columns[a, i] * columns[b, i]
-                total /= scales[begin + a] * scales[begin + b]
-                covariances[k, a, b] = covariances[k, b, a] = total
+            covariances[k, i - PARAMETERS * k, a] = column[PARAMETERS * k + a] if known else math.nan
 
 
 @njit(cache=True, nogil=True)
@@ -259,7 +247,8 @@ def fit_windows(
     right, trial_right, step = np.zeros((3, most))
     left, trial_left, y, there = np.empty((4, length))
     factor, scales, free = np.zeros((most, most)), np.ones(most), np.ones(most, np.bool_)
-    work = np.zeros((most + 4 * parameters.shape[1] + 2, min(CHUNK, length)))
+    chunk = min(CHUNK, length)
+    rows, phasors = np.empty((most + 1, chunk)), np.empty((parameters.shape[1], 2, chunk), np.complex128)
     for row in chosen:
         n = used[row]
         tones = parameters[row, :n]
@@ -276,7 +265,7 @@ def fit_windows(
             residuals[row] = np.nan
             continue
         constant /= count
-        cost = _equations(y, there, tones, constant, gram, right, left, work)
+        cost = _equations(y, there, tones, constant, gram, right, left, rows, phasors)
         trial = np.empty_like(tones)
         for stage, steps in STAGES:
             damping, taken, done = DAMPING, 0, False
@@ -302,7 +291,7 @@ def fit_windows(
                     if gain <= SMALL_GAIN * cost / count or largest <= SMALL_STEP:
                         done = True
                     elif turned < LONGEST_STEP:
-                        lower = _equations(y, there, trial, level, trial_gram, trial_right, trial_left, work)
+                        lower = _equations(y, there, trial, level, trial_gram, trial_right, trial_left, rows, phasors)
                         if lower <= cost:
                             # Nearly every step is taken: its equations are those of the next one.
                             for k in range(n):
@@ -320,7 +309,7 @@ def fit_windows(
             converged[row] = done
         for j in range(length):
             residuals[row, j] = left[j] if there[j] else np.nan
-        _covariances(gram, factor, scales[:size], covariances[row])
+        _covariances(gram, free, factor, scales[:size], right, step, covariances[row])
 
 
 @njit(cache=True, nogil=True)
@@ -348,11 +337,11 @@ def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArr
             turn, bend = parameters[row, k, 3], parameters[row, k, 4]
             response = 0.0j
             for lag in range(filters.shape[1]):
-                response += filters[row, lag] * cmath.exp(complex(0.0, -turn * du * lag))
+                response += filters[row, lag] * _phasor(0.0, -turn * du * lag)
             phase = math.atan2(-sine, cosine) + math.atan2(response.imag, response.real)
-            z = cmath.exp(complex(0.0, turn - bend - phase))
-            q = cmath.exp(complex(0.0, -turn * du - bend * (du * du - 2.0 * du)))
-            p = cmath.exp(complex(0.0, -2.0 * bend * du * du))
+            z = _phasor(0.0, turn - bend - phase)
+            q = _phasor(0.0, -turn * du - bend * (du * du - 2.0 * du))
+            p = _phasor(0.0, -2.0 * bend * du * du)
             real, imag, largest, third = 0.0, 0.0, 0.0, 0.0
             for i in range(length):
                 u = du * i - 1.0
@@ -395,22 +384,3 @@ def keep_readings(
                     best = k
             kept[best] = True
     return kept
-
-
-@njit(cache=True, nogil=True)
-def refute(
-    omega: Array, error: Array, window: IndexArray, comb: Array, bounds: IndexArray, covered: float
-) -> NDArray[np.bool_]:
-    """Return which readings are lines of a comb where a shorter window shows one tone that is elsewhere."""
-    refuted = np.zeros(omega.size, np.bool_)
-    gap, low, high = comb
-    for row in range(bounds.size - 1):
-        for k in range(bounds[row], bounds[row + 1]):
-            best = -1
-            if gap[k] > 0.0:
-                for j in range(bounds[row], bounds[row + 1]):
-                    shorter = window[j] < window[k] and window[j] * gap[k] < 2.0 * math.pi
-                    if shorter and low[k] < omega[j] < high[k] and (best < 0 or error[j] < error[best]):
-                        best = j
-            refuted[k] = best >= 0 and abs(omega[k] - omega[best]) > covered * error[best]
-    return refuted

@@ -36,7 +36,7 @@ class MissingLine(NamedTuple):
 
     #: Frequency [rad/s].
     omega: float
-    #: Share of the rows in which it was left over; NaN where that is not known.
+    #: Share of the rows in which it was left over.
     share: float
     #: Amplitude where it was left over, a median [signal unit].
     amplitude: float

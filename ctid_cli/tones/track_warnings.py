@@ -40,7 +40,7 @@ def _missing_lines(track: Track) -> Iterator[str]:
 
 
 def _line_words(line: MissingLine) -> str:
-    rows = f", in {100 * line.share:.3g} % of the rows" if np.isfinite(line.share) else ""
+    rows = f", in {100 * line.share:.3g} % of the rows"
     return f"{line.omega / TURN:.6g} Hz (amplitude {line.amplitude:.3g}{rows})"
 
 

@@ -1,7 +1,5 @@
 """One sample in, one estimate out: the same numbers as of the whole record, however that is cut."""
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
@@ -10,8 +8,6 @@ from ctid_cli.frequency import delay_regression
 from ctid_cli.frequency.drem import DremFiniteTime, DremWindow
 from ctid_cli.frequency.flags import Flag
 from ctid_cli.frequency.restarting_least_squares import RestartingLeastSquares
-from ctid_cli.kinds import KINDS, classes
-from ctid_cli.specification.messages import option_docs
 from tests.frequency.signals import INTERVAL, OMEGA, online_estimators, tones
 
 ESTIMATORS = online_estimators()
@@ -69,12 +65,6 @@ def test_what_is_no_series_of_numbers_is_refused(samples):
         RestartingLeastSquares(tones=2, h=0.4).track(samples, INTERVAL)
 
 
-def test_integers_are_numbers():
-    y = np.round(100 * tones(2, 600).sum(axis=1)).astype(int)
-    options = RestartingLeastSquares(tones=2, h=0.4)
-    same(options.track(y, INTERVAL), options.track(y.astype(float), INTERVAL))
-
-
 @pytest.mark.parametrize("interval", [0.0, -0.1, np.nan, np.inf])
 @each
 def test_impossible_intervals_are_refused(options, interval):
@@ -89,18 +79,6 @@ def test_estimates_explain_themselves():
     assert estimate.flags[0] == Flag.STARTING
     assert estimate.reasons(0) == ("Too few samples have arrived since the start or since the last restart.",)
     assert online.update(1.0).t[0] == INTERVAL
-
-
-def test_the_table_of_estimators_names_all_kinds():
-    assert sorted(KINDS["frequency_estimator"]) == [
-        "drem_finite_time",
-        "drem_gradient",
-        "drem_window",
-        "restarting_least_squares",
-    ]
-    for kind, estimator in classes("frequency_estimator").items():
-        assert estimator.kind == kind
-        assert set(option_docs(estimator)) == {item.name for item in fields(estimator) if item.init}
 
 
 @pytest.mark.parametrize(

@@ -43,14 +43,6 @@ def test_regression_holds_from_2nh_on_and_not_before(n):
     assert np.abs(residual).max() <= 1e-12 * 2**n * AMPLITUDES[:n].sum()
 
 
-@pytest.mark.parametrize("n", range(1, 6))
-def test_rows_that_are_filtered_are_those_of_the_products(n):
-    y = tones(n, 2 * n * 7 + 40).sum(axis=1)
-    psi, phi = regression_rows(y, n, 7)
-    rows = RestartingLeastSquares(tones=n, h=0.07).start(0.01).rows(y)[0]
-    np.testing.assert_allclose(rows, np.column_stack([phi, psi]), rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize(("length", "difference"), [(0.0, 0.0), (1.0, 0.0), (0.0, 0.7), (1.0, 0.7), (0.013, 0.01)])
 def test_prefilter_is_a_hann_window_and_a_difference(length, difference):
     weights = RestartingLeastSquares(tones=1, h=0.4, prefilter=length, difference=difference).weights(0.01)

@@ -33,13 +33,8 @@ def alarms(track):
 
 @pytest.mark.parametrize("n", range(1, 6))
 def test_estimate_is_least_squares_over_all_rows(n):
-    y = noisy(n)
-    rows = rows_of(y, n)
-    theta = np.linalg.lstsq(rows[:, :n], rows[:, n], rcond=None)[0]
-    track = tracker(n).track(
-        y[: -((y.size - 2 * n * LAG) % 10) or None], INTERVAL
-    )  # the estimate is refreshed every ten rows
-    rows = rows[: track.t.size - 2 * n * LAG]
+    y = noisy(n)[: 1500 - (1500 - 2 * n * LAG) % 10]  # the estimate is refreshed every ten rows
+    track, rows = tracker(n).track(y, INTERVAL), rows_of(y, n)
     theta = np.linalg.lstsq(rows[:, :n], rows[:, n], rcond=None)[0]
     np.testing.assert_allclose(track.frequencies[-1], frequencies_of(theta, H)[0], atol=1e-7)
 
@@ -94,15 +89,6 @@ def test_a_step_raises_one_alarm_and_is_exact_again_after_the_flush():
         assert np.abs(track.frequencies[alarm + flush + 20 :] - [1.3, 2.5]).max() < 1e-8
         assert track.valid[-500:].all()
         assert not track.valid[alarm : alarm + flush + 2 * LAG // 4].any()
-
-
-def test_amplitudes_may_change():
-    y = tones(2, 3000)
-    y[1500:, 0] *= 1.7
-    track = tracker().track(y.sum(axis=1), INTERVAL)
-    assert alarms(track).size == 1
-    assert np.abs(track.frequencies[track.valid] - OMEGA[2]).max() < 1e-8
-    assert track.valid[-500:].all()
 
 
 def test_noise_raises_no_alarm_but_a_step_does():
@@ -228,13 +214,6 @@ def test_a_sample_that_is_missing_during_the_flush_is_a_gap_too():
     assert Flag(int(track.flags[1520])) & (Flag.GAP | Flag.CHANGED) == Flag.GAP | Flag.CHANGED
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"memory": 0.0}, "memory must be a positive number"),
-        ({"solution": "best"}, "solution must be 'least_squares' or 'total_least_squares', not 'best'"),
-    ],
-)
-def test_impossible_options_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        tracker(**options)
+def test_an_unknown_solution_is_refused():
+    with pytest.raises(ValueError, match="solution must be 'least_squares' or 'total_least_squares', not 'best'"):
+        tracker(solution="best")

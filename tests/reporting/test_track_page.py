@@ -27,7 +27,7 @@ def track(**known):
     shape = (ROWS.size, 1)
     phase = (2 * np.pi * 12.0 * ROWS)[:, None]
     flags = np.zeros(ROWS.size, np.uint16)
-    flags[:20] = int(Flag.LINE_LEFT)
+    flags[:20] = int(Flag.UNRESOLVED)
     lines = (MissingLine(2 * np.pi * 19.0, 0.9, 0.1),)
     parts = {"error": np.full(shape, 0.01), "amplitudes": np.full(shape, 2.0), "window": np.full(shape, 0.2)}
     parts |= {"phase": phase, "missing": lines} | known

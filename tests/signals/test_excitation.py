@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctid_cli.errors import DataError
-from ctid_cli.signals.excitation import TAPS, Gaussian, Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
+from ctid_cli.signals.excitation import Gaussian, Gbn, InputFile, Prbs, Step, Steps, maximal_length_sequence
 from ctid_cli.signals.multisine import Multisine
 from ctid_cli.signals.noise import stream
 from ctid_cli.signals.sampling import UniformIntervals
@@ -14,14 +14,6 @@ from ctid_cli.signals.sampling import UniformIntervals
 
 def rng(replicate=0):
     return stream(7, "input", replicate)
-
-
-def register(stages, length, state):
-    """The shift register itself, bit by bit."""
-    bits = [(state >> k) & 1 for k in range(stages)]
-    while len(bits) < length:
-        bits.append(int(np.bitwise_xor.reduce([bits[tap - stages] for tap in (0, *TAPS[stages])])))
-    return bits[:length]
 
 
 # --- binary inputs --------------------------------------------------------------------------------
@@ -35,12 +27,6 @@ def test_register_visits_every_state_but_zero_and_has_two_correlations(stages):
     assert np.array_equal(np.sort(states), np.arange(1, period + 1))
     correlation = np.fft.irfft(np.abs(np.fft.rfft(2.0 * bits[:period] - 1)) ** 2, n=period)
     np.testing.assert_allclose(correlation, [period, *[-1.0] * (period - 1)], atol=1e-9 * period)
-
-
-@given(st.data(), st.sampled_from(sorted(TAPS)), st.integers(1, 500))
-def test_the_sequence_is_that_of_the_register(data, stages, length):
-    state = data.draw(st.integers(1, 2**stages - 1))
-    assert maximal_length_sequence(stages, length, state).tolist() == register(stages, length, state)
 
 
 def test_an_edge_at_the_last_sample_counts_whatever_the_rounding():

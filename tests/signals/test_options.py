@@ -10,17 +10,15 @@ from ctid_cli.signals.excitation import Gaussian, Gbn, InputFile, Prbs, Step, St
 from ctid_cli.signals.multisine import Multisine
 from ctid_cli.signals.noise import ArmaNoise, WhiteNoise
 from ctid_cli.signals.sampling import (
-    InstantsFile,
     IrregularSampling,
     JitteredSampling,
-    RegularSampling,
     UniformIntervals,
     geometric_sizes,
 )
-from ctid_cli.signals.sinusoids import Piece, SineDisturbance, SumOfSinusoids, Tone
+from ctid_cli.signals.sinusoids import Piece, SumOfSinusoids, Tone
 
 BAND = {"lowest_frequency": 1.0, "highest_frequency": 2.0}
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 
 
 def has_check(hint):
@@ -45,13 +43,10 @@ def test_every_option_has_a_check():
         (Prbs, {"stages": 21, "clock_period": 1.0}, "stages must be an integer from 2 to 20, not 21"),
         (Prbs, {"stages": 4.0, "clock_period": 1.0}, "stages must be an integer from 2 to 20, not 4.0"),
         (Prbs, {"stages": 10, "clock_period": NAN}, r"clock_period must be a positive number \[s\], not nan"),
-        (Prbs, {"stages": 10, "clock_period": None}, r"clock_period must be a positive number \[s\], not None"),
         (Prbs, {"stages": 10, "clock_period": 1.0, "amplitude": True}, "amplitude must be a positive number"),
         (Gbn, {"clock_period": 1.0, "switching_probability": 1.5}, r"above 0 and at most 1 \[-\], not 1.5"),
         (Gaussian, {"clock_period": 0.0}, "clock_period must be a positive number"),
         (Step, {"amplitude": 0.0}, "amplitude must not be zero"),
-        (Step, {"amplitude": INF}, "amplitude must be a finite number"),
-        (Step, {"time": -1.0}, "time must be zero or a positive number"),
         (Steps, {"times": (0.0, 1.0), "levels": (1.0,)}, "as many as times, and there are 1 of them and 2 times"),
         (Steps, {"times": (1.0, 1.0), "levels": (1.0, 2.0)}, r"must increase from 0 s on; they are \[1.0, 1.0\] s"),
         (Steps, {"times": (0.0,), "levels": (0.0,)}, "levels must not all be zero"),
@@ -61,17 +56,15 @@ def test_every_option_has_a_check():
         (Multisine, {}, "lowest_frequency is missing"),
         (Multisine, {"lowest_frequency": 2.0, "highest_frequency": 1.0, "tones": 3}, "they are 2 and 1 rad/s"),
         (Multisine, {"lowest_frequency": 2.0, "highest_frequency": 2.0, "tones": 3}, "3 tones need a band"),
-        (Multisine, BAND | {"tones": 0}, "tones must be an integer of at least 1, not 0"),
         (Multisine, BAND, "tones is missing: the number of tones; with a period"),
         (Multisine, BAND | {"period": 9.0, "spacing": "logarithmic"}, "tones is missing"),
         (Multisine, BAND | {"highest_frequency": 2e9, "period": 9.0}, "is filled up to harmonic 10000"),
         (Multisine, BAND | {"highest_frequency": 1.1, "period": 1.0}, "no harmonic of 6.28319 rad/s in the band"),
         (Multisine, {"frequencies": (1.0, 2.0), "tones": 2}, "tones is of a band, and frequencies are given"),
-        (Multisine, {"frequencies": (1.0,), "spacing": "logarithmic"}, "spacing is how a band is filled"),
+        (Multisine, {"frequencies": (1.0,), "spacing": "logarithmic"}, "spacing is of a band"),
         (Multisine, {"frequencies": (1.0,), "period": 1e300}, "up to harmonic 1000000 of the period"),
         (Multisine, {"frequencies": (1.0, 1.0)}, "two of the frequencies are the same; leave"),
         (Multisine, {"frequencies": (1.0, 1.1), "period": 6.0}, "the same harmonic of the period"),
-        (Multisine, {"frequencies": (1.0, -1.1)}, r"each of the frequencies must be a positive number \[rad/s\]"),
         (WhiteNoise, {}, "exactly one of snr_db .*, standard_deviation .*, variance .*; none was given"),
         (WhiteNoise, {"snr_db": 5.0, "standard_deviation": 1.0}, "snr_db and standard_deviation were given"),
         (WhiteNoise, {"variance": -0.1}, r"variance must be zero or a positive number \[output unit\^2\], not -0.1"),
@@ -85,24 +78,18 @@ def test_every_option_has_a_check():
         (ArmaNoise, {"numerator": (1.0,), "denominator": (0.0, 1.0)}, "the first coefficient of denominator is zero"),
         (ArmaNoise, {"numerator": (), "denominator": (1.0,)}, "numerator must hold at least one coefficient"),
         (ArmaNoise, {"numerator": (1.0, NAN), "denominator": (1.0,)}, "a coefficient of numerator must be a finite"),
-        (RegularSampling, {"interval": 0.1, "samples": 10.5}, "samples must be an integer of at least 2, not 10.5"),
         (UniformIntervals, {"low": 0.2, "high": 0.1, "samples": 10}, "must not exceed high; they are 0.2 s and 0.1 s"),
         (IrregularSampling, {"interval": 0.1, "samples": 9, "spread": 1.0}, r"above 0 and below 1 \[-\], not 1.0"),
         (JitteredSampling, {"interval": 0.1, "samples": 9, "largest_shift": 0.05}, r"than half the interval, 0\.05 s"),
-        (InstantsFile, {"file": "a.csv", "input_record": ""}, "input_record must be 'sampled' or 'exact', not ''"),
         (geometric_sizes, {"first": 500, "last": 500, "count": 3}, "must be below the last; they are 500 and 500"),
         (geometric_sizes, {"first": 2, "last": 5, "count": 9}, "no 9 different sizes from 2 to 5"),
-        (geometric_sizes, {"first": 0, "last": 5, "count": 2}, "first size must be an integer of at least 1, not 0"),
         (Tone, {"frequency": 0.0}, "frequency must be a positive number"),
-        (Tone, {"frequency": 1.0, "amplitude": -1.0}, "amplitude must be a positive number"),
         (Tone, {"frequency": (Piece(1.0, 2.0),)}, "the last has none"),
         (Tone, {"frequency": (Piece(1.0), Piece(2.0))}, "needs 'until'"),
         (Tone, {"frequency": (Piece(1.0, 3.0), Piece(2.0, 2.0), Piece(1.0))}, "follow one another"),
         (SumOfSinusoids, {"tones": ()}, "tones must hold at least one"),
         (SumOfSinusoids, {"tones": (Tone(1.0), Tone(1.0))}, "same frequency from 0 s"),
         (SumOfSinusoids, {"tones": (Tone(1.0), Tone((Piece(2.0, 4.0), Piece(1.0))))}, "same frequency from 4 s"),
-        (SumOfSinusoids, {"tones": (Tone(1.0),), "phase_at_steps": "smooth"}, "phase_at_steps must be"),
-        (SineDisturbance, {"amplitude": 1.0, "frequency": -1.0}, "frequency must be a positive number"),
     ],
 )
 def test_impossible_options_are_refused(make, options, message):

@@ -145,22 +145,6 @@ def test_other_refusals(tmp_path):
         read_sampled_signal(write(tmp_path / "a.csv", (np.arange(9.0), np.full(9, np.nan)), "t,y"))
 
 
-def test_a_flac_file_is_read_as_a_wav_file_is(tmp_path):
-    soundfile = pytest.importorskip("soundfile")
-    data = np.round(20000 * np.column_stack((np.sin(0.1 * np.arange(500)), np.cos(0.1 * np.arange(500))))).astype(
-        "int16"
-    )
-    soundfile.write(tmp_path / "a.flac", data, 8000)
-    soundfile.write(tmp_path / "a.wav", data, 8000)
-    for channel in (None, "channel 2"):
-        one, other = (read_sampled_signal(tmp_path / name, signal=channel) for name in ("a.flac", "a.wav"))
-        assert one.samples.tolist() == other.samples.tolist()
-        assert (one.interval, one.notes) == (other.interval, other.notes)
-    (tmp_path / "b.flac").write_bytes(b"fLaC, but no more")
-    with pytest.raises(DataError, match="not a FLAC file, or a damaged one"):
-        read_sampled_signal(tmp_path / "b.flac")
-
-
 def test_without_soundfile_it_is_said_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     (tmp_path / "a.flac").write_bytes(b"fLaC")

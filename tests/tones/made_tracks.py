@@ -28,7 +28,7 @@ def coming_later():
     """Tones of which one is there for a part, with a line left over."""
     flags = np.zeros((ROWS, 2), np.uint16)
     flags[:20, 1] = int(Flag.ABSENT)
-    flags[20:25, 1] = int(Flag.LINE_LEFT)
+    flags[20:25, 1] = int(Flag.UNRESOLVED)
     lines = (MissingLine(2 * np.pi * 85.0, 0.9, 0.1), MissingLine(2 * np.pi * 120.0, 0.25, 0.02))
     track = make_track(error=np.full((ROWS, 2), 0.01), window=np.full((ROWS, 2), 0.2))
     omega = track.omega.copy()

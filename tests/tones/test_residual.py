@@ -1,6 +1,5 @@
-"""Lines that the tones of a track leave over."""
+"""What the tones of a track leave of its record."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,43 +7,12 @@ import pytest
 
 from ctid_cli.tones.condition import find_spikes
 from ctid_cli.tones.constants import SPIKE_AROUND, SPIKE_TIMES, SPIKE_WIDTH
-from ctid_cli.tones.residual import left_over, with_lines_left, without_spikes
-from ctid_cli.tones.track import MissingLine, Track
+from ctid_cli.tones.residual import left_over, without_spikes
 from ctid_cli.tones.track import track as follow
 
 INTERVAL = 0.002
 T = INTERVAL * np.arange(10_000)
 NOISE = 0.01 * np.random.default_rng(0).standard_normal(T.size)
-
-
-def tracked(y, tones):
-    return with_lines_left(
-        replace(follow(SimpleNamespace(samples=y, interval=INTERVAL), tones), missing=()), y, INTERVAL
-    )
-
-
-def test_a_second_tone_that_nobody_asked_for_is_named():
-    y = np.sin(2 * np.pi * 60.0 * T) + 0.1 * np.sin(2 * np.pi * 85.0 * T) + NOISE
-    (line,) = tracked(y, 1).missing
-    assert line.omega / (2 * np.pi) == pytest.approx(85.0, abs=0.05)
-    assert line.amplitude == pytest.approx(0.1, rel=0.05)
-    assert tracked(y, 2).missing == ()
-
-
-def test_a_tone_that_moves_leaves_no_line_beside_itself():
-    y = np.sin(2 * np.pi * (60.0 * T + 0.2 * T**2)) + NOISE
-    assert tracked(y, 1).missing == ()
-
-
-def test_a_method_that_names_lines_itself_is_believed():
-    lines = (MissingLine(300.0, 1.0, 0.1),)
-    track = Track.of(T[:3], np.full((3, 1), 100.0), np.zeros(3, np.uint16), INTERVAL, missing=lines)
-    assert with_lines_left(track, NOISE, INTERVAL) is track
-
-
-def test_where_nothing_is_known_nothing_is_named():
-    track = Track.of(T[:3], np.full((3, 1), 100.0), np.zeros(3, np.uint16), INTERVAL)
-    assert with_lines_left(track, NOISE, INTERVAL).missing == ()
 
 
 def test_a_spike_is_not_what_the_tones_leave():
