@@ -20,6 +20,12 @@ from ctid_cli.reporting.records import Records
 
 #: Rows of the printed table.
 ROWS = 12
+#: Mark of a structure that cannot be chosen, whatever its criterion, and what it means.
+NO_CANDIDATE = "no"
+ABOUT_NO_CANDIDATE = (
+    "- Not to be chosen (no): the data do not determine the parameters, or a pair is held at the least damping or the "
+    "greatest frequency that is admitted, where it follows this record's noise."
+)
 STRUCTURE = ("poles", "zeros", "integrators")
 FORMATS = {**dict.fromkeys(("fit %", "validation %"), ".2f"), "criterion": "+.1f"}
 
@@ -46,6 +52,8 @@ class OrderSearchResult(Result):
         verdict = f"Chosen: {spelled(choice.ranking.best)}." if choice.seen else choice.why_none
         formats = FORMATS | {f"delay [{self.records.units.time}]": ".4g"}
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
+        if any(not each.candidate.is_admissible for each in self.judged[:ROWS]):
+            notes.append(ABOUT_NO_CANDIDATE)
         if len(self.judged) > ROWS:
             notes.append(f"- The best {ROWS} of {len(self.judged)} structures; all are in order.json.")
         frame = self.to_frame().head(ROWS)
@@ -65,7 +73,7 @@ class OrderSearchResult(Result):
         least = self.choice.ranking.best.criterion
         rows = [
             {
-                "chosen": "*" if k == 0 and self.choice.seen else "",
+                "chosen": "*" if k == 0 and self.choice.seen else NO_CANDIDATE * (not each.candidate.is_admissible),
                 **picked(each.candidate.options, STRUCTURE),
                 "criterion": each.candidate.criterion - least,
                 "fit %": each.candidate.fit.fit_percent,
