@@ -96,13 +96,13 @@ class Ranking:
         return Ranking(tuple(found), self.noise) if found else None
 
     def runner_up(self, *names: str) -> Candidate | None:
-        """Return the first admissible one whose hold or options of these names are not those of the best, or None."""
+        """Return the first candidate that the best is better than and that differs in its hold or options, or None."""
 
         def key(each: Candidate) -> tuple[object, ...]:
             return tuple(each.hold if name == "hold" else getattr(each.options, name) for name in names)
 
         others = (each for each in self.candidates if key(each) != key(self.best))
-        return next((each for each in others if each.is_admissible), None)
+        return next((each for each in others if each.criterion >= self.best.criterion), None)
 
 
 def ranked(candidates: Sequence[Candidate]) -> Ranking:

@@ -267,7 +267,7 @@ class _Sentences:
             )
         ended = "its end is not seen" if not math.isnan(ratio.value) else ""
         if not math.isnan(time.value):
-            ended = f"63 % of it are reached after {self._interval(time, self.time)}"
+            ended = f"63 % of it is reached after {self._interval(time, self.time)}"
         return Finding("ok", "response", "; ".join(filter(None, [*parts, ended])) + ".")
 
     def _interval(self, estimate: Estimate | SlowTerm, unit: str) -> str:
