@@ -159,9 +159,13 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     assert found.validation.fit_percent > 85
 
 
-def test_a_chosen_model_that_does_not_carry_over_is_said():
+def test_a_validation_record_is_judged_and_enters_nothing_else():
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
-    assert "it does not carry over" in identify(record_of(SECOND), validation=other).warnings[0]
+    alone, judged = (identify(record_of(SECOND), validation=each) for each in (None, other))
+    first, *others = judged.warnings
+    assert "it does not carry over" in first
+    assert (judged.choices, judged.options, others) == (alone.choices, alone.options, list(alone.warnings))
+    np.testing.assert_array_equal(judged.fit.theta, alone.fit.theta)
 
 
 def test_no_response_is_no_model():
