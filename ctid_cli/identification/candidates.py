@@ -10,7 +10,7 @@ from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_o
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.delay_profile import DelayProfile, fitted
-from ctid_cli.identification.criterion import Candidate, Ranking, ranked
+from ctid_cli.identification.criterion import Candidate, Ranking, penalised, ranked
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -21,6 +21,9 @@ from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
 MOST_POLES = 12
 #: The grid ends this many poles above the order of the best structure, and at this order at the least.
 BEYOND, FEWEST_TRIED = 2, 4
+#: It ends at this order at the least while each more pole pays even if the rest is taken as white noise: what the
+#: closest fit misses of the response would pass as coloured noise.
+TRIED_AGAINST_NOISE = 6
 #: From then on a number of integrators whose best structure is so far behind is left out.
 BEHIND = 30.0
 #: All poles and zeros of the structures that settings of records are compared with.
@@ -193,12 +196,24 @@ def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[
             break
         if order >= FEWEST_TRIED and found:
             ranking = ranked(found)
-            if order - ranking.best.options.order >= BEYOND:
+            inside = order - ranking.best.options.order >= BEYOND
+            if inside and (order >= TRIED_AGAINST_NOISE or not still_pays(ranking, order)):
                 break
             families = [family for family in families if _promising(family, ranking)]
     if not found:
         raise DataError(f"{named(records[0])}too few usable samples for a model's parameters; take a longer record")
     return ranked(found)
+
+
+def still_pays(ranking: Ranking, order: int) -> bool:
+    """Whether structures of about the greatest order are the best of those that leave white noise."""
+    best = min((each for each in ranking.candidates if each.is_admissible), key=_criterion_in_white_noise, default=None)
+    return best is not None and order - best.options.order < BEYOND
+
+
+def _criterion_in_white_noise(candidate: Candidate) -> float:
+    fit = candidate.fit
+    return penalised(fit.cost * fit.count, fit.count, candidate.size)
 
 
 def _promising(family: Structures, ranking: Ranking) -> bool:

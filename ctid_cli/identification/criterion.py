@@ -29,6 +29,8 @@ from ctid_cli.signals.treatment import Hold
 #: What a parameter counts over its share in BIC. Of 134 simulated records of known structure, models so chosen had at
 #: most 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
 PENALTY = 1.5
+#: Names of the bounds at which a pair follows an oscillation of this record's noise.
+UNDAMPED = frozenset({"least_damping", "imaginary"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +61,11 @@ class Candidate:
     criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
 
     @property
-    def is_determined(self) -> bool:
-        """Whether the data determine its parameters: without that it has no standard errors."""
-        return self.fit.condition_number <= LARGEST_CONDITION
+    def is_admissible(self) -> bool:
+        """Whether the data determine its parameters, and less damping than is admitted would not improve it."""
+        box, held = self.fit.box, self.fit.held_poles
+        undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
+        return self.fit.condition_number <= LARGEST_CONDITION and not undamped
 
     @property
     def name(self) -> str:
@@ -72,7 +76,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """Candidates, the least criterion first and those whose parameters the data do not determine last; their noise."""
+    """Candidates, the least criterion first and those that are not admissible last; their noise."""
 
     candidates: tuple[Candidate, ...]
     noise: NoiseModel
@@ -92,19 +96,21 @@ class Ranking:
         return Ranking(tuple(found), self.noise) if found else None
 
     def runner_up(self, *names: str) -> Candidate | None:
-        """Return the first candidate whose hold or options of these names are not those of the best; None without."""
+        """Return the first candidate that the best is better than and that differs in its hold or options, or None."""
 
         def key(each: Candidate) -> tuple[object, ...]:
             return tuple(each.hold if name == "hold" else getattr(each.options, name) for name in names)
 
-        return next((each for each in self.candidates if key(each) != key(self.best)), None)
+        others = (each for each in self.candidates if key(each) != key(self.best))
+        return next((each for each in others if each.criterion >= self.best.criterion), None)
 
 
 def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Return candidates by their criterion; all must have been fitted to the same samples."""
-    noise = noise_of(min(candidates, key=lambda each: each.fit.cost).fit.residuals)
+    closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
+    noise = noise_of(closest.fit.residuals)
     judged = sorted(
-        (_judged(each, noise) for each in candidates), key=lambda each: (not each.is_determined, each.criterion)
+        (_judged(each, noise) for each in candidates), key=lambda each: (not each.is_admissible, each.criterion)
     )
     return Ranking(tuple(judged), noise)
 

@@ -195,7 +195,9 @@ def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
     """That a fit is low, and what did not raise it; with outliers it always is."""
     if fit.fit_percent < LOW_FIT and fit.weighting is None and fit.noise is None:
         what = f"The fit is {fit.fit_percent:.1f} %: {100 * (1 - fit.r2):.2g} % of the output's variance is left"
-        yield f"{what}; tried without gain: {', '.join(tried.without_gain)}" if tried.without_gain else what
+        words = (word for option in tried.without_gain for word in option.split())
+        names = list(dict.fromkeys(word for word in words if word.startswith("--")))
+        yield f"{what}; tried without gain: other values of {listed(names)}" if names else what
 
 
 def _of_noise(fit: MeasuredFit) -> Iterator[str]:

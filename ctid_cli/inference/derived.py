@@ -141,7 +141,7 @@ class _Rows:
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
         """Reason for which pole k has no standard error, or nothing."""
         if indistinct(poles, k, slope, others, self._own(slope.size), self._reach):
-            return "This pole is so close to another that these data cannot tell them apart; fewer poles may do."
+            return "This pole has no standard error: so far as these data determine it, it may be another pole too."
         return ""
 
 

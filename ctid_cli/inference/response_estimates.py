@@ -48,7 +48,10 @@ UNKNOWN = Estimate()
 
 
 def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
-    """Return the variance of the response to the input over that of the noise [dB], beside columns of X."""
+    """Return the variance of the response to the input over that of the noise [dB], beside columns of X.
+
+    Both are taken about their means over the record.
+    """
     from scipy.special import chdtri
 
     columns, variance = model.layout.columns[:, : model.layout.taps], model.noise.innovation_variance
@@ -65,9 +68,18 @@ def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
     fitted = float(np.sum(model.directions.squares > 1))
     worth = max(2.0, len(columns) / squared_correlations(model.noise) - fitted)
     worth = SPARE * 2 / (2 / worth + error**2)
-    ratio = power / float(model.noise.first_autocovariances[0])
+    ratio = power / variance_about_mean(model.noise, len(columns))
     low, high = (ratio * chdtri(worth, tail) / worth for tail in reversed(TAILS))
     return Estimate(*(10 * math.log10(each) for each in (ratio, low, high)))
+
+
+def variance_about_mean(noise: NoiseModel, count: int) -> float:
+    """Mean variance of so many successive samples of a noise about their own mean.
+
+    Noise that is slow for a record wanders far beyond what the record shows of it.
+    """
+    of_mean = float(noise.covariance_of(np.full((count, 1), 1 / count))[0, 0])
+    return float(noise.first_autocovariances[0]) - of_mean
 
 
 def squared_correlations(noise: NoiseModel) -> float:

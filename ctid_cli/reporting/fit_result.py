@@ -172,7 +172,7 @@ class FitResult(PagedResult):
             yield "start", fit.start_method
         yield (
             "initial state",
-            f"{TREATMENTS[options.initial_state]}{_before(self.fitted)} (--initial-state {options.initial_state})",
+            f"{TREATMENTS[options.initial_state]}{_before(self.fitted, options.initial_state)}",
         )
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
         yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
@@ -281,11 +281,14 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
-def _before(result: Identification) -> str:
-    """Return the input before the record, where it is not zero."""
-    before = getattr(result.options, "input_before", None)
+def _before(result: Identification, state: str) -> str:
+    """Return the input before the record, where it is not zero, and the options for it and for the state."""
+    before, state = getattr(result.options, "input_before", None), f"--initial-state {state}"
+    if before is None:
+        return f" ({state})"
     levels = ", ".join(f"{level:.6g}" for level in result.fit.input_offsets)
-    return "" if before is None else f", with the input at {levels} (--input-before {before})"
+    typed = before if before == "first" else f"{before:g}"
+    return f", with the input at {levels} ({state} --input-before {typed})"
 
 
 def _offset(result: Identification, units: Units) -> str:

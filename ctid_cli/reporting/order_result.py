@@ -24,6 +24,12 @@ if TYPE_CHECKING:
 
 #: Rows of the printed table.
 ROWS = 12
+#: Mark of a structure that cannot be chosen, whatever its criterion, and what it means.
+NO_CANDIDATE = "no"
+ABOUT_NO_CANDIDATE = (
+    "- Not to be chosen (no): the data do not determine the parameters, or a pair is held at the least damping or the "
+    "greatest frequency that is admitted, where it follows this record's noise."
+)
 STRUCTURE = ("poles", "zeros", "integrators")
 
 
@@ -47,6 +53,8 @@ class OrderSearchResult(Result):
         choice = self.choice
         verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.seen else choice.why_none
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
+        if any(not each.candidate.is_admissible for each in self.judged[:ROWS]):
+            notes.append(ABOUT_NO_CANDIDATE)
         if len(self.judged) > ROWS:
             notes.append(f"- The best {ROWS} of {len(self.judged)} structures; all are in order.json.")
         return [
@@ -104,7 +112,10 @@ class OrderSearchResult(Result):
             Column("delay", form=".4g", unit=self.records.units.time),
         )
         rows = [self._content(each) for each in self.judged[:most]]
-        marked = [row | {"chosen": "*" * (k == 0 and self.choice.seen)} for k, row in enumerate(rows)]
+        marks = [NO_CANDIDATE * (not each.candidate.is_admissible) for each in self.judged[:most]]
+        if marks and self.choice.seen:
+            marks[0] = "*"
+        marked = [row | {"chosen": mark} for row, mark in zip(rows, marks, strict=True)]
         return Section.table(marked, columns, **parts)
 
     def content(self) -> dict[str, Any]:

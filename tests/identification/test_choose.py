@@ -7,6 +7,7 @@ import pytest
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.identification.candidates import still_pays
 from ctid_cli.identification.criterion import ranked
 
 SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
@@ -85,11 +86,25 @@ def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
     assert without_drift.options.integrators == 1
 
 
-def test_a_model_that_the_data_do_not_determine_comes_last():
+@pytest.mark.parametrize("why", ["undetermined", "undamped"])
+def test_what_is_no_candidate_comes_last_and_tells_nothing_of_the_noise(why):
     best, other, *_ = choose(record_of(SECOND)).ranking.candidates
-    assert best.is_determined
-    undetermined = replace(best, fit=replace(best.fit, condition_number=1e15))
-    assert ranked([undetermined, other]).best.options == other.options
+    if why == "undetermined":
+        fit = replace(best.fit, condition_number=1e15)
+    else:
+        fit = replace(best.fit, held_poles=(complex(-best.fit.box.least_damping, 1.0),))
+    ranking = ranked([replace(best, fit=replace(fit, cost=0.0)), other])
+    assert ranking.best.options == other.options
+    assert ranking.noise.innovation_variance == ranked([other]).noise.innovation_variance
+
+
+def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
+    ranking = choose(record_of(SECOND)).ranking
+    assert max(each.options.order for each in ranking.candidates) == 4
+    assert not still_pays(ranking, 4)
+    best = ranking.best
+    larger = replace(best, options=replace(best.options, poles=3), fit=replace(best.fit, cost=0.5 * best.fit.cost))
+    assert still_pays(ranked([*ranking.candidates, larger]), 4)
 
 
 def test_the_hold_is_compared_where_the_input_moves_continuously():
@@ -144,9 +159,13 @@ def test_a_validation_record_has_a_state_and_an_offset_of_its_own():
     assert found.validation.fit_percent > 85
 
 
-def test_a_chosen_model_that_does_not_carry_over_is_said():
+def test_a_validation_record_is_judged_and_enters_nothing_else():
     other = record_of(TransferFunction([-2.0], [1.0, 1.2, 4.0], 0.23), seed=1)
-    assert "it does not carry over" in identify(record_of(SECOND), validation=other).warnings[0]
+    alone, judged = (identify(record_of(SECOND), validation=each) for each in (None, other))
+    first, *others = judged.warnings
+    assert "it does not carry over" in first
+    assert (judged.choices, judged.options, others) == (alone.choices, alone.options, list(alone.warnings))
+    np.testing.assert_array_equal(judged.fit.theta, alone.fit.theta)
 
 
 def test_no_response_is_no_model():
