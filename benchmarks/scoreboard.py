@@ -205,7 +205,7 @@ def dryer() -> list[Row]:
             "DaISy dryer, delay",
             "2 poles, no zero, state and offset estimated, zero-order hold",
             f"{two.fit.parameters['delay']:.3f} ± {two.fit.standard_errors['delay']:.3f} s",
-            "3 samples of 0.08 s: between 0.16 and 0.24 s of delay behind a hold",
+            "3 samples of 0.08 s: between 0.16 and 0.24 s of delay, if the input is held",
             "ControlSystemIdentification.jl, example *hair dryer*, read off an impulse response",
         ),
         Row(
@@ -249,7 +249,7 @@ def gas_furnace() -> list[Row]:
             "Gas furnace, delay",
             "1 pole, AR(2) noise, the rest chosen",
             f"{found.fit.parameters['delay']:.1f} ± {found.fit.standard_errors['delay']:.1f} s",
-            "3 samples of 9 s: between 18 and 27 s of delay behind a hold",
+            "3 samples of 9 s: between 18 and 27 s of delay, if the input is held",
             "Box, Jenkins, *Time Series Analysis*, series J",
         ),
         Row(
@@ -300,10 +300,10 @@ def page(runs: int) -> str:
     lines = [
         "# Scoreboard",
         "",
-        "`ctid` beside numbers that others printed and beside exact bounds. `make scoreboard` writes this page; rows in",
-        "which `ctid` is worse stay. Published studies are read from `results/published`, all else is computed. Records",
-        "that may not be redistributed are read from the folder that `CTID_DATA` names; `benchmarks/scoreboard.py` holds",
-        "their SHA-256.",
+        "`ctid` beside numbers that others printed and beside exact bounds. `make scoreboard` writes this page; rows",
+        "in which `ctid` is worse stay. Published studies are read from `results/published`, the rest is computed.",
+        "Records that may not be redistributed are read from the folder that `CTID_DATA` names;",
+        "`benchmarks/scoreboard.py` holds their SHA-256.",
     ]
     for title, rows in sections.items():
         lines += [
