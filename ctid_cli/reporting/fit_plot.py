@@ -168,7 +168,7 @@ def draw_profile(axes: Any, result: Identification, units: Units) -> None:
         axes.plot([delay], [result.fit.cost], "o", color=DARK, label=plain(f"{what} {delay:.4g} {units.time}"))
     else:
         whole = profile.samples >= result.fit.count
-        behind = "" if whole else f" of the liveliest {profile.samples} samples"
+        behind = "" if whole else f" of the most active {profile.samples} samples"
         behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
         label = plain(f"profile{behind}")
         axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=label)
