@@ -49,7 +49,7 @@ docs: $(VENV)/.docs-installed
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs build/docs
 
 scoreboard: $(VENV)/.installed
-	$(BIN)/python benchmarks/scoreboard.py --write docs/scoreboard.md
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.scoreboard --write docs/scoreboard.md
 
 release-check:
 	PYTHON="$(PYTHON)" .ci/release-check $(VERSIONS)
