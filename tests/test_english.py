@@ -29,8 +29,8 @@ INSTEAD = {
 ALLOWED = re.compile(r"noise[ _]floor|room for|np\.floor|math\.floor", re.IGNORECASE)
 #: Python 3.11 has a whole f-string as one STRING; later versions have its parts.
 TEXTS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
-#: Packages that are still to be rewritten.
-LATER = ("ctid_cli/identification", "ctid_cli/estimation", "ctid_cli/tones")
+#: A package that is still to be rewritten.
+LATER = ("ctid_cli/tones",)
 
 
 def words_of(path):

@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
+from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, most_active_parts
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
@@ -264,9 +264,9 @@ class MeasuredRecords:
         return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
 
     def part(self) -> "MeasuredRecords | None":
-        """The liveliest parts of long records, each from a state of its own; None where they tell too little."""
+        """The most active parts of long records, each from a state of its own; None where they tell too little."""
         treatment = self.treatment
-        parts = liveliest_parts(self.data, treatment.delay_bounds[1])
+        parts = most_active_parts(self.data, treatment.delay_bounds[1])
         if parts is None or treatment.initial_state == "periodic":
             return None
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset

@@ -187,11 +187,11 @@ def _upper(poles: ComplexArray) -> list[complex]:
 def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
     """Ways of giving each term its poles, conjugates not listed.
 
-    Complex pairs beyond the room of the terms become real poles, and real poles that are left over fill pairs as
+    Complex pairs beyond what the terms can hold become real poles, and real poles that are left over fill pairs as
     neighbours. Groups go to the terms by rising frequency, in every order of the different structures.
     """
-    single, room = sum(term.poles % 2 for term in terms), sum(term.poles // 2 for term in terms)
-    pairs, reals = _with_room(poles, room)
+    single, double = sum(term.poles % 2 for term in terms), sum(term.poles // 2 for term in terms)
+    pairs, reals = _at_most_pairs(poles, double)
     tried: list[list[list[complex]]] = []
     for alone in combinations(range(len(reals)), single):
         rest = [pole for k, pole in enumerate(reals) if k not in alone]
@@ -217,11 +217,11 @@ def _dealt(
     return groups
 
 
-def _with_room(poles: Sequence[complex], room: int) -> tuple[list[complex], list[complex]]:
-    """Complex poles, no more than there is room for, and real ones; both by rising magnitude."""
+def _at_most_pairs(poles: Sequence[complex], count: int) -> tuple[list[complex], list[complex]]:
+    """Complex poles, one of each pair and at most a number of them, and real ones; both by rising magnitude."""
     pairs = sorted((pole for pole in poles if pole.imag), key=abs)
     reals = [pole for pole in poles if not pole.imag]
-    while len(pairs) > room:
+    while len(pairs) > count:
         # The best damped pair is nearest to two real poles.
         pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
         reals += [complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)]

@@ -107,7 +107,7 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
     bandwidth = svf_cutoff or measured.bandwidth
     cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
     treatment = measured.treatment
-    # What filters see must be the answer to the input alone, or to one that is known from the start of the window on.
+    # What filters see must be the response to the input alone, or to one that is known from the start of the window on.
     at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset not in ("estimate", "drift")
     # With integrators they leave the mean out, and nothing is known at rest.
     if (

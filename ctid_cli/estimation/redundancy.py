@@ -156,7 +156,7 @@ def minimise_redundantly(
     That the family is redundant is an assumption which one run does not test: run it from many starts where the answer
     is known. Members whose basins have different widths or places are useful, members alike are not. With noise the
     members agree on the global minimum but roughly: end with a local search on the cost whose minimum is wanted. A
-    reference cost with a high floor (noise, a constant) changes by small shares: subtract the floor, or lower
+    reference cost with a large constant part (noise) changes by small shares: subtract that part, or lower
     `improvement`.
 
     References

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.estimation.optimum.best_model import liveliest
+from ctid_cli.estimation.optimum.best_model import most_active
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, beginning
@@ -44,7 +44,7 @@ def _part(record: Record, most: int) -> tuple[Record, bool]:
     y = record.bridged_y
     if all(np.std(x[:most]) >= LIVELY * np.std(x) for x in (signal.values, y)):
         return beginning(record, most), True
-    where = liveliest(signal.values, y, most)
+    where = most_active(signal.values, y, most)
     t = record.t[where]
     held = HeldSignal(t, signal.values[where], signal.hold)
     return Record(t, record.y[where], held, name=record.name), where.start == 0

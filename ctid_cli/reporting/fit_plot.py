@@ -141,7 +141,7 @@ class FitFigures:
             axes.plot([fit.model.delay], [fit.cost], "o", color=DARK, label=label)
         else:
             whole = profile.samples >= fit.count
-            part = "" if whole else f" of the liveliest {profile.samples} samples"
+            part = "" if whole else f" of the most active {profile.samples} samples"
             part += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
             axes.plot(profile.delays, profile.costs, ".-", color=DARK, lw=0.8, ms=4, label=plain(f"profile{part}"))
             if profile.cutoff is None and whole and fit.noise is None:

@@ -115,21 +115,6 @@ def test_initial_state_is_projected_out():
     assert squared_error < 1e-8 * np.sum(np.abs(data[1]) ** 2)
 
 
-@pytest.mark.parametrize("model", [CASE_1, CASE_2])
-def test_units_do_not_matter(model):
-    # Time in units of 1/1024 s, output and input in other units.
-    frequencies, outputs, inputs, weights = spectral_data(make_record(model, snr_db=10), HIGHEST[model], 8.0)
-    n, m = model.order, model.numerator.size - 1
-    scale = np.concatenate((1024.0 ** -np.arange(1.0, n + 1), 1024.0 ** -np.arange(n - m, n + 1.0) * 8.0 / 0.25))
-    data = frequencies, outputs, inputs, weights
-    theta, squared_error, step = fitted(data, model, disturbed(model), tolerance=1e-9)
-    scaled = frequencies / 1024, 8.0 * outputs, 0.25 * inputs, weights
-    other, its_error, its_step = fitted(scaled, model, disturbed(model) * scale, tolerance=1e-9)
-    np.testing.assert_allclose(other, theta * scale, rtol=1e-8)
-    assert its_error == pytest.approx(64 * squared_error, rel=1e-9)
-    assert its_step == pytest.approx(1024 * step, rel=1e-6)
-
-
 def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
     # The mean and one frequency are three real equations; three coefficients of a transient explain them all.
     t = 0.1 * np.arange(200)

@@ -30,7 +30,6 @@ from tests.estimators.additive_records import (
     TWO_MODES,
     assert_parameters,
     beam_record,
-    coloured_record,
     deviations,
     disturbed,
     loop_record,
@@ -116,14 +115,6 @@ def test_reference_estimate_of_four_modes(variant):
     gains = [2.90641429, 0.40364981, 0.19854286, 0.06228051]
     np.testing.assert_allclose([part.dc_gain for part in fit.additive.submodels], gains, rtol=1e-6)
     assert fit.cost == pytest.approx(0.16533830866, rel=1e-8)
-
-
-def test_reference_estimate_of_the_unfactored_model():
-    fit = Srivc(8, 6, tolerance=1e-10).fit(reference_record(), Start(model=disturbed(FOUR_MODES, 1)))
-    assert fit.status is Status.CONVERGED
-    gains = [2.9075898, 0.40822627, 0.19897482, 0.05737992]
-    np.testing.assert_allclose([part.dc_gain for part in factored(fit.model).submodels], gains, rtol=1e-6)
-    assert fit.cost == pytest.approx(0.16515278298, rel=1e-8)
 
 
 def record_of(system, n, noise, seed, instruments, **options):
@@ -260,16 +251,6 @@ def test_record_that_starts_in_motion_is_fitted_exactly(whole, system, instrumen
     assert fit.covariance.shape == (system.theta.size,) * 2
     at_rest = fitted(record, start, instruments=instruments, tolerance=1e-10)
     assert np.abs(at_rest.additive.theta / system.sorted().theta - 1).max() > 1e-3
-
-
-def test_every_record_of_four_modes_converges():
-    # Coloured noise at 9 dB; starts wrong by up to 5 %.
-    for seed in range(8):
-        fit = fitted(coloured_record(100 + seed, 7368), (FOUR_MODES, seed))
-        assert fit.status is Status.CONVERGED
-        assert fit.iterations <= 40
-        frequencies = [part.natural_frequency for part in fit.additive.submodels]
-        np.testing.assert_allclose(frequencies, [p.natural_frequency for p in FOUR_MODES.submodels], rtol=0.05)
 
 
 @pytest.mark.parametrize("coloured", [False, True])

@@ -134,17 +134,6 @@ def test_noise_free_loop_returns_the_true_model(system, enters):
         assert_parameters(fit, system, 1e-7)
 
 
-def test_every_record_of_the_loop_converges():
-    for seed in range(20):
-        record = loop_record(TWO_MODES, 3140, 0.1, 200 + seed)
-        start = disturbed(TWO_MODES, seed)
-        fits = [fitted(record, start, variant=variant) for variant in ("plain", "relaxed")]
-        fits += [Srivc(4, 2, instruments="closed_loop", tolerance=1e-8).fit(record, Start(model=start))]
-        for fit in fits:
-            assert fit.status is Status.CONVERGED
-        np.testing.assert_allclose(fits[0].additive.theta, fits[1].additive.theta, rtol=1e-5)
-
-
 def test_relaxed_steps_end_a_cycle_of_full_ones():
     # A short record on which full steps never settle.
     record = loop_record(TWO_MODES, 500, 0.1, 150)

@@ -63,14 +63,6 @@ def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irreg
             np.testing.assert_allclose(psi[:, k], slope, atol=2e-8 * max(1.0, np.abs(slope).max()))
 
 
-def test_a_free_response_is_what_the_cut_off_past_leaves_behind():
-    record = record_of(past=150)
-    known = DelayProfile(2, 0, (SYSTEM.delay, SYSTEM.delay), initial_state="estimate")
-    applied = known.prepare(record).laid_out.errors_of(SYSTEM)
-    assert np.sum(applied.residuals[0] ** 2) < 1e-18 * np.sum(record.y**2)
-    assert np.abs(applied.initial_states[0]).max() > 0.1
-
-
 # --- what is estimated with the model --------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import residual
-from tests.estimation.optimum.systems import random_model, record_of
+from tests.estimation.optimum.systems import record_of
 
 INTERVAL = 0.5
 
@@ -72,39 +72,3 @@ def check(fit, model, residual_of):
     assert float(np.sum(residual_of(a, fit.model.delay) ** 2)) == pytest.approx(squared_error, rel=1e-7)
     assert np.concatenate(fit.residuals) @ np.concatenate(fit.residuals) == pytest.approx(squared_error, rel=1e-9)
     assert squared_error <= 2 * found.cost * (1 + 1e-6)
-
-
-@pytest.mark.parametrize(
-    ("seed", "larger", "smaller", "treatment"),
-    [
-        (3, (3, 1), (2, 1), {"initial_state": "periodic", "offset": "estimate"}),
-        (100, (5, 2), (5, 1), {"initial_state": "estimate", "offset": "none"}),
-        (1, (12, 0), (9, 0), {"initial_state": "rest", "offset": "remove"}),
-    ],
-)
-def test_more_poles_or_zeros_never_cost_more(seed, larger, smaller, treatment):
-    rng = np.random.default_rng(seed)
-    poles = int(rng.integers(1, 6))
-    zeros, samples = int(rng.integers(0, poles)), int(rng.choice([80, 90, 100]))
-    model, noise = random_model(rng, poles, zeros), float(rng.choice([0.1, 0.5, 1.0]))
-    offset = 2.0 * (treatment["offset"] != "none")
-    record = record_of(model, rng, samples=samples, noise=noise, regular=seed % 4 > 0, offset=offset)
-    one, two = (DelayProfile(*pair, (0.0, 0.0), nested=True, **treatment).fit(record) for pair in (larger, smaller))
-    assert one.cost <= two.cost * (1 + 1e-6)
-
-
-def test_several_records_are_fitted_together():
-    # Twice the same in pieces is the same, whatever each begins with.
-    record, _ = in_motion()
-    options = DelayProfile(2, 0, (0.7, 0.7), initial_state="estimate", offset="estimate")
-    other, _ = in_motion(seed=3)
-    both = options.fit([record, other])
-    apart = [options.prepare(one).laid_out.errors_of(both.model) for one in (record, other)]
-    for k, alone in enumerate(apart):
-        np.testing.assert_allclose(both.residuals[k], alone.residuals[0], atol=1e-7)
-    singles = [options.fit(one) for one in (record, other)]
-    assert both.cost * both.count >= sum(fit.cost * fit.count for fit in singles)
-    # At the least sum the derivatives of all records cancel.
-    shared = sum(psi[:, :3].T @ eps for psi, eps in zip(both.sensitivities, both.residuals, strict=True))
-    lengths = [np.linalg.norm(psi[:, :3], axis=0) for psi in both.sensitivities]
-    assert np.all(np.abs(shared) < 1e-6 * sum(lengths) * np.sqrt(both.cost * both.count))

@@ -262,8 +262,3 @@ def test_mistakes_have_their_places(file, measures, said):
     with pytest.raises(SpecError, match=r"--set:1:\d+: ") as error:
         load_spec(file, [f"measures=[{measures}]"], allow_code=True)
     assert said in str(error.value)
-
-
-def test_nothing_is_imported_without_permission(file):
-    with pytest.raises(RefusedError, match=r"measures\[1\].kind: names code"):
-        load_spec(file, [*OWN, asked("Slowest")])

@@ -17,8 +17,8 @@ from ctid_cli.estimation.optimum.starts import SAME, StructureSearch
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
 
-#: A model found from a part of the records is one of all of them if its mean squared error there is at most so many
-#: times that in the part, and so large a share of the output's variance is explained.
+#: A model found from a part of the records is one of all of them if its mean squared error there is at most AS_GOOD
+#: times that in the part, and it explains at least the share EXPLAINED of the output's variance.
 AS_GOOD, EXPLAINED = 1.5, 0.05
 #: Records of more samples than the first number are long; a part of them has the second.
 LONG, PART = 100_000, 20_000
@@ -230,27 +230,27 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
 
 
 def part_of(problem: Problem, latest: float) -> Problem | None:
-    """The liveliest part of each record, with a free response; None where the records are not long.
+    """The most active part of each record, with a free response; None where the records are not long.
 
     The input of a part is known for delays up to ``latest`` [s].
     """
-    parts = liveliest_parts(problem.records, latest)
+    parts = most_active_parts(problem.records, latest)
     if parts is None or any(problem.periods):
         return None
     records = tuple(_cut(data, part, latest) for data, part in zip(problem.records, parts, strict=True))
     return problem._replace(records=records, free_response=True, periods=(0.0,) * len(records))
 
 
-def liveliest_parts(records: Sequence[FilterData], latest: float) -> list[slice] | None:
+def most_active_parts(records: Sequence[FilterData], latest: float) -> list[slice] | None:
     """Samples of each record around which the input moves and the output varies most; None where none is long."""
     if sum(data.t.size for data in records) <= LONG or not all(data.common_clock for data in records):
         return None
     # What comes before the latest delay tells nothing.
     sizes = [PART // len(records) + int(latest * data.t.size / (data.t[-1] - data.t[0])) for data in records]
-    return [liveliest(data.u, data.y, size) for data, size in zip(records, sizes, strict=True)]
+    return [most_active(data.u, data.y, size) for data, size in zip(records, sizes, strict=True)]
 
 
-def liveliest(u: Array, y: Array, size: int) -> slice:
+def most_active(u: Array, y: Array, size: int) -> slice:
     """Return the samples, ``size`` of them, around which the input moves and the output varies most."""
     if y.size <= size:
         return slice(None)

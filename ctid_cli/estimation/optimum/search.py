@@ -25,8 +25,8 @@ MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
 CLOSE = 0.01
 #: The same for the delay on an irregular clock, as a fraction of a quarter period.
 CLOSE_BETWEEN_KINKS = 1e-3
-#: A search is given up for a lower known minimum once the fall that a step promises is, so many times, less than what
-#: parts them (after the first few steps), or once the squared error is still so many times higher.
+#: A search is given up for a lower known minimum after FIRST_STEPS steps if the next one promises less than 1/HOPELESS
+#: of the fall to that minimum, and after PATIENCE steps if the squared error is still more than FAR times as high.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
 #: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
 DIFFERENCE, FLAT = 1e-4, 1e-9

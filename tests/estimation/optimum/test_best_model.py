@@ -190,7 +190,7 @@ def test_a_long_record_is_searched_by_a_part_of_it(monkeypatch, delay, free_resp
 
 
 def test_a_part_that_tells_too_little_is_not_trusted(monkeypatch):
-    # A quick start and a long slow end: the liveliest part has not met the slow pole.
+    # A quick start and a long slow end: the most active part has not met the slow pole.
     rng = np.random.default_rng(1)
     t = np.arange(3000.0)
     u = np.where(t < 300, np.repeat(rng.choice([-1.0, 1.0], 1000), 3), 1.0)

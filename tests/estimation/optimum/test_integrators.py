@@ -7,9 +7,8 @@ from ctid_cli.estimation.optimum.projection import project, slopes
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import squared_error
-from tests.estimation.optimum.systems import best, problem_of, record_of
+from tests.estimation.optimum.systems import problem_of, record_of
 
 SPEED, DAMPING = np.array([2.2, 0.4]), np.array([0.3, -1.0])
 DENOMINATOR = np.convolve([1.0, 1.32, 4.84], [1.0, 0.4])
@@ -42,21 +41,3 @@ def test_gradient_is_that_of_differences(integrators, free_response):
     found = slopes(problem, SPEED, DAMPING, here, project(problem, SPEED, DAMPING, here), True)
     differences = [(value(step) - value(-step)) / 4e-5 for step in 1e-5 * np.eye(4)]
     np.testing.assert_allclose(found.gradient, differences, rtol=0, atol=1e-6 * np.abs(found.gradient).max())
-
-
-@pytest.mark.parametrize("free_response", [False, True])
-@pytest.mark.parametrize("integrators", [1, 2])
-def test_an_integrating_model_is_found(integrators, free_response):
-    model = MODEL[integrators]
-    record = record_of(model, np.random.default_rng(3), offset=3.0 * free_response)
-    y = record.y.copy()
-    if free_response:
-        # What came before is a state, the offset part of it.
-        y[:40] = np.nan
-    data = filter_data(Record(record.t, y, record.input))
-    own = {"free_response": free_response, "offset": free_response, "integrators": integrators}
-    found = best([data], 2, 1, delays=(0.0, 2.0), random_starts=2, **own)
-    assert found.squared_error < 1e-16 * float(data.y_used @ data.y_used)
-    assert found.delay == pytest.approx(0.7, abs=1e-6)
-    np.testing.assert_allclose(found.numerator, model.numerator, rtol=1e-5)
-    np.testing.assert_allclose(found.model.denominator, model.denominator, rtol=1e-5)
