@@ -27,14 +27,17 @@ class MeasuredLines(MeasuredRecords):
         integrators: int = 0,
         known: KnownCoefficients = NOTHING,
         name: str = "",
+        *,
+        check: bool = True,
     ) -> None:
         self.lines, self.structure, self.known = lines, structure, known
         self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=integrators)
         self.layout = Layout(structure, integrators=integrators)
         self.records, self.input_offsets, self.offsets = [], [0.0], [0.0]
         self.outputs = [lines.y_used]
+        self._problem = Problem((lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
         what = f"{name}: " if name else ""
-        if lines.count <= structure.size:
+        if check and lines.count <= structure.size:
             raise DataError(
                 f"{what}{lines.count} real equations are too few for {structure.size} parameters; give more "
                 "frequencies, or fit a smaller model"
@@ -44,7 +47,6 @@ class MeasuredLines(MeasuredRecords):
                 f"{what}a system with integrators has no value at frequency 0; leave that line out, or fit without "
                 "integrators"
             )
-        self._problem = Problem((lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
 
     @property
     def problem(self) -> Problem:  # type: ignore[override]

@@ -88,7 +88,9 @@ class FrequencyResponseResult(Result):
         }
         if found.distortion is not None:
             columns[f"distortion [{unit}]"] = np.sqrt(found.distortion)
-        return pd.DataFrame(columns)
+        # What a fit to the table needs to know of its values.
+        told = {f"hold_interval [{self.records.units.time}]": found.interval or np.nan}
+        return pd.DataFrame(columns | told | {"correlated [-]": found.method != "periodic"})
 
     def content(self) -> dict[str, Any]:
         """Return the response for JSON."""
