@@ -13,6 +13,7 @@ import typer
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.cli._progress import FitProgress
+from ctid_cli.cli.frequency_fit import frequency_files, frequency_fit
 from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
@@ -45,15 +46,23 @@ class WritingOptions:
         text = result.file_text(self.out, command)
         contents = {self.out / "fit.json": text.encode() + b"\n", self.out / "fit.svg": result.drawing().saved()}
         if self.report:
-            from ctid_cli.reporting.pages.fit_page import fit_page
-
-            contents[self.out / "fit.html"] = fit_page(result, json.loads(text)).encode()
+            contents[self.out / "fit.html"] = self._page(result, json.loads(text)).encode()
         if self.csv is not None:
             contents |= {self.csv / name: frame_bytes(frame) for name, frame in fit_tables(result).items()}
         if self.export is not None:
             name, code = model_code(result.fitted, self.export, result.units.time)
             contents[self.out / name] = code.encode()
         return contents
+
+    def _page(self, result: FitResult, content: dict[str, Any]) -> str:
+        """Return the page of a fit."""
+        from ctid_cli.reporting.frequency_fit import FrequencyFitResult
+        from ctid_cli.reporting.pages.fit_page import fit_page
+        from ctid_cli.reporting.pages.frequency_fit_page import frequency_fit_page
+
+        if isinstance(result, FrequencyFitResult):
+            return frequency_fit_page(result, content)
+        return fit_page(result, content)
 
 
 @guarded
@@ -79,29 +88,49 @@ def fit(
         int | None, typer.Option("--predict", metavar="K", help="Fit of predictions K samples ahead, with --noise.")
     ] = None,
 ) -> None:
-    """Fit a transfer function with a delay to measured records.
+    """Fit a transfer function with a delay to measured records, or to a frequency response.
 
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
     fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and
-    offset are chosen by one criterion where they are not given.
+    offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
+    writes, needs --poles.
     """
-    from ctid_cli.reporting.fit_result import FitResult
-
-    _check_draws(bootstrap)
-    _check_predicted(predict, treatment.noise)
-    loop.check()
     asked = Asked(model, treatment, loop.use)
-    options = options_of(asked)
-    if asked.single and len(files) > 1:
-        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    records = _records(files, validate, loop, columns, treatment)
-    found = _identified(options, records, bootstrap)
-    other = None if found.validation is None else found.validation.record
-    result = FitResult(found, records.with_data(found.records, other), predict)
+    if frequency_files(files):
+        others: dict[str, object] = {"validate": validate, "bootstrap": bootstrap, "predict": predict}
+        result: FitResult = frequency_fit(files, asked, loop, columns, others)
+    else:
+        _check_draws(bootstrap)
+        _check_predicted(predict, treatment.noise)
+        loop.check()
+        result = _fit_of_records(files, validate, asked, loop, columns, bootstrap, predict)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting([*files, *([validate] if validate else [])], contents)
     write_files(contents)
     emit(result, form.form, list(contents), stored=next(iter(contents.values())).decode())
+
+
+def _fit_of_records(
+    files: Sequence[Path],
+    validate: Path | None,
+    asked: Asked,
+    loop: LoopOptions,
+    columns: RecordOptions,
+    bootstrap: int | None,
+    predict: int | None,
+) -> FitResult:
+    """Fit a model to records in time."""
+    from ctid_cli.reporting.fit_result import FitResult
+
+    if asked.treatment.weight is not None:
+        raise UsageError("--weight is for a frequency response; the samples of a record weigh the same, drop --weight")
+    options = options_of(asked)
+    if asked.single and len(files) > 1:
+        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+    records = _records(files, validate, loop, columns, asked.treatment)
+    found = _identified(options, records, bootstrap)
+    other = None if found.validation is None else found.validation.record
+    return FitResult(found, records.with_data(found.records, other), predict)
 
 
 def _check_draws(bootstrap: int | None) -> None:

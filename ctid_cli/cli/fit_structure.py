@@ -13,7 +13,7 @@ import typer
 
 from ctid_cli.cli._common import span
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset, Weight
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
@@ -168,6 +168,9 @@ class FitOptions(TreatmentOptions):
         str, typer.Option("--noise", metavar="white|arma:P,Q|auto", help="Noise that is estimated with the model.")
     ] = "white"
     hold: HoldOption = "auto"
+    weight: Annotated[
+        Weight | None, typer.Option("--weight", help="Weights of a frequency response without standard errors.")
+    ] = None
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,7 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
 
 def _given(asked: Asked) -> Given:
     model, treatment = asked.model, asked.treatment
-    fixed = _fixed(model.fix)
+    fixed = fixed_of(model.fix)
     if fixed and model.poles is None:
         raise UsageError("--poles is missing: with --fix it must be given")
     # The names of known parameters are those of a number of zeros.
@@ -291,7 +294,7 @@ def _submodels(asked: Asked) -> MeasuredSubmodels:
         asked.treatment.initial_state or "rest",
         asked.treatment.offset or "none",
         factored=asked.model.model == "additive" or asked.integrators > 0,
-        fixed=_fixed(asked.model.fix),
+        fixed=fixed_of(asked.model.fix),
     )
 
 
@@ -378,7 +381,8 @@ def _terms(text: str, integrators: int) -> list[Term]:
     return [Term(*degrees, integrators * (k == 0)) for k, degrees in enumerate(found)]
 
 
-def _fixed(given: Sequence[str] | None) -> tuple[Fixed, ...] | None:
+def fixed_of(given: Sequence[str] | None) -> tuple[Fixed, ...] | None:
+    """Known parameters, as they are given."""
     from ctid_cli.estimation.common import Fixed
 
     found = []

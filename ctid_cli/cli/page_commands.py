@@ -138,8 +138,11 @@ def report(
 
 def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str:
     """Return the page of a fit or a track, of which the file says which it is."""
+    from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
     from ctid_cli.reporting.fit_result import FitResult
+    from ctid_cli.reporting.frequency_fit import FrequencyFitResult
     from ctid_cli.reporting.pages.fit_page import fit_page
+    from ctid_cli.reporting.pages.frequency_fit_page import frequency_fit_page
     from ctid_cli.reporting.pages.track_page import track_page
     from ctid_cli.reporting.records import Records
     from ctid_cli.storage.fit_file import FIT, read_fit
@@ -150,6 +153,8 @@ def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
     if FIT.kind_in(str(path)) != TRACK.kind:
         fit = read_fit(path, records or None, validate)
+        if isinstance(fit.result.fit, FrequencyDomainFit):
+            return frequency_fit_page(FrequencyFitResult.of(fit.result), fit.content)
         return fit_page(FitResult(fit.result, Records(fit.measurements, fit.validation)), fit.content)
     if validate:
         raise UsageError(f"{path} is a track, which has no validation record; leave --validate out")

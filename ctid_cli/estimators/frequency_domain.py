@@ -13,14 +13,14 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Estimator, Fixed, Prepared, Start, places_of
 from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit, check_structure, fitted, samples_at
+from ctid_cli.estimators.delay_profile import MeasuredFit, check_structure, fitted, samples_at
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
 from ctid_cli.inference.residual_tests import all_white, chi_square_tail
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
-from ctid_cli.signals.frequency_data import FrequencyData, Weight
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+from ctid_cli.signals.frequency_data import FrequencyData
+from ctid_cli.signals.treatment import InitialState, LossKind, Offset, Weight
 
 #: Residuals that exceed the given standard errors by chance less often than this count as larger.
 MISFIT = 0.01
@@ -110,7 +110,8 @@ class FrequencyDomainFit(MeasuredFit):
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
         """Forget what belongs to single lines; it is computed from the data, which are kept."""
-        super().leave_out(lambda: _samples(self)._asdict())
+        measured = _laid_out(self, lines_of(self.data, self.weight))
+        super().leave_out(lambda: samples_at(measured, self.model, self.theta, None)._asdict())
 
     def answers(self, frequencies: Array) -> ComplexArray:
         """Values of the model as those of the data are: ``G(jw)``, or of samples.
@@ -125,25 +126,21 @@ class FrequencyDomainFit(MeasuredFit):
         ndarray of complex, shape (N,)
             Values [output unit/input unit].
         """
-        zero = np.zeros(frequencies.size)
-        lines = FrequencyLines(frequencies, zero.astype(complex), np.ones(frequencies.size), self.data.interval)
-        structure = Structure(self.model.order, max(self.model.numerator.size - 1, 0))
-        bounds = (self.model.delay, self.model.delay)
-        measured = MeasuredLines(lines, structure, bounds, check=False)
-        residual = -measured.errors_of(self.model).residuals[0]
-        whole = np.zeros(2 * frequencies.size)
-        whole[lines.use] = residual
-        return np.asarray(whole[: frequencies.size] + 1j * whole[frequencies.size :])
+        if not self.data.interval:
+            return self.model.frequency_response(frequencies)
+        count = frequencies.size
+        lines = FrequencyLines(frequencies, np.zeros(count, dtype=complex), np.ones(count), self.data.interval)
+        parts = np.zeros(2 * count)
+        parts[lines.use] = -_laid_out(self, lines).errors_of(self.model).residuals[0]
+        return np.asarray(parts[:count] + 1j * parts[count:])
 
 
-def _samples(fit: FrequencyDomainFit) -> FittedSamples:
-    """What a fit says of each part of each line, without the names that samples of records have."""
-    integrators = int(np.count_nonzero(fit.model.denominator[::-1].cumsum() == 0.0))
+def _laid_out(fit: FrequencyDomainFit, lines: FrequencyLines) -> MeasuredLines:
+    """Lay lines out for the structure of a fit."""
+    integrators = int(np.count_nonzero(np.cumsum(fit.model.denominator[::-1]) == 0.0))
     zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
     structure = Structure(fit.model.order, zeros, "delay" in fit.parameter_names)
-    bounds = (fit.model.delay, fit.model.delay)
-    measured = MeasuredLines(lines_of(fit.data, fit.weight), structure, bounds, integrators)
-    return samples_at(measured, fit.model, fit.theta, None)
+    return MeasuredLines(lines, structure, (fit.model.delay,) * 2, integrators, check=False)
 
 
 @dataclass(frozen=True)

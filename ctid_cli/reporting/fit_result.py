@@ -133,7 +133,7 @@ class FitResult(Result):
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
         hold, (low, high) = first.record.input.hold, options.delay_bounds
         searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-        yield "model", f"{_structure(options)}; delay {searched}"
+        yield "model", f"{structure_text(options)}; delay {searched}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
         yield from _loop(options, first)
@@ -172,13 +172,7 @@ class FitResult(Result):
         yield "condition number", number(fit.condition_number, 3)
         if isinstance(fit, SubmodelsFit):
             yield from _conditions(fit)
-        if fit.starts is not None:
-            yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
-        if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
-            yield "admissible", _box_text(fit.box, units)
-            for name, limit, value in fit.box.limits_met(fit.held_poles):
-                unit = "" if name == "least_damping" else f" rad/{units.time}"
-                yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
+        yield from search_lines(fit, units)
         for k, test in enumerate(self.fitted.tests, start=1):
             what = "residuals" if fit.noise is None else "innovations"
             yield what if len(fit.residuals) == 1 else f"{what} {k}", _tested(test)
@@ -191,6 +185,17 @@ class FitResult(Result):
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
         return fit_content(self.fitted, self.records, self.ahead)
+
+
+def search_lines(fit: MeasuredFit, units: Units) -> Iterator[tuple[str, str]]:
+    """Return how the search went, and the bounds of the admissible models where it ended at them."""
+    if fit.starts is not None:
+        yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
+    if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
+        yield "admissible", _box_text(fit.box, units)
+        for name, limit, value in fit.box.limits_met(fit.held_poles):
+            unit = "" if name == "least_damping" else f" rad/{units.time}"
+            yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
 
 
 def _noise_lines(
@@ -236,7 +241,7 @@ def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> s
     return f", {known}{rough}"
 
 
-def _structure(options: Options) -> str:
+def structure_text(options: Options) -> str:
     """Poles and zeros, of each submodel if there are several."""
     if not isinstance(options, MeasuredSubmodels) or not options.factored:
         integrators = getattr(options, "integrators", 0)
@@ -325,11 +330,11 @@ def _covariance_line(result: Identification) -> str:
     what = "residuals" if result.fit.noise is None else "innovations"
     text = f"Standard errors are those for white {what}"
     if not result.answer.seen:
-        return f"There are no standard errors, as no answer to the input is seen. {_form(result.fit)}"
+        return f"There are no standard errors, as no answer to the input is seen. {form_of(result.fit)}"
     if found.kind == "biased":
-        return f"{BIASED} {_form(result.fit)}"
+        return f"{BIASED} {form_of(result.fit)}"
     if not np.isfinite(np.diag(found.covariance)).any():
-        return f"There are no standard errors. {_form(result.fit)}"
+        return f"There are no standard errors. {form_of(result.fit)}"
     if found.kind != "white":
         text = f"Standard errors are those for coloured noise{f', because the {what} are not white' * (not asked)}"
     elif result.tests:
@@ -342,10 +347,10 @@ def _covariance_line(result: Identification) -> str:
         text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
     if result.delay_interval is not None:
         text += ", that of the delay from the profile of the cost, which is not quadratic there"
-    return f"{text}. {_form(result.fit)}"
+    return f"{text}. {form_of(result.fit)}"
 
 
-def _form(fit: MeasuredFit) -> str:
+def form_of(fit: MeasuredFit) -> str:
     """How coefficients are scaled and counted."""
     if additive_of(fit) is None:
         return "Monic denominator, descending powers."
@@ -392,7 +397,7 @@ def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:
     StorageError
         If the file cannot be written.
     """
-    text = FitResult.of(result).file_text(Path(path).parent)
+    text = result._result().file_text(Path(path).parent)
     try:
         write_file(Path(path), text.encode() + b"\n")
     except OSError as error:

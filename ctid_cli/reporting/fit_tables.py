@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.reporting.document import Tool
 from ctid_cli.reporting.estimate import Units
+from ctid_cli.reporting.frequency_fit import line_frame
 
 if TYPE_CHECKING:
     from ctid_cli.reporting.fit_result import FitResult
@@ -25,6 +27,8 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
         "step.csv": response_frame(fitted.step_response(), units.gain, units),
         "bode.csv": frequency_frame(fitted.frequency_response(), units),
     }
+    if isinstance(fitted.fit, FrequencyDomainFit):
+        return tables | {"lines.csv": line_frame(fitted.fit, units)}
     several = len(result.records.data) > 1
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"

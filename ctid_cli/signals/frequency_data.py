@@ -6,7 +6,7 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +34,6 @@ NAMES: dict[str, tuple[str, ...]] = {
 HERTZ = {"hz": 1.0, "mhz": 1e-3, "khz": 1e3, "ghz": 1e9}
 #: A line may be this fraction beyond half the sampling frequency.
 ROUNDING = 1e-9
-#: What weighs lines of unknown accuracy: the reciprocal of the gain, of its square root, or nothing.
-Weight = Literal["inverse", "inverse-sqrt", "none"]
 
 
 @dataclass(frozen=True, eq=False)
