@@ -16,7 +16,7 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimators.delay_profile import MeasuredFit, check_structure, fitted, samples_at
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
-from ctid_cli.inference.residual_tests import all_white, chi_square_tail
+from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
 from ctid_cli.signals.frequency_data import FrequencyData
@@ -57,9 +57,9 @@ class FrequencyDomainFit(MeasuredFit):
         Parameters
         ----------
         kind : {"auto", "white", "robust"}, default "auto"
-            ``white`` takes the errors of lines as independent: with the standard errors of the data, unless the
-            residuals are larger, or without any by the residuals of each line; ``robust`` takes those of neighbouring
-            lines as correlated, which ``auto`` does where the data say so or the residuals are.
+            ``white`` takes the errors of lines as independent: by the standard errors of the data, or by the residuals
+            of each line where these are larger or the standard errors estimates themselves; ``robust`` takes those of
+            neighbouring lines as correlated, which ``auto`` does where the data say so or the residuals are.
         draws, progress
             Not used: there is no bootstrap.
 
@@ -76,15 +76,14 @@ class FrequencyDomainFit(MeasuredFit):
         inverse = unit_inverse(psi.T @ psi) if e.size > psi.shape[1] else None
         if inverse is None:
             return Uncertainty("white", self.tangent, np.full((psi.shape[1],) * 2, np.nan), e.size)
+        if self.errors_known:
+            return Uncertainty("white", self.tangent, inverse[0] * np.outer(inverse[1], inverse[1]), np.inf)
+        # With the squared residual of each part over its expectation any variance over frequency is allowed (HC2 of
+        # MacKinnon and White, 1985).
         scaled = psi * inverse[1]
-        if self.data.standard_error is None:
-            # With the squared residual of each line over its expectation, any variance over frequency is allowed.
-            leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
-            weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
-            return Uncertainty("white", self.tangent, sandwich(*inverse, weighed.T @ weighed), e.size)
-        size = 1.0 if self.misfit_p_value >= MISFIT else self.excess
-        known = np.inf if size == 1.0 else e.size
-        return Uncertainty("white", self.tangent, size * inverse[0] * np.outer(inverse[1], inverse[1]), known)
+        leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
+        weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
+        return Uncertainty("white", self.tangent, sandwich(*inverse, weighed.T @ weighed), e.size)
 
     @property
     def correlated(self) -> bool:
@@ -97,16 +96,29 @@ class FrequencyDomainFit(MeasuredFit):
         return all_white(np.split(self.residuals[0], [self.data.frequencies.size]))
 
     @property
+    def errors_known(self) -> bool:
+        """Whether the data have standard errors that the residuals agree with and that are no estimates."""
+        return self.misfit_p_value >= MISFIT and self.data.freedom == np.inf
+
+    @property
     def excess(self) -> float:
         """Variance of the residuals over that of the data's standard errors [-]."""
         return self.cost * self.count / max(self.count - self.tangent.shape[1], 1)
 
     @property
     def misfit_p_value(self) -> float:
-        """Probability of residuals as large as these by the data's standard errors; NaN without these [-]."""
-        if self.data.standard_error is None:
+        """Probability of residuals as large as these by the data's standard errors; NaN where it is not known [-].
+
+        Over an estimated variance of d degrees of freedom the squared error of a line has the F-distribution of 2 and
+        2 d of them.
+        """
+        spare, d = max(self.count - self.tangent.shape[1], 1), self.data.freedom
+        if self.data.standard_error is None or d <= 2.0:
             return float("nan")
-        return chi_square_tail(max(self.count - self.tangent.shape[1], 1), self.cost * self.count)
+        if d == np.inf:
+            return chi_square_tail(spare, self.cost * self.count)
+        variance = d**3 / ((d - 1.0) ** 2 * (d - 2.0)) / (0.5 * spare)
+        return normal_tail((self.excess - d / (d - 1.0)) / np.sqrt(variance))
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
         """Forget what belongs to single lines; it is computed from the data, which are kept."""

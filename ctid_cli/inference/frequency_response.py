@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -99,10 +99,10 @@ class FrequencyResponse:
     def data(self) -> FrequencyData:
         """The response as data for a model: of a clock with a zero-order hold the values of samples."""
         values = self.frequencies, self.response, self.standard_error
-        correlated = self.method != "periodic"
+        others: Any = {"correlated": self.method != "periodic", "freedom": float(self.freedom.min())}
         if self.interval:
-            return FrequencyData.of_held(*values, self.interval, correlated=correlated)
-        return FrequencyData(*values, correlated=correlated)
+            return FrequencyData.of_held(*values, self.interval, **others)
+        return FrequencyData(*values, **others)
 
     @property
     def standard_error(self) -> Array:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomainFit
+from ctid_cli.canonical import plain as as_plain
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_frame
@@ -91,12 +92,10 @@ class FrequencyFitResult(FitResult):
         if law.kind == "robust":
             why = "the lines share samples" if fit.data.correlated else "the residuals of neighbouring lines are"
             text = f"Standard errors are those for correlated errors of neighbouring lines, as {why}"
-        elif fit.data.standard_error is None:
-            text = "Standard errors are from the residuals of each line, taken as independent"
-        elif fit.misfit_p_value < MISFIT:
-            text = "Standard errors are those of the data, raised to the size of the residuals"
-        else:
+        elif fit.errors_known:
             text = "Standard errors are from those of the data, which the residuals agree with"
+        else:
+            text = "Standard errors are from the residuals of the lines, taken as independent"
         return f"{text}; intervals are estimate -+ {law.quantile(np.zeros(1)):.3g} of them."
 
     def quality(self) -> Iterator[tuple[str, str]]:
@@ -130,7 +129,7 @@ class FrequencyFitResult(FitResult):
             "misfit_p_value": fit.misfit_p_value,
             "correlated": fit.correlated,
         }
-        return {**fit_content(self.fitted, self.records, units=self.units), "frequency_response": response}
+        return {**fit_content(self.fitted, self.records, units=self.units), "frequency_response": as_plain(response)}
 
 
 def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:

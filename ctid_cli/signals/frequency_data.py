@@ -26,9 +26,11 @@ NAMES: dict[str, tuple[str, ...]] = {
     "gain": ("gain", "magnitude", "mag", "amplitude", "gain_db", "magnitude_db", "mag_db"),
     "phase": ("phase", "angle", "phase_deg", "phase_rad"),
     "standard_error": ("standard_error", "se"),
-    #: Those of ``ctid frf``: interval of the hold that was divided out, and whether lines share samples.
+    #: Those of ``ctid frf``: interval of the hold that was divided out, whether lines share samples, and the degrees of
+    #: freedom of the standard errors.
     "hold_interval": ("hold_interval",),
     "correlated": ("correlated",),
+    "freedom": ("freedom",),
 }
 #: Prefixes of hertz.
 HERTZ = {"hz": 1.0, "mhz": 1e-3, "khz": 1e3, "ghz": 1e9}
@@ -53,6 +55,9 @@ class FrequencyData:
         Sampling interval [s] of such samples; 0 where the values are ``G(jw)``.
     correlated : bool, default False
         Whether neighbouring lines have errors in common, as those of local polynomials and of Welch's method have.
+    freedom : float, default infinite
+        Degrees of freedom of the complex residuals that the standard errors are from [-]; infinite where they are
+        known.
     name : str, default ""
         What messages call the data.
     units : tuple of str, default ("s", "out", "in")
@@ -78,6 +83,7 @@ class FrequencyData:
     standard_error: Array | None = None
     interval: float = 0.0
     correlated: bool = False
+    freedom: float = math.inf
     name: str = ""
     units: tuple[str, str, str] = ("s", "out", "in")
     notes: tuple[str, ...] = ()
@@ -168,7 +174,7 @@ def read_frequency_data(
                 f"{table.head}: there is no column {role!r}; a frequency response needs frequency [Hz or rad/s] and "
                 "real and imaginary, or gain [- or dB] and phase [deg or rad]"
             )
-    roles = [role for role in ("frequency", *pair, "standard_error", "hold_interval", "correlated") if role in chosen]
+    roles = [role for role in NAMES if role in chosen and role not in {"real", "imaginary", "gain", "phase"} - {*pair}]
     columns = table.read([chosen[role] for role in roles])
     values = {role: columns.values[chosen[role]] for role in roles}
     scale, time_unit = _rate(table, chosen["frequency"])
@@ -186,6 +192,7 @@ def read_frequency_data(
     interval, errors = _sampled(table, time_unit), values.get("standard_error")
     others: dict[str, Any] = {"name": columns.file, "units": units, "notes": tuple(notes)}
     others["correlated"] = bool(np.any(values.get("correlated", np.zeros(1)) == 1.0))
+    others["freedom"] = float(np.min(values.get("freedom", np.full(1, np.inf))))
     held = values.get("hold_interval", np.full(1, np.nan))
     if interval is None and errors is not None and np.isfinite(held).all():
         return FrequencyData.of_held(w[used], response[used], errors[used], float(held[0]), **others)
