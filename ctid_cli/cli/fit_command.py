@@ -13,8 +13,8 @@ import typer
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.frequency_fit import frequency_files, frequency_fit
 from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
+from ctid_cli.cli.frequency_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 

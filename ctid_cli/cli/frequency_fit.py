@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ctid_cli.cli._options import RecordOptions
 from ctid_cli.cli.fit_structure import Asked, LoopOptions, as_usage_errors, check_integrators, fixed_of
@@ -50,21 +51,16 @@ def frequency_fit(
     if model.poles is None:
         raise UsageError("--poles is missing: for a frequency response it must be given")
     check_integrators(asked.integrators, "none")
-    data = read_frequency_data(files[0], columns.start, columns.stop)
-    with as_usage_errors():
-        options = FrequencyDomain(
-            model.poles,
-            model.zeros or 0,
-            asked.delay,
-            asked.integrators,
-            fixed_of(model.fix),
-            asked.treatment.weight or "none",
+    data, weight = read_frequency_data(files[0], columns.start, columns.stop), asked.treatment.weight
+    if weight is not None and data.standard_error is not None:
+        raise UsageError(
+            f"--weight is for lines without standard errors, and {files[0]} has them; drop --weight, or rename the "
+            "column standard_error"
         )
-        if asked.treatment.weight is not None and data.standard_error is not None:
-            raise UsageError(
-                f"--weight is for lines without standard errors, and {files[0]} has them; drop --weight, or rename the "
-                "column standard_error"
-            )
+    data = replace(data, weight=weight or "none")
+    with as_usage_errors():
+        given: Any = {"integrators": asked.integrators, "fixed": fixed_of(model.fix)}
+        options = FrequencyDomain(model.poles, model.zeros or 0, asked.delay, **given)
         return FrequencyFitResult.of(identify_frequency_response(data, options))
 
 

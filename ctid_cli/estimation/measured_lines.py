@@ -1,7 +1,5 @@
 """A frequency response laid out for estimation, as records are."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
@@ -11,47 +9,44 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.signals.frequency_data import FrequencyData
 
 
 class MeasuredLines(MeasuredRecords):
     """A frequency response of a system at rest, and its least-squares cost over all parameters.
 
-    The parts of the values, real ones first and weighted, stand where records have their samples.
+    The parts of the weighted values, real ones first, stand where records have their samples.
     """
 
     def __init__(
         self,
-        lines: FrequencyLines,
+        source: FrequencyData,
         structure: Structure,
         delay_bounds: tuple[float, float],
         integrators: int = 0,
         known: KnownCoefficients = NOTHING,
-        name: str = "",
-        *,
-        check: bool = True,
     ) -> None:
-        self.lines, self.structure, self.known = lines, structure, known
+        self.source, self.structure, self.known = source, structure, known
         self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=integrators)
         self.layout = Layout(structure, integrators=integrators)
         self.records, self.input_offsets, self.offsets = [], [0.0], [0.0]
-        self.outputs = [lines.y_used]
-        self._problem = Problem((lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
-        what = f"{name}: " if name else ""
-        if check and lines.count <= structure.size:
+        self.lines = lines_of(source)
+        self.outputs = [self.lines.y_used]
+        self.problem = Problem((self.lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
+
+    def check(self) -> None:
+        """Refuse data from which the structure cannot be estimated."""
+        what, size = f"{self.source.name}: " if self.source.name else "", self.structure.size
+        if self.lines.count <= size:
             raise DataError(
-                f"{what}{lines.count} real equations are too few for {structure.size} parameters; give more "
-                "frequencies, or fit a smaller model"
+                f"{what}{self.lines.count} real equations are too few for {size} parameters; give more frequencies, or "
+                "fit a smaller model"
             )
-        if integrators and lines.frequencies[0] == 0.0:
+        if self.treatment.integrators and self.lines.frequencies[0] == 0.0:
             raise DataError(
                 f"{what}a system with integrators has no value at frequency 0; leave that line out, or fit without "
                 "integrators"
             )
-
-    @property
-    def problem(self) -> Problem:  # type: ignore[override]
-        """The lines, and that nothing but the numerator is eliminated with them."""
-        return self._problem
 
     @property
     def spread(self) -> float:
@@ -67,7 +62,22 @@ class MeasuredLines(MeasuredRecords):
         """Which real and imaginary parts are equations."""
         return (self.lines.use,)
 
-    def with_structure(self, structure: Structure) -> "MeasuredLines":
-        """The same lines for another model."""
-        bounds, integrators = self.treatment.delay_bounds, self.treatment.integrators
-        return MeasuredLines(self.lines, structure, bounds, integrators)
+
+def lines_of(data: FrequencyData) -> FrequencyLines:
+    """Lay a frequency response out with the weights of its lines.
+
+    With standard errors the real and the imaginary part of each error have the variance one.
+    """
+    w, size = data.frequencies, data.frequencies.size
+    even = FrequencyLines(w, data.response, np.ones(size), data.interval)
+    if data.standard_error is not None:
+        both = even.use[size:]
+        return FrequencyLines(w, data.response, np.sqrt(1.0 + both) / data.standard_error, data.interval)
+    if data.weight == "none":
+        return even
+    gain = np.abs(data.response)
+    if not gain.all():
+        what = f"the value at {w[int(np.argmin(gain))]:g} rad/{data.units[0]} is 0, which has no weight {data.weight}"
+        raise DataError(f"{data.name}: {what}; use none" if data.name else f"{what}; use none")
+    weights = 1.0 / (gain if data.weight == "inverse" else np.sqrt(gain))
+    return FrequencyLines(w, data.response, weights, data.interval)

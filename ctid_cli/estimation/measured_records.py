@@ -303,7 +303,7 @@ class MeasuredRecords:
     def with_outputs(self, outputs: Sequence[Array]) -> "MeasuredRecords":
         """The same with other outputs at the used samples of each record."""
         records = []
-        for data, values in zip(self.problem.records, outputs, strict=True):
+        for data, values in zip(self.problem.sampled, outputs, strict=True):
             y = data.y.copy()
             y[data.use] = values
             records.append(data._replace(y=y))

@@ -336,7 +336,15 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             raise OptionError(
                 "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"
             )
-        check_structure(self)
+        low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
+        object.__setattr__(self, "delay_bounds", bounds)
+        allowed = self.order if low == high else self.order - 1
+        if self.zeros > allowed:
+            reason = "" if low == high else " while the delay is estimated"
+            given = f"got {self.zeros} zeros and {self.order} poles" + ", integrators included" * (self.integrators > 0)
+            raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
+        # Names are made of degrees that make sense only.
+        _check_stable(places_of(self.fixed, Structure(self.poles, self.zeros).names), self.poles)
 
     @property
     def order(self) -> int:
@@ -536,20 +544,6 @@ def _check_clocks(records: Sequence[Record]) -> None:
                 f"{named(record)}the clock is irregular, and a noise model from sample to sample needs a regular one; "
                 "take noise_model white (--noise white), or resample the record"
             )
-
-
-def check_structure(options: Any) -> None:
-    """Check delay, degrees and known coefficients of one transfer function, and make numbers of the delay's bounds."""
-    low, high = bounds = checked_bounds(options.delay_bounds, known_allowed=True)
-    object.__setattr__(options, "delay_bounds", bounds)
-    allowed = options.order if low == high else options.order - 1
-    if options.zeros > allowed:
-        reason = "" if low == high else " while the delay is estimated"
-        given = f"got {options.zeros} zeros and {options.order} poles"
-        given += ", integrators included" * (options.integrators > 0)
-        raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
-    # Names are made of degrees that make sense only.
-    _check_stable(places_of(options.fixed, Structure(options.poles, options.zeros).names), options.poles)
 
 
 def _check_stable(known: Mapping[int, float], poles: int) -> None:

@@ -9,21 +9,22 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.errors import DataError
-from ctid_cli.estimation.common import Estimator, Fixed, Prepared, Start, places_of
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import Prepared, Start, places_of
 from ctid_cli.estimation.measured_lines import MeasuredLines
+from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimators.delay_profile import MeasuredFit, check_structure, fitted, samples_at
-from ctid_cli.filtering.frequency_lines import FrequencyLines
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted, samples_at
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
 from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
 from ctid_cli.signals.frequency_data import FrequencyData
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset, Weight
 
 #: Residuals that exceed the given standard errors by chance less often than this count as larger.
 MISFIT = 0.01
+#: Options of a record in time.
+OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,12 +43,9 @@ class FrequencyDomainFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     data : FrequencyData
         The frequency response.
-    weight : {"inverse", "inverse-sqrt", "none"}
-        What lines weigh by where they have no standard errors.
     """
 
     data: FrequencyData = field(kw_only=True)
-    weight: Weight = "none"
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -103,7 +101,7 @@ class FrequencyDomainFit(MeasuredFit):
     @property
     def excess(self) -> float:
         """Variance of the residuals over that of the data's standard errors [-]."""
-        return self.cost * self.count / max(self.count - self.tangent.shape[1], 1)
+        return float(self.cost * self.count) / max(self.count - self.tangent.shape[1], 1)
 
     @property
     def misfit_p_value(self) -> float:
@@ -118,11 +116,11 @@ class FrequencyDomainFit(MeasuredFit):
         if d == np.inf:
             return chi_square_tail(spare, self.cost * self.count)
         variance = d**3 / ((d - 1.0) ** 2 * (d - 2.0)) / (0.5 * spare)
-        return normal_tail((self.excess - d / (d - 1.0)) / np.sqrt(variance))
+        return float(normal_tail((self.excess - d / (d - 1.0)) / np.sqrt(variance)))
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
         """Forget what belongs to single lines; it is computed from the data, which are kept."""
-        measured = _laid_out(self, lines_of(self.data, self.weight))
+        measured = _laid_out(self, self.data)
         super().leave_out(lambda: samples_at(measured, self.model, self.theta, None)._asdict())
 
     def answers(self, frequencies: Array) -> ComplexArray:
@@ -141,39 +139,34 @@ class FrequencyDomainFit(MeasuredFit):
         if not self.data.interval:
             return self.model.frequency_response(frequencies)
         count = frequencies.size
-        lines = FrequencyLines(frequencies, np.zeros(count, dtype=complex), np.ones(count), self.data.interval)
-        parts = np.zeros(2 * count)
-        parts[lines.use] = -_laid_out(self, lines).errors_of(self.model).residuals[0]
+        ones = FrequencyData(frequencies, np.ones(count, dtype=complex), interval=self.data.interval)
+        measured, parts = _laid_out(self, ones), np.zeros(2 * count)
+        parts[measured.lines.use] = measured.outputs[0] - measured.errors_of(self.model).residuals[0]
         return np.asarray(parts[:count] + 1j * parts[count:])
 
 
-def _laid_out(fit: FrequencyDomainFit, lines: FrequencyLines) -> MeasuredLines:
+def _laid_out(fit: FrequencyDomainFit, data: FrequencyData) -> MeasuredLines:
     """Lay lines out for the structure of a fit."""
     integrators = int(np.count_nonzero(np.cumsum(fit.model.denominator[::-1]) == 0.0))
     zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
     structure = Structure(fit.model.order, zeros, "delay" in fit.parameter_names)
-    return MeasuredLines(lines, structure, (fit.model.delay,) * 2, integrators, check=False)
+    return MeasuredLines(data, structure, (fit.model.delay,) * 2, integrators)
 
 
 @dataclass(frozen=True)
-class FrequencyDomain(Estimator[MeasuredLines, FrequencyDomainFit]):
+class FrequencyDomain(DelayProfile):
     r"""Least squares over frequency, by the search of :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
 
     Parameters
     ----------
-    poles : int
-        Degree of the denominator, 1 to 12, without integrators.
-    zeros : int
-        Degree of the numerator, below ``poles``; equal to ``poles`` only where the delay is known.
+    poles, zeros, fixed, integrators
+        As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
     delay_bounds : tuple of float, default (0.0, 0.0)
         Least and greatest delay [s]; two equal numbers are a known delay.
-    integrators : int, default 0
-        Poles at the origin besides.
-    fixed : tuple of Fixed, optional
-        Parameters that are known, by their names ``a1 ... an, b0 ... bm``.
-    weight : {"inverse", "inverse-sqrt", "none"}, default "none"
-        What the errors of lines without standard errors are multiplied by: the reciprocal of the measured gain, which
-        makes them relative, that of its square root, or one.
+    initial_state, offset, loss, input_before, noise_model
+        Of records in time: for a frequency response they keep their defaults.
+    svf_cutoff, nested, hold_output, covariance, bootstrap_draws
+        Not used: smaller models are always fitted too, and standard errors are those of the lines.
 
     Raises
     ------
@@ -182,11 +175,9 @@ class FrequencyDomain(Estimator[MeasuredLines, FrequencyDomainFit]):
 
     Notes
     -----
-    Minimised is ``sum |W_k (G_k - B/A exp(-j w_k tau))|^2``, W the reciprocal of the standard error, with the sampled
-    response of the model in the place of ``B/A`` for values of samples. Poles are searched from 1e-4 of the least to
-    1e2 times the greatest frequency; of samples no faster than ten over the interval.
-
-    With weights by the measured gain noise biases the estimate where it is not small beside the response.
+    Minimised is ``sum |W_k (G_k - B/A exp(-j w_k tau))|^2``, W the reciprocal of the standard error or the weight of
+    the data, with the sampled response of the model in the place of ``B/A`` for values of samples. Poles are searched
+    from 1e-4 of the least to 1e2 times the greatest frequency; of samples no faster than ten over the interval.
 
     Examples
     --------
@@ -199,76 +190,30 @@ class FrequencyDomain(Estimator[MeasuredLines, FrequencyDomainFit]):
     """
 
     kind: ClassVar[str] = "frequency_domain"
-    loss: ClassVar[LossKind] = "squares"
-    initial_state: ClassVar[InitialState] = "rest"
-    offset: ClassVar[Offset] = "none"
 
-    poles: int
-    zeros: int
     delay_bounds: tuple[float, float] = (0.0, 0.0)
-    integrators: int = 0
-    fixed: tuple[Fixed, ...] | None = None
-    weight: Weight = "none"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_structure(self)
+    def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
+        """Check a frequency response and lay it out; a DataError says why nothing can be estimated.
 
-    @property
-    def order(self) -> int:
-        """Number of poles, integrators included."""
-        return self.poles + self.integrators
-
-    def prepare(self, record: Any) -> Prepared[MeasuredLines, FrequencyDomainFit]:
-        """Check a frequency response and lay it out; a DataError says why nothing can be estimated."""
+        A record is laid out for the model to be applied to it.
+        """
         if not isinstance(record, FrequencyData):
-            raise DataError("a fit to a frequency response takes FrequencyData, and no record in time")
-        return FrequencyDomainData(self, self._lay_out(record), data=record)
-
-    def _lay_out(self, record: Any) -> MeasuredLines:
+            return super().prepare(record)
+        for name in OF_RECORDS:
+            if getattr(self, name) != next(each.default for each in fields(self) if each.name == name):
+                raise OptionError(name, f"{name} is for records in time, not for a frequency response; leave it out")
         low, high = self.delay_bounds
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
-        return MeasuredLines(
-            lines_of(record, self.weight),
-            Structure(self.order, self.zeros, delay=low < high),
-            self.delay_bounds,
-            self.integrators,
-            KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING,
-            record.name,
-        )
+        coefficients = KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING
+        structure = Structure(self.order, self.zeros, delay=low < high)
+        measured = MeasuredLines(record, structure, self.delay_bounds, self.integrators, coefficients)
+        measured.check()
+        return Prepared(self, measured)
 
-
-@dataclass(frozen=True, eq=False)
-class FrequencyDomainData(Prepared[MeasuredLines, FrequencyDomainFit]):
-    """A frequency response laid out for a fit."""
-
-    data: FrequencyData = field(kw_only=True)
-
-    def fit(self, start: Start | None = None) -> FrequencyDomainFit:
-        """Estimate; no start is needed."""
-        measured, options = self.laid_out, self.estimator
+    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        if not isinstance(measured, MeasuredLines):
+            raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
         found = fitted(measured, measured.best([], True), None, None)
         values = {each.name: getattr(found, each.name) for each in fields(found)}
-        assert isinstance(options, FrequencyDomain)
-        return FrequencyDomainFit(**values, data=self.data, weight=options.weight)._with_uncertainty("auto", DRAWS)
-
-
-def lines_of(data: FrequencyData, weight: Weight) -> FrequencyLines:
-    """Lay a frequency response out with the weights of its lines.
-
-    With standard errors the real and the imaginary part of each error have the variance one.
-    """
-    unweighted = FrequencyLines(data.frequencies, data.response, np.ones(data.frequencies.size), data.interval)
-    if data.standard_error is not None:
-        both = unweighted.use[data.frequencies.size :]
-        return FrequencyLines(
-            data.frequencies, data.response, np.sqrt(1.0 + both) / data.standard_error, data.interval
-        )
-    if weight == "none":
-        return unweighted
-    gain = np.abs(data.response)
-    if not gain.all():
-        w = data.frequencies[int(np.argmin(gain))]
-        raise DataError(f"{data.name or 'the data'}: the value at {w:g} is 0, which has no weight {weight}; use none")
-    weights = 1.0 / (gain if weight == "inverse" else np.sqrt(gain))
-    return FrequencyLines(data.frequencies, data.response, weights, data.interval)
+        return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)

@@ -7,7 +7,7 @@ break, d breaks ago:
 .. math:: z = q^{-d} \left[ e^{F f h} (q I - e^{F h})^{-1} \Gamma(h) + \Gamma(f h) \right] u, \qquad
           \Gamma(x) = \int_0^x e^{F s} ds \, g.
 
-A complex equation is two real ones, but for the lines at zero and at half the sampling frequency, whose values are real.
+A complex equation is two real ones, but for the lines at zero and at half the sampling frequency: their values are real.
 """
 
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class FrequencyLines:
     @property
     def y_used(self) -> Array:
         """Weighted real and imaginary parts, shape (count,)."""
-        return self.parts(self.response[:, None])[0]
+        return np.asarray(self.parts(self.response[:, None])[0])
 
     @property
     def lowest(self) -> float:
@@ -135,4 +135,4 @@ def held_integral(poles: ComplexArray, x: float) -> tuple[ComplexArray, ComplexA
     ratio = np.expm1(far) / far
     value = np.where(small, value, ratio)
     slope = np.where(small, slope, (np.exp(far) - ratio) / far)
-    return x * value, x * x * slope
+    return np.asarray(x * value, dtype=complex), np.asarray(x * x * slope, dtype=complex)

@@ -48,10 +48,11 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
     """
     prepared = options.prepare(data)
     fit = prepared.fit()
+    assert isinstance(fit, FrequencyDomainFit)
     assert fit.law is not None
     (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
     answer, free = _answer(fit), free_directions(fit)[0]
-    found = Identification(
+    return Identification(
         options=options,
         fit=fit,
         answer=answer,
@@ -62,7 +63,6 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
         r_t_squared=r_t_squared(residuals, values),
         warnings=tuple(f"{text}." for text in list(_warnings(fit, answer))[:MOST]),
     )
-    return found
 
 
 def _answer(fit: FrequencyDomainFit) -> AnswerTest:

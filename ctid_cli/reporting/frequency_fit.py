@@ -59,7 +59,9 @@ class FrequencyFitResult(FitResult):
         """Return the data, and what reading them has shown."""
         data, time = self.fit.data, self.units.time
         low, high = data.frequencies[[0, -1]]
-        line = f"{data.name or 'frequency response'}: {count(data.frequencies.size, 'line')} from {low:.6g} to {high:.6g}"
+        line = (
+            f"{data.name or 'frequency response'}: {count(data.frequencies.size, 'line')} from {low:.6g} to {high:.6g}"
+        )
         return Section(sentences=[f"{line} rad/{time}", *data.notes])
 
     def settings(self) -> Iterator[tuple[str, str]]:
@@ -73,7 +75,7 @@ class FrequencyFitResult(FitResult):
         sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
         yield "values", sampled if data.interval else "G(jw)"
         if data.standard_error is None:
-            yield "weights", f"{WEIGHTS[self.fit.weight]} (--weight {self.fit.weight})"
+            yield "weights", f"{WEIGHTS[data.weight]} (--weight {data.weight})"
         else:
             yield "weights", "reciprocal of standard_error"
 
@@ -124,7 +126,7 @@ class FrequencyFitResult(FitResult):
             "file": data.name,
             "lines": data.frequencies.size,
             "interval": data.interval or None,
-            "weights": fit.weight if data.standard_error is None else "standard_error",
+            "weights": data.weight if data.standard_error is None else "standard_error",
             "residuals_over_standard_errors": None if data.standard_error is None else np.sqrt(fit.excess),
             "misfit_p_value": fit.misfit_p_value,
             "correlated": fit.correlated,
@@ -162,9 +164,13 @@ def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
             axes.semilogx(w[seen], fitted[seen], color=DARK, linewidth=1.2, label="model")
         if data.standard_error is not None:
             level = decibels(data.standard_error)
-            error.fill_between(w[seen], np.min(level) - 40.0, level[seen], color=BAND, linewidth=0.0, label="standard error")
+            error.fill_between(
+                w[seen], np.min(level) - 40.0, level[seen], color=BAND, linewidth=0.0, label="standard error"
+            )
             error.set_ylim(bottom=float(np.min(level)) - 20.0)
-        error.semilogx(w[seen], decibels(np.abs(data.response - model))[seen], ".", color=DARK, markersize=3, label="residual")
+        error.semilogx(
+            w[seen], decibels(np.abs(data.response - model))[seen], ".", color=DARK, markersize=3, label="residual"
+        )
         error.set_ylabel(f"residual [dB re 1 {plain(units.gain)}]")
         error.legend(loc="best", fontsize=8)
         name_axes(gain, phase, error, units)

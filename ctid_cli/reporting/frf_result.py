@@ -89,7 +89,10 @@ class FrequencyResponseResult(Result):
         if found.distortion is not None:
             columns[f"distortion [{unit}]"] = np.sqrt(found.distortion)
         # What a fit to the table needs to know of its values.
-        told: dict[str, Any] = {"freedom [-]": found.freedom, f"hold_interval [{self.records.units.time}]": found.interval or np.nan}
+        told: dict[str, Any] = {
+            "freedom [-]": found.freedom,
+            f"hold_interval [{self.records.units.time}]": found.interval or np.nan,
+        }
         return pd.DataFrame(columns | told | {"correlated [-]": found.method != "periodic"})
 
     def content(self) -> dict[str, Any]:

@@ -6,16 +6,17 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.signals.checks import freeze
+from ctid_cli.signals.checks import freeze, require_choice
 from ctid_cli.signals.held import hold_factor
 from ctid_cli.signals.measurement import open_table
-from ctid_cli.signals.table import Columns, Table, split_header
+from ctid_cli.signals.table import Table, split_header
+from ctid_cli.signals.treatment import Weight
 from ctid_cli.text import listed
 
 #: Names by which columns are recognised; case is ignored.
@@ -58,6 +59,10 @@ class FrequencyData:
     freedom : float, default infinite
         Degrees of freedom of the complex residuals that the standard errors are from [-]; infinite where they are
         known.
+    weight : {"inverse", "inverse-sqrt", "none"}, default "none"
+        What the errors of lines without standard errors are multiplied by: the reciprocal of the measured gain, which
+        makes them relative, that of its square root, or one. Weights by a gain that is not large beside its noise bias
+        an estimate.
     name : str, default ""
         What messages call the data.
     units : tuple of str, default ("s", "out", "in")
@@ -84,6 +89,7 @@ class FrequencyData:
     interval: float = 0.0
     correlated: bool = False
     freedom: float = math.inf
+    weight: Weight = "none"
     name: str = ""
     units: tuple[str, str, str] = ("s", "out", "in")
     notes: tuple[str, ...] = ()
@@ -101,18 +107,23 @@ class FrequencyData:
         if errors is not None and not (np.isfinite(errors) & (errors > 0.0)).all():
             k = int(np.argmin(np.isfinite(errors) & (errors > 0.0)))
             raise DataError(
-                f"{self._what}standard_error at {w[k]:g} {rate} is {errors[k]:g}; it must be a positive number, or leave"
-                " the standard errors out: lines then weigh by --weight"
+                f"{self._what}standard_error at {w[k]:g} {rate} is {errors[k]:g}; it must be a positive number, "
+                "or leave the standard errors out: lines then weigh by --weight"
             )
         if not (np.isfinite(self.interval) and self.interval >= 0.0):
-            raise DataError(f"{self._what}the interval must be a positive number, or 0 for G(jw); got {self.interval!r}")
+            raise DataError(
+                f"{self._what}the interval must be a positive number, or 0 for G(jw); got {self.interval!r}"
+            )
         if self.interval and w.max() > np.pi / self.interval * (1.0 + ROUNDING):
             raise DataError(
                 f"{self._what}{w.max():g} {rate} is beyond half the sampling frequency, {np.pi / self.interval:g} "
                 f"{rate}, of values of samples; leave such lines out, or correct the interval"
             )
+        require_choice("weight", self.weight, get_args(Weight))
         order = np.argsort(w, kind="stable")
-        freeze(self, frequencies=w[order], response=values[order], standard_error=None if errors is None else errors[order])
+        freeze(
+            self, frequencies=w[order], response=values[order], standard_error=None if errors is None else errors[order]
+        )
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
@@ -149,8 +160,8 @@ def read_frequency_data(
     Parameters
     ----------
     path : path
-        A text, MATLAB or HDF5 file with columns ``frequency`` [Hz or rad/s], and ``real`` and ``imaginary``, or ``gain``
-        [- or dB] and ``phase`` [deg or rad]; with ``standard_error`` the square root of ``E |e|^2`` of the complex
+        A text, MATLAB or HDF5 file with columns ``frequency`` [Hz or rad/s], and ``real`` and ``imaginary``, or
+        ``gain`` [- or dB] and ``phase`` [deg or rad]; with ``standard_error`` the square root of ``E |e|^2`` of the complex
         value. Comments ``# hold: zoh`` and ``# interval: 0.05`` say that the values are those of samples.
     low, high : float, optional
         First and last frequency to use [unit of the file].

@@ -181,7 +181,9 @@ class Fractions:
             lower[:, pairs] = values[:, poles.size :]
             # Real and imaginary part in time: half the sum and half the difference of a mode and its conjugate.
             of_z = np.stack((0.5 * (upper + lower), -0.5j * (upper - lower)), axis=2)
-            columns.append(of_z.reshape(len(values), -1)[:, np.column_stack((np.full(poles.size, True), pairs)).ravel()])
+            columns.append(
+                of_z.reshape(len(values), -1)[:, np.column_stack((np.full(poles.size, True), pairs)).ravel()]
+            )
         return np.column_stack((*columns, lines.delayed(delay)))
 
     def free(self, elapsed: Array, second: bool) -> Array:

@@ -206,7 +206,10 @@ class StructureSearch:
         """
         samples = sum(data.count for data in self.problem.records)
         # Half of what separates two frequencies.
-        resolution, highest = 0.5 * np.pi * self.box.spread[0], min(self.box.imaginary, self.box.fastest, self.box.highest)
+        resolution, highest = (
+            0.5 * np.pi * self.box.spread[0],
+            min(self.box.imaginary, self.box.fastest, self.box.highest),
+        )
         count = min(int(highest / resolution), RESOLVED // samples)
         if poles < 2 or count < self.effort.pairs:
             return []

@@ -122,7 +122,12 @@ def _reduced(triangle: Array | None, rows: Array) -> Array:
 
 
 def triangle_of(
-    form: Form, columns: Columns, delay: Delay, data: FilterData | FrequencyLines, period: float, noise: SampledNoise | None = None
+    form: Form,
+    columns: Columns,
+    delay: Delay,
+    data: FilterData | FrequencyLines,
+    period: float,
+    noise: SampledNoise | None = None,
 ) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     # Memory is that of one piece, however long the record.
