@@ -13,6 +13,7 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Prepared, Start, places_of
 from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import Optimum
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted, samples_at
 from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
@@ -214,6 +215,11 @@ class FrequencyDomain(DelayProfile):
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         if not isinstance(measured, MeasuredLines):
             raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
-        found = fitted(measured, measured.best([], True), None, None)
+        return self.fit_of(measured, measured.best([], True))
+
+    @staticmethod
+    def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
+        """Return the fit that an optimum is, with its standard errors."""
+        found = fitted(measured, optimum, None, None)
         values = {each.name: getattr(found, each.name) for each in fields(found)}
         return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)
