@@ -31,7 +31,7 @@ def data_of(name: str, count: int) -> tuple[FrequencyData, np.ndarray]:
     options = FrequencyDomain(poles, zeros, integrators=integrators, delay_bounds=(model.delay, model.delay))
     blank = FrequencyData(w, np.ones(count, dtype=complex), interval=interval)
     measured = options.prepare(blank).laid_out
-    parts = (measured.outputs[0] - measured.errors_of(model).residuals[0])
+    parts = measured.outputs[0] - measured.errors_of(model).residuals[0]
     values = parts[:count] + 1j * parts[count:]
     shape = 1.0 + 2.0 * w / highest
     power = np.median(np.abs(values) ** 2) if integrators else np.mean(np.abs(values) ** 2)

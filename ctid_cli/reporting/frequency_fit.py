@@ -108,12 +108,15 @@ class FrequencyFitResult(FitResult):
         yield "cost", f"{number(fit.cost)}, mean square of a weighted real or imaginary part"
         if fit.data.standard_error is not None:
             size = f"{number(np.sqrt(fit.excess), 4)} times the standard errors of the data"
-            yield "residuals", f"{size} (chi-square test, p = {number(fit.misfit_p_value, 2)})"
+            yield "residuals", f"{size} (p = {number(fit.misfit_p_value, 2)})"
         sizes = f"N = {criteria.count} real equations and p = {criteria.parameters} parameters"
         yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)} with {sizes}"
         yield "condition number", number(fit.condition_number, 3)
         yield from search_lines(fit, self.units)
-        yield "neighbouring lines", "residuals pass as uncorrelated" if fit.white else "residuals are correlated"
+        yield (
+            "lines",
+            "errors of neighbours pass as uncorrelated" if fit.white else "errors of neighbours are correlated",
+        )
 
     def drawing(self) -> Drawing:
         """Return the figure of gain, phase and residuals."""

@@ -57,7 +57,11 @@ def test_units_errors_samples_and_lines_without_a_value(tmp_path):
         ("frequency [rad/s],real,imaginary", "# hold: foh\n", "1: hold must be zoh and none, not 'foh'"),
         ("frequency [rad/s],real,imaginary", "# hold: zoh\n", "1: hold zoh needs the sampling interval"),
         ("frequency [rad/s],real,imaginary", "# interval: 1\n", "1: an interval needs the hold"),
-        ("frequency [rad/s],real,imaginary", "# hold: zoh\n# interval: fast\n", "2: interval must be a positive number"),
+        (
+            "frequency [rad/s],real,imaginary",
+            "# hold: zoh\n# interval: fast\n",
+            "2: interval must be a positive number",
+        ),
         ("frequency [rad/s],real,imaginary", "# hold: zoh\n# interval: 3\n", "beyond half the sampling frequency"),
     ],
 )
