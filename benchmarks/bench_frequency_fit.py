@@ -2,7 +2,7 @@
 
     python benchmarks/bench_frequency_fit.py --lines 600 --records 250
 
-Three systems: G(jw), samples under a zero-order hold, and samples with an integrator, all with a delay that is searched.
+Systems of first and second order with a delay that is searched: G(jw), samples under a zero-order hold, an integrator.
 All records are searched in the basin of the true model, the first of them globally too.
 """
 
@@ -77,10 +77,9 @@ def main() -> None:
         names = [n for n, f in zip(fit.parameter_names, free, strict=True) if f]
         for j, parameter in enumerate(names):
             bias = error[:, j].mean() / scatter[j]
-            print(
-                f"  {parameter:6} bias {bias:+.3f} sd ({bias * np.sqrt(given.records):+.1f} Monte Carlo errors), scatter "
-                f"over theory {scatter[j] / theory[j]:.3f}, coverage {100 * inside[j]:.1f} %"
-            )
+            certain = f"{bias:+.3f} sd ({bias * np.sqrt(given.records):+.1f} Monte Carlo errors)"
+            ratio = f"{scatter[j] / theory[j]:.3f}, coverage {100 * inside[j]:.1f} %"
+            print(f"  {parameter:6} bias {certain}, scatter over theory {ratio}")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ break, d breaks ago:
 .. math:: z = q^{-d} \left[ e^{F f h} (q I - e^{F h})^{-1} \Gamma(h) + \Gamma(f h) \right] u, \qquad
           \Gamma(x) = \int_0^x e^{F s} ds \, g.
 
-A complex equation is two real ones, but for the lines at zero and at half the sampling frequency: their values are real.
+A complex equation is two real ones, but one at frequency zero and at half the sampling frequency.
 """
 
 from dataclasses import dataclass

@@ -161,8 +161,8 @@ def read_frequency_data(
     ----------
     path : path
         A text, MATLAB or HDF5 file with columns ``frequency`` [Hz or rad/s], and ``real`` and ``imaginary``, or
-        ``gain`` [- or dB] and ``phase`` [deg or rad]; with ``standard_error`` the square root of ``E |e|^2`` of the complex
-        value. Comments ``# hold: zoh`` and ``# interval: 0.05`` say that the values are those of samples.
+        ``gain`` [- or dB] and ``phase`` [deg or rad]; with ``standard_error`` the square root of ``E |e|^2`` of the
+        complex value. Comments ``# hold: zoh`` and ``# interval: 0.05`` say that the values are those of samples.
     low, high : float, optional
         First and last frequency to use [unit of the file].
 

@@ -3,8 +3,20 @@
 import numpy as np
 import pytest
 
-from ctid_cli import DataError, Fixed, FrequencyData, FrequencyDomain, HeldSignal, Record, TransferFunction, simulate
-from ctid_cli import estimate_frequency_response, identify_frequency_response, load_fit, save_fit
+from ctid_cli import (
+    DataError,
+    Fixed,
+    FrequencyData,
+    FrequencyDomain,
+    HeldSignal,
+    Record,
+    TransferFunction,
+    estimate_frequency_response,
+    identify_frequency_response,
+    load_fit,
+    save_fit,
+    simulate,
+)
 from ctid_cli.estimation.measured_lines import MeasuredLines
 from ctid_cli.estimation.optimum.box import box_of, point_of
 from ctid_cli.estimation.optimum.projection import project, slopes
