@@ -102,7 +102,7 @@ class FrequencyDomainFit(MeasuredFit):
     @property
     def excess(self) -> float:
         """Variance of the residuals over that of the data's standard errors [-]."""
-        return float(self.cost * self.count) / max(self.count - self.tangent.shape[1], 1)
+        return float(self.cost * self.count / max(self.count - self.tangent.shape[1], 1))
 
     @property
     def misfit_p_value(self) -> float:
