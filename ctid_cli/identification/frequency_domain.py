@@ -83,10 +83,11 @@ def _warnings(fit: FrequencyDomainFit, answer: AnswerTest) -> Iterator[str]:
         yield f"No model: the values are not seen to be anything but noise (p = {answer.p_value:.2g})"
         return
     if fit.misfit_p_value < MISFIT:
-        yield (
+        what = (
             f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say (p = "
-            f"{fit.misfit_p_value:.2g}): the model misses a part of the response, or the errors are too small"
         )
+        hold = ", or the input is not constant between the samples (ctid frf --hold)" * (fit.data.interval > 0.0)
+        yield f"{what}{fit.misfit_p_value:.2g}): the model misses a part of the response{hold}, or the errors are too small"
     if not fit.white and not fit.data.correlated:
         yield (
             "The residuals of neighbouring lines are correlated: the model misses a part of the response, or the lines "

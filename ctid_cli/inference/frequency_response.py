@@ -99,7 +99,7 @@ class FrequencyResponse:
     def data(self) -> FrequencyData:
         """The response as data for a model: of a clock with a zero-order hold the values of samples."""
         values = self.frequencies, self.response, self.standard_error
-        others: Any = {"correlated": self.method != "periodic", "freedom": float(self.freedom.min())}
+        others: Any = {"correlated": self.method != "periodic", "freedom": float(np.median(self.freedom))}
         if self.interval:
             return FrequencyData.of_held(*values, self.interval, **others)
         return FrequencyData(*values, **others)

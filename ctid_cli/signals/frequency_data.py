@@ -57,8 +57,8 @@ class FrequencyData:
     correlated : bool, default False
         Whether neighbouring lines have errors in common, as those of local polynomials and of Welch's method have.
     freedom : float, default infinite
-        Degrees of freedom of the complex residuals that the standard errors are from [-]; infinite where they are
-        known.
+        Degrees of freedom of the complex residuals that the standard errors are from, their median over the lines [-];
+        infinite where standard errors are known.
     weight : {"inverse", "inverse-sqrt", "none"}, default "none"
         What the errors of lines without standard errors are multiplied by: the reciprocal of the measured gain, which
         makes them relative, that of its square root, or one. Weights by a gain that is not large beside its noise bias
@@ -203,7 +203,7 @@ def read_frequency_data(
     interval, errors = _sampled(table, time_unit), values.get("standard_error")
     others: dict[str, Any] = {"name": columns.file, "units": units, "notes": tuple(notes)}
     others["correlated"] = bool(np.any(values.get("correlated", np.zeros(1)) == 1.0))
-    others["freedom"] = float(np.min(values.get("freedom", np.full(1, np.inf))))
+    others["freedom"] = float(np.median(values.get("freedom", np.full(1, np.inf))))
     held = values.get("hold_interval", np.full(1, np.nan))
     if interval is None and errors is not None and np.isfinite(held).all():
         return FrequencyData.of_held(w[used], response[used], errors[used], float(held[0]), **others)
