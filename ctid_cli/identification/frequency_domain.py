@@ -87,7 +87,8 @@ def _warnings(fit: FrequencyDomainFit, answer: AnswerTest) -> Iterator[str]:
             f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say (p = "
         )
         hold = ", or the input is not constant between the samples (ctid frf --hold)" * (fit.data.interval > 0.0)
-        yield f"{what}{fit.misfit_p_value:.2g}): the model misses a part of the response{hold}, or the errors are too small"
+        missed = f"the model misses a part of the response{hold}, or the errors are too small"
+        yield f"{what}{fit.misfit_p_value:.2g}): {missed}"
     if not fit.white and not fit.data.correlated:
         yield (
             "The residuals of neighbouring lines are correlated: the model misses a part of the response, or the lines "
