@@ -4,7 +4,11 @@
 #                 goes on where it was; with RUNS=20 fewer data sets, which are checked and not published
 # make reproduce-small
 #                 the first data sets of every study, compared with the committed estimates: what CI does after make test
-# make docs      the documentation site in build/docs; warnings are errors
+# make docs       the documentation site in build/docs; warnings are errors
+# make scoreboard ctid beside numbers that others printed and exact bounds: docs/scoreboard.md
+# make release-check
+#                 wheel and sdist, built, installed in new environments and run without a clone; VERSIONS=newest or
+#                 oldest: of the dependencies
 # make bench      speed, measured against other tools
 # make clean      remove what the other targets built (never results)
 
@@ -12,12 +16,13 @@ PYTHON ?= python3
 RUNS ?=
 JOBS ?= 2
 OUT ?= results
+VERSIONS ?= pinned
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test reproduce reproduce-small docs bench clean
+.PHONY: demo test reproduce reproduce-small docs scoreboard release-check bench clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -42,6 +47,12 @@ reproduce-small: $(VENV)/.installed
 
 docs: $(VENV)/.docs-installed
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs build/docs
+
+scoreboard: $(VENV)/.installed
+	$(BIN)/python benchmarks/scoreboard.py --write docs/scoreboard.md
+
+release-check:
+	PYTHON="$(PYTHON)" .ci/release-check $(VERSIONS)
 
 bench: $(VENV)/.test-installed
 	set -e; for file in benchmarks/bench_*.py; do echo "== $$file"; PYTHONPATH=. $(BIN)/python "$$file"; done

@@ -21,39 +21,30 @@ import typer
 from typer.core import TyperCommand
 
 from ctid_cli.canonical import plain
-from ctid_cli.cli._options import with_option_groups
+from ctid_cli.cli._options import flag, with_option_groups
 from ctid_cli.errors import CtidError, ExitCode, RefusedError, SpecError, StorageError, UsageError
 from ctid_cli.reporting.document import Format, Result
-from ctid_cli.signals.treatment import Hold
 from ctid_cli.written_files import write_file
 
 Function = TypeVar("Function", bound=Callable[..., None])
 Number = TypeVar("Number", int, float)
 
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder that holds the results.")]
+Out = Annotated[Path, flag("--out", "Folder that holds the results.", "DIR")]
 Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Replace one value of the file, e.g. noise.snr_db=15; repeatable."),
+    list[str] | None, flag("--set", "Replace one value of the file, e.g. noise.snr_db=15; repeatable.", "KEY=VALUE")
 ]
 AllowCode = Annotated[
-    bool,
-    typer.Option("--allow-code", envvar="CTID_ALLOW_CODE", help="Run the code that the file names as kind; trust it."),
+    bool, flag("--allow-code", "Run the code that the file names as kind; trust it.", envvar="CTID_ALLOW_CODE")
 ]
 AllowOutside = Annotated[
-    bool,
-    typer.Option(
-        "--allow-outside", envvar="CTID_ALLOW_OUTSIDE", help="Read data files outside the folder of the file."
-    ),
+    bool, flag("--allow-outside", "Read data files outside the folder of the file.", envvar="CTID_ALLOW_OUTSIDE")
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Worker processes; all processors by default.")]
-Runs = Annotated[
-    int | None, typer.Option("--runs", min=1, help="Number of data sets per setting, in place of the file's.")
-]
-AllowMixed = Annotated[bool, typer.Option("--allow-mixed", help="Mix code versions or processors.")]
-Fresh = Annotated[bool, typer.Option("--fresh", help="Move older results aside and start anew.")]
+Runs = Annotated[int | None, flag("--runs", "Number of data sets per setting, in place of the file's.", min=1)]
+AllowMixed = Annotated[bool, flag("--allow-mixed", "Mix code versions or processors.")]
+Fresh = Annotated[bool, flag("--fresh", "Move older results aside and start anew.")]
 Config = Annotated[Path, typer.Argument(metavar="CONFIG", help="Experiment file (YAML).")]
 Configs = Annotated[list[Path], typer.Argument(metavar="CONFIG", help="Experiment files (YAML).")]
-InputHold = Annotated[Hold, typer.Option("--hold", help="The input between its samples.")]
 
 #: Options that say where and in what form results are written, not what they are.
 _OF_OUTPUT = ("format", "json", "out", "report", "csv", "export")
@@ -70,7 +61,11 @@ class Command(TyperCommand):
         for option in given:
             if option.param_type_name == "option" and not option.multiple and given.count(option) > 1:
                 ctx.fail(f"{max(option.opts, key=len)} is given twice.")
-        return super().parse_args(ctx, args)
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            raise
 
 
 class ComputingCommand(Command):

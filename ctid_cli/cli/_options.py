@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -17,6 +17,7 @@ import typer
 from ctid_cli.reporting.document import Format
 
 if TYPE_CHECKING:
+    from ctid_cli.reporting.records import Records as MeasuredRecords
     from ctid_cli.signals.measurement import Measurement
 
 
@@ -53,9 +54,18 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     return wrapper
 
 
-TimeColumn = Annotated[str | None, typer.Option("--time", metavar="NAME", help="Column of the times.")]
-From = Annotated[float | None, typer.Option("--from", metavar="TIME", help="First instant to use [unit of the file].")]
-To = Annotated[float | None, typer.Option("--to", metavar="TIME", help="Last instant to use.")]
+def flag(name: str, help: str, metavar: str | None = None, **more: Any) -> Any:
+    """Return the declaration of an option."""
+    return typer.Option(name, help=help, metavar=metavar, **more)
+
+
+TimeColumn = Annotated[str | None, flag("--time", "Column of the times.", "NAME")]
+From = Annotated[float | None, flag("--from", "First instant to use [unit of the file].", "TIME")]
+To = Annotated[float | None, flag("--to", "Last instant to use.", "TIME")]
+Records = Annotated[
+    list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
+]
+Validate = Annotated[Path | None, flag("--validate", "Validate on this record too.", "FILE")]
 
 
 @dataclass(frozen=True)
@@ -63,28 +73,37 @@ class RecordOptions:
     """Which columns and which part of measured records are used."""
 
     time: TimeColumn = None
-    input: Annotated[str | None, typer.Option("--input", metavar="NAME", help="Column of the input.")] = None
-    output: Annotated[str | None, typer.Option("--output", metavar="NAME", help="Column of the output.")] = None
+    input: Annotated[str | None, flag("--input", "Column of the input.", "NAME")] = None
+    output: Annotated[str | None, flag("--output", "Column of the output.", "NAME")] = None
     start: From = None
     stop: To = None
 
     def read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         """Read a record, between the instants that are given."""
-        return self.read_whole(file, hold, start=self.start, stop=self.stop, **others)
+        return self._read(file, hold, start=self.start, stop=self.stop, **others)
 
-    def read_whole(self, file: Path, hold: Any, **others: Any) -> Measurement:
-        """Read a record from its beginning to its end, such as one for validation."""
+    def _read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         from ctid_cli.signals.measurement import read_measurement
 
         return read_measurement(file, time=self.time, input=self.input, output=self.output, hold=hold, **others)
+
+    def read_all(self, files: Sequence[Path], validate: Path | None, hold: Any, **others: Any) -> MeasuredRecords:
+        """Read records, and one for validation from its beginning to its end; a DataError where their units differ."""
+        from ctid_cli.reporting.records import Records
+
+        other = None if validate is None else self._read(validate, hold, **others)
+        records = Records([self.read(file, hold, **others) for file in files], other)
+        # Units that differ are refused before anything is computed.
+        records.units  # noqa: B018
+        return records
 
 
 @dataclass(frozen=True)
 class FormatOptions:
     """The form of what a command prints."""
 
-    format: Annotated[Format, typer.Option("--format", help="Output format.")] = "text"
-    json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False
+    format: Annotated[Format, flag("--format", "Output format.")] = "text"
+    json: Annotated[bool, flag("--json", "Short for --format json.")] = False
 
     @property
     def form(self) -> Format:

@@ -23,8 +23,8 @@ def accuracy(
     the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
     unexpected about them comes last.
     """
-    from ctid_cli.reporting.accuracy_result import accuracy_of
+    from ctid_cli.reporting.accuracy_result import AccuracyResult
     from ctid_cli.reporting.results import find_results
 
     ((_, plan),) = spec.plans([config])
-    emit(accuracy_of(plan, find_results(out, plan.experiment)), form.form)
+    emit(AccuracyResult.of(plan, find_results(out, plan.experiment)), form.form)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import emit, guarded
-from ctid_cli.cli._options import FormatOptions, RecordOptions
+from ctid_cli.cli._options import FormatOptions, RecordOptions, flag
 from ctid_cli.errors import MismatchError
 from ctid_cli.signals.treatment import AskedHold
 
@@ -22,8 +22,8 @@ def check(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Measured record (.csv, .mat, .h5).")],
     columns: RecordOptions,
     form: FormatOptions,
-    hold: Annotated[AskedHold, typer.Option("--hold", help="The input between its samples.")] = "auto",
-    strict: Annotated[bool, typer.Option("--strict", help="Exit code 7 if there is a PROBLEM.")] = False,
+    hold: Annotated[AskedHold, flag("--hold", "The input between its samples.")] = "auto",
+    strict: Annotated[bool, flag("--strict", "Exit code 7 if there is a PROBLEM.")] = False,
 ) -> None:
     """State facts on a measured record, and the fit to begin with.
 
@@ -40,7 +40,7 @@ def check(
     facts = record_facts(measured.record)
     result = RecordCheckResult(measured, facts)
     if result.worst != "problem":
-        choice = choose(measured.record, Given(hold=hold))
+        choice = choose(measured.record, Given(hold=hold), measured.time_unit or "s")
         result = replace(result, command=command_of(measured, choice.words()) if choice.seen else None)
     emit(result, form.form)
     if strict and result.worst == "problem":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import emit, guarded, refuse_overwriting, write_files
-from ctid_cli.cli._options import FormatOptions, RecordOptions
+from ctid_cli.cli._options import FormatOptions, RecordOptions, flag
 from ctid_cli.signals.treatment import Hold, InitialState, Offset
 
 if TYPE_CHECKING:
@@ -21,21 +21,13 @@ if TYPE_CHECKING:
 @guarded
 def compare(
     files: Annotated[list[Path], typer.Argument(metavar="FIT", help="Files that ctid fit wrote (fit.json).")],
-    on: Annotated[
-        Path, typer.Option("--on", metavar="FILE", help="Record, preferably one that no model was fitted to.")
-    ],
+    on: Annotated[Path, flag("--on", "Record, preferably one that no model was fitted to.", "FILE")],
     columns: RecordOptions,
     form: FormatOptions,
-    hold: Annotated[
-        Hold | None, typer.Option("--hold", help="The input between its samples; as in the fit if not given.")
-    ] = None,
-    initial_state: Annotated[
-        InitialState | None, typer.Option("--initial-state", help="State before the record; as in the fit.")
-    ] = None,
-    offset: Annotated[
-        Offset | None, typer.Option("--offset", help="Constant offset of the output; as in the fit.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for comparison.csv and .svg.")] = Path("."),
+    hold: Annotated[Hold | None, flag("--hold", "The input between its samples; as in the fit.")] = None,
+    initial_state: Annotated[InitialState | None, flag("--initial-state", "Before the record; as in the fit.")] = None,
+    offset: Annotated[Offset | None, flag("--offset", "Constant offset of the output; as in the fit.")] = None,
+    out: Annotated[Path, flag("--out", "Folder for comparison.csv and .svg.", "DIR")] = Path("."),
 ) -> None:
     """Compare fitted models on the same samples of one record.
 

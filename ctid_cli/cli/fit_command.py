@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
-from ctid_cli.cli._options import FormatOptions, RecordOptions
+from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
 from ctid_cli.cli.frequency_fit import frequency_files, frequency_fit
@@ -19,24 +18,17 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 
 if TYPE_CHECKING:
-    from ctid_cli.estimators.identification import Identification
-    from ctid_cli.estimators.loop_output_error import LoopOutputError
-    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
-    from ctid_cli.identification.choice import Given
     from ctid_cli.reporting.fit_result import FitResult
-    from ctid_cli.reporting.records import Records
 
 
 @dataclass(frozen=True)
 class WritingOptions:
     """Which files ``ctid fit`` writes."""
 
-    report: Annotated[bool, typer.Option("--report", help="Write the page fit.html too.")] = False
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="DIR", help="Write step, Bode, simulation and residuals as CSV.")
-    ] = None
-    export: Annotated[Tool | None, typer.Option("--export", help="Write the model as code for this tool.")] = None
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for fit.json and fit.svg.")] = Path(".")
+    report: Annotated[bool, flag("--report", "Write the page fit.html too.")] = False
+    csv: Annotated[Path | None, flag("--csv", "Write step, Bode, simulation and residuals as CSV.", "DIR")] = None
+    export: Annotated[Tool | None, flag("--export", "Write the model as code for this tool.")] = None
+    out: Annotated[Path, flag("--out", "Folder for fit.json and fit.svg.", "DIR")] = Path(".")
 
     def contents(self, result: FitResult, command: str) -> dict[Path, bytes]:
         """Return what is written, by path; the first is the fit itself."""
@@ -46,7 +38,7 @@ class WritingOptions:
         text = result.file_text(self.out, command)
         contents = {self.out / "fit.json": text.encode() + b"\n", self.out / "fit.svg": result.drawing().saved()}
         if self.report:
-            contents[self.out / "fit.html"] = self._page(result, json.loads(text)).encode()
+            contents[self.out / "fit.html"] = result.page(json.loads(text)).encode()
         if self.csv is not None:
             contents |= {self.csv / name: frame_bytes(frame) for name, frame in fit_tables(result).items()}
         if self.export is not None:
@@ -54,39 +46,53 @@ class WritingOptions:
             contents[self.out / name] = code.encode()
         return contents
 
-    def _page(self, result: FitResult, content: dict[str, Any]) -> str:
-        """Return the page of a fit."""
-        from ctid_cli.reporting.frequency_fit import FrequencyFitResult
-        from ctid_cli.reporting.pages.fit_page import fit_page
-        from ctid_cli.reporting.pages.frequency_fit_page import frequency_fit_page
 
-        if isinstance(result, FrequencyFitResult):
-            return frequency_fit_page(result, content)
-        return fit_page(result, content)
+@dataclass(frozen=True)
+class JudgingOptions:
+    """How the fit is judged."""
+
+    validate: Validate = None
+    bootstrap: Annotated[
+        int | None, flag("--bootstrap", "Compute bootstrap intervals from this number of draws.", "DRAWS")
+    ] = None
+    predict: Annotated[int | None, flag("--predict", "Fit of predictions K samples ahead, with --noise.", "K")] = None
+
+    @property
+    def draws(self) -> dict[str, Any]:
+        """The intervals that are asked for, as options of a fit."""
+        return {} if self.bootstrap is None else {"covariance": "bootstrap", "bootstrap_draws": self.bootstrap}
+
+    def check(self, noise: str) -> None:
+        """Refuse too few draws, and predictions of what cannot be predicted."""
+        from ctid_cli.estimation.common import LEAST_DRAWS
+
+        if self.bootstrap is not None and self.bootstrap < LEAST_DRAWS:
+            found = f"got {self.bootstrap}"
+            raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; {found}")
+        if self.predict is not None and self.predict < 1:
+            raise UsageError(f"--predict must be at least 1 sample, for example 10; got {self.predict}")
+        if self.predict is not None and noise == "white":
+            raise UsageError("--predict needs a noise model: white noise cannot be predicted; add --noise auto")
+
+    def check_records(self, lengths: dict[str, int]) -> None:
+        """Refuse predictions farther ahead than a record is long."""
+        for name, n in lengths.items():
+            if self.predict is not None and self.predict >= n:
+                wrong = f"--predict {self.predict} is as long as {name} with its {n} samples or longer"
+                raise UsageError(f"{wrong}; give a smaller number, for example 10")
 
 
 @guarded
 def fit(
     context: typer.Context,
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
-    ],
+    files: Records,
     model: ModelOptions,
     loop: LoopOptions,
     treatment: FitOptions,
     columns: RecordOptions,
     form: FormatOptions,
     writing: WritingOptions,
-    validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record.")
-    ] = None,
-    bootstrap: Annotated[
-        int | None,
-        typer.Option("--bootstrap", metavar="DRAWS", help="Compute bootstrap intervals from this number of draws."),
-    ] = None,
-    predict: Annotated[
-        int | None, typer.Option("--predict", metavar="K", help="Fit of predictions K samples ahead, with --noise.")
-    ] = None,
+    judging: JudgingOptions,
 ) -> None:
     """Fit a transfer function with a delay to measured records, or to a frequency response.
 
@@ -97,80 +103,31 @@ def fit(
     """
     asked = Asked(model, treatment, loop.use)
     if frequency_files(files):
-        others: dict[str, object] = {"validate": validate, "bootstrap": bootstrap, "predict": predict}
-        result: FitResult = frequency_fit(files, asked, loop, columns, others)
+        result: FitResult = frequency_fit(files, asked, loop, columns, asdict(judging))
     else:
-        _check_draws(bootstrap)
-        _check_predicted(predict, treatment.noise)
-        loop.check()
-        result = _fit_of_records(files, validate, asked, loop, columns, bootstrap, predict)
+        result = _fit_of_records(files, asked, loop, columns, judging)
     contents = writing.contents(result, given_command(context))
-    refuse_overwriting([*files, *([validate] if validate else [])], contents)
+    refuse_overwriting([*files, *([judging.validate] if judging.validate else [])], contents)
     write_files(contents)
     emit(result, form.form, list(contents), stored=next(iter(contents.values())).decode())
 
 
 def _fit_of_records(
-    files: Sequence[Path],
-    validate: Path | None,
-    asked: Asked,
-    loop: LoopOptions,
-    columns: RecordOptions,
-    bootstrap: int | None,
-    predict: int | None,
+    files: list[Path], asked: Asked, loop: LoopOptions, columns: RecordOptions, judging: JudgingOptions
 ) -> FitResult:
-    """Fit a model to records in time."""
+    """Fit a model to records in time, with a bar of progress where it takes long."""
+    from ctid_cli.identification.identify import identify
     from ctid_cli.reporting.fit_result import FitResult
 
-    if asked.treatment.weight is not None:
-        raise UsageError("--weight is for a frequency response; the samples of a record weigh the same, drop --weight")
+    judging.check(asked.treatment.noise)
+    loop.check()
     options = options_of(asked)
     if asked.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    records = _records(files, validate, loop, columns, asked.treatment)
-    found = _identified(options, records, bootstrap)
-    other = None if found.validation is None else found.validation.record
-    return FitResult(found, records.with_data(found.records, other), predict)
-
-
-def _check_draws(bootstrap: int | None) -> None:
-    from ctid_cli.estimation.common import LEAST_DRAWS
-
-    if bootstrap is not None and bootstrap < LEAST_DRAWS:
-        raise UsageError(f"--bootstrap must be at least {LEAST_DRAWS} draws, for example 500; got {bootstrap}")
-
-
-def _check_predicted(ahead: int | None, noise: str) -> None:
-    if ahead is not None and ahead < 1:
-        raise UsageError(f"--predict must be at least 1 sample, for example 10; got {ahead}")
-    if ahead is not None and noise == "white":
-        raise UsageError("--predict needs a noise model: white noise cannot be predicted; add --noise auto")
-
-
-def _records(
-    files: Sequence[Path], validate: Path | None, loop: LoopOptions, columns: RecordOptions, treatment: FitOptions
-) -> Records:
-    """Read the records, in their loop; a DataError where their units differ."""
-    from ctid_cli.reporting.records import Records
-
-    hold = "zoh" if treatment.hold == "auto" else treatment.hold
-    measured = [loop.applied(columns.read(file, hold, reference=loop.reference)) for file in files]
-    other = None
-    if validate is not None:
-        other = loop.applied(columns.read_whole(validate, hold, reference=loop.reference))
-    records = Records(measured, other)
-    # Units that differ are refused before anything is computed.
-    records.units  # noqa: B018
-    return records
-
-
-def _identified(
-    options: MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None
-) -> Identification:
-    """Fit, with a bar of progress where it takes long."""
-    from ctid_cli.identification.identify import identify
-
-    validation = None if records.validation is None else records.validation.record
+    hold = "zoh" if asked.treatment.hold == "auto" else asked.treatment.hold
+    records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
+    judging.check_records({record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
-        noise: Any = ("auto",) if bootstrap is None else ("bootstrap", bootstrap, progress)
-        return identify(records.data, options, validation, *noise)
+        draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
+        found = identify(records.data, options, records.validation_record, **draws)
+    return FitResult(found, records.of_fit(found), judging.predict)

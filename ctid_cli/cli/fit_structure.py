@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ctid_cli.cli._common import span
+from ctid_cli.cli._options import flag
 from ctid_cli.errors import UsageError
 from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset, Weight
 
@@ -34,58 +34,52 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
-HoldOption = Annotated[AskedHold, typer.Option("--hold", help="Input between its samples; else chosen.")]
+HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; else chosen.")]
+
+
+# --- options ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class StructureOptions:
     """Range of the delay, and poles at the origin."""
 
-    delay: Annotated[
-        str | None,
-        typer.Option(
-            "--delay",
-            metavar="LOW:HIGH|VALUE",
-            help="Range or value [time unit]; else chosen.",
-        ),
-    ] = None
+    delay: Annotated[str | None, flag("--delay", "Range or value [time unit]; else chosen.", "LOW:HIGH|VALUE")] = None
     integrators: Annotated[
-        int | None,
-        typer.Option(
-            "--integrators", help="Additional poles at the origin (of a sum: in its first submodel); else chosen."
-        ),
+        int | None, flag("--integrators", "Additional poles at the origin (of a sum: in its first submodel).")
     ] = None
 
     @property
     def bounds(self) -> tuple[float, float] | None:
         """Range of the delay, a known one twice; None where it is not given."""
-        return None if self.delay is None else delay_bounds(self.delay)
+        if self.delay is None:
+            return None
+        bounds = span(self.delay, float)
+        if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
+            return bounds
+        allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
+        raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {self.delay!r}")
 
 
 @dataclass(frozen=True)
 class TreatmentOptions:
     """Treatment of the initial state and of offsets."""
 
-    initial_state: Annotated[
-        InitialState | None, typer.Option("--initial-state", help="State before the record; else chosen.")
-    ] = None
+    initial_state: Annotated[InitialState | None, flag("--initial-state", "State before the record; else chosen.")] = (
+        None
+    )
     input_before: Annotated[
-        str | None,
-        typer.Option(
-            "--input-before", metavar="VALUE|first", help="Input before the first sample, at rest; else chosen."
-        ),
+        str | None, flag("--input-before", "Input before the first sample, at rest; else chosen.", "VALUE|first")
     ] = None
-    offset: Annotated[
-        Offset | None, typer.Option("--offset", help="Offset of the output, or its drift; else chosen.")
-    ] = None
+    offset: Annotated[Offset | None, flag("--offset", "Offset of the output, or its drift; else chosen.")] = None
 
     @property
     def level(self) -> InputBefore:
         """The input before the first sample; None where it is not given."""
-        if self.input_before in (None, "first"):
+        if self.input_before is None or self.input_before == "first":
             return "first" if self.input_before else None
         try:
-            return float(self.input_before or "")
+            return float(self.input_before)
         except ValueError:
             raise UsageError(f"--input-before must be a number or first; got {self.input_before!r}") from None
 
@@ -94,19 +88,43 @@ class TreatmentOptions:
 class ModelOptions(StructureOptions):
     """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
-    poles: Annotated[
-        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else chosen.")
-    ] = None
-    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles; else chosen.")] = None
-    model: Annotated[ModelForm, typer.Option("--model", help="One transfer function, or a sum of submodels.")] = (
-        "fraction"
-    )
-    terms: Annotated[
-        str | None, typer.Option("--terms", metavar="P/Z,P/Z,...", help="Poles/zeros of each submodel.")
-    ] = None
-    fix: Annotated[
-        list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
-    ] = None
+    poles: Annotated[int | None, flag("--poles", "Poles, 1 to 12 (0 with --integrators); else chosen.")] = None
+    zeros: Annotated[int | None, flag("--zeros", "Zeros, fewer than poles; else chosen.")] = None
+    model: Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")] = "fraction"
+    terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel.", "P/Z,P/Z,...")] = None
+    fix: Annotated[list[str] | None, flag("--fix", "Hold a parameter; repeatable.", "NAME=VALUE")] = None
+
+    @property
+    def fixed(self) -> tuple[Fixed, ...] | None:
+        """Known parameters."""
+        from ctid_cli.estimation.common import Fixed
+
+        found = []
+        for text in self.fix or ():
+            name, equals, value = (part.strip() for part in text.partition("="))
+            if name == "delay":
+                raise UsageError("--fix delay=VALUE is --delay VALUE; use that")
+            try:
+                found.append(Fixed(name, float(value if equals and name else "")))
+            except ValueError:
+                example = "for example a1=2"
+                raise UsageError(f"--fix must be NAME=VALUE with a finite number, {example}; got {text!r}") from None
+        return tuple(found) or None
+
+    @property
+    def submodels(self) -> tuple[Term, ...]:
+        """The terms of a sum, such as ``2/0,2/1``, or the one fraction; integrators belong to the first."""
+        from ctid_cli.models.additive import Term
+
+        parts = f"{self.poles}/{self.zeros or 0}" if self.terms is None else self.terms
+        found: list[Term] = []
+        for part in parts.split(","):
+            degrees = re.fullmatch(r"\s*(\d{1,2})(?:/(\d{1,2}))?\s*", part)
+            if degrees is None:
+                allowed = "poles/zeros of each submodel with commas between them, for example 2/0,2/1"
+                raise UsageError(f"--terms must be {allowed}; got {parts!r}")
+            found.append(Term(int(degrees[1]), int(degrees[2] or 0), 0 if found else self.integrators or 0))
+        return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -114,17 +132,12 @@ class LoopOptions:
     """The loop that a record was taken in."""
 
     loop: Annotated[
-        str | None,
-        typer.Option(
-            "--loop", metavar="FILE|unknown", help="YAML with the section loop of the record, if it is known."
-        ),
+        str | None, flag("--loop", "YAML with the section loop of the record, if it is known.", "FILE|unknown")
     ] = None
-    reference: Annotated[
-        str | None, typer.Option("--reference", metavar="NAME", help="Column of the loop's reference.")
-    ] = None
-    direct: Annotated[
-        bool, typer.Option("--direct", help="Fit to the input as if there were no loop: noise through it biases.")
-    ] = False
+    reference: Annotated[str | None, flag("--reference", "Column of the loop's reference.", "NAME")] = None
+    direct: Annotated[bool, flag("--direct", "Fit to the input as if there were no loop: noise through it biases.")] = (
+        False
+    )
 
     @property
     def use(self) -> LoopUse:
@@ -133,15 +146,22 @@ class LoopOptions:
             return "none"
         return "reference" if self.loop in (None, UNKNOWN) else "controller"
 
+    @cached_property
+    def known(self) -> Any:
+        """The loop of the file; None where there is none."""
+        from ctid_cli.specification.load import load_loop
+
+        return None if self.loop in (None, UNKNOWN) else load_loop(Path(self.loop or ""))
+
     def check(self) -> None:
-        """Refuse half of what a loop needs."""
-        if self.loop not in (None, UNKNOWN) and self.reference is None and not self.direct:
-            raise UsageError(
-                "--loop FILE needs the reference too; add --reference COLUMN, or --direct to fit without it"
-            )
+        """Refuse half of what a loop needs, and a file that is none."""
         if self.direct and self.loop is None:
             raise UsageError(
                 "--direct says how a record in a loop is fitted; add --loop FILE or --loop unknown, or drop it"
+            )
+        if self.known is not None and self.reference is None and not self.direct:
+            raise UsageError(
+                "--loop FILE needs the reference too; add --reference COLUMN, or --direct to fit without it"
             )
 
     def applied(self, measured: Measurement) -> Measurement:
@@ -149,11 +169,9 @@ class LoopOptions:
         if self.loop is None and self.reference is None:
             return measured
         from ctid_cli.simulation.record_loop import in_loop, in_unknown_loop
-        from ctid_cli.specification.load import load_loop
 
-        options = None if self.loop in (None, UNKNOWN) else load_loop(Path(self.loop or ""))
-        if self.use == "controller" and options is not None:
-            return in_loop(measured, options)
+        if self.use == "controller":
+            return in_loop(measured, self.known)
         if self.use == "reference":
             return in_unknown_loop(measured)
         return replace(measured, record=replace(measured.record, feedback=True), notes=(*measured.notes, DIRECT))
@@ -163,14 +181,15 @@ class LoopOptions:
 class FitOptions(TreatmentOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
-    loss: Annotated[LossKind, typer.Option("--loss", help="Loss function of the output errors.")] = "squares"
-    noise: Annotated[
-        str, typer.Option("--noise", metavar="white|arma:P,Q|auto", help="Noise that is estimated with the model.")
-    ] = "white"
+    loss: Annotated[LossKind, flag("--loss", "Loss function of the output errors.")] = "squares"
+    noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
     hold: HoldOption = "auto"
-    weight: Annotated[
-        Weight | None, typer.Option("--weight", help="Weights of a frequency response without standard errors.")
-    ] = None
+    weight: Annotated[Weight | None, flag("--weight", "Weights of a frequency response without standard errors.")] = (
+        None
+    )
+
+
+# --- the estimator ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -197,16 +216,6 @@ class Asked:
         """Whether the estimator takes one record."""
         return self.iterated or self.simulated
 
-    @property
-    def delay(self) -> tuple[float, float]:
-        """The range of the delay of submodels."""
-        return self.model.bounds or (0.0, 0.0)
-
-    @property
-    def integrators(self) -> int:
-        """Poles at the origin."""
-        return self.model.integrators or 0
-
 
 @contextlib.contextmanager
 def as_usage_errors() -> Iterator[None]:
@@ -219,14 +228,45 @@ def as_usage_errors() -> Iterator[None]:
 
 def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
     """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
+    from ctid_cli.estimators.loop_output_error import LoopOutputError
+    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+
+    model, treatment = asked.model, asked.treatment
+    if treatment.weight is not None:
+        raise UsageError("--weight is for a frequency response; the samples of a record weigh the same, drop --weight")
     _refuse_other_form(asked)
-    if asked.simulated:
-        return _in_loop(asked)
-    if not asked.iterated:
-        return _given(asked)
-    _refuse_unable(asked)
+    for wrong, option, remedy in _unavailable(asked) if asked.single else ():
+        if wrong:
+            raise UsageError(f"{option} is not available for {_what(asked)}; {remedy}")
+    needing = [("--loop", asked.simulated), ("--reference", asked.iterated), ("--fix", bool(model.fix))]
+    for option in [name for name, given in needing if given][:1] if model.terms is None and model.poles is None else ():
+        raise UsageError(f"--poles is missing: with {option} it must be given")
+    state: Any = treatment.initial_state or "rest"
+    offset: Any = treatment.offset or "none"
+    bounds = model.bounds or (0.0, 0.0)
     with as_usage_errors():
-        return _submodels(asked)
+        if asked.simulated:
+            degrees = model.poles or 0, model.zeros or 0
+            return LoopOutputError(*degrees, bounds, state, offset, model.integrators or 0)
+        if asked.iterated:
+            instruments: dict[LoopUse, Instruments] = {
+                "none": "open_loop",
+                "reference": "reference",
+                "controller": "closed_loop",
+            }
+            return MeasuredSubmodels(
+                model.submodels,
+                bounds[0],
+                instruments[asked.loop],
+                state,
+                offset,
+                factored=model.model == "additive" or bool(model.integrators),
+                fixed=model.fixed,
+            )
+    # The names of known parameters are those of a number of zeros.
+    zeros = 0 if model.fix and model.zeros is None else model.zeros
+    given = replace(given_of(model, treatment, treatment.hold), poles=model.poles, zeros=zeros, fixed=model.fixed)
+    return replace(given, loss=treatment.loss, noise_model=treatment.noise)
 
 
 def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold) -> Given:
@@ -245,162 +285,61 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
     )
 
 
-def _given(asked: Asked) -> Given:
-    model, treatment = asked.model, asked.treatment
-    fixed = fixed_of(model.fix)
-    if fixed and model.poles is None:
-        raise UsageError("--poles is missing: with --fix it must be given")
-    # The names of known parameters are those of a number of zeros.
-    zeros = 0 if fixed and model.zeros is None else model.zeros
-    given = given_of(model, treatment, treatment.hold)
-    return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed, noise_model=treatment.noise)
-
-
-def _in_loop(asked: Asked) -> LoopOutputError:
-    from ctid_cli.estimators.loop_output_error import LoopOutputError
-
-    _refuse_of_loop(asked)
-    if asked.model.poles is None:
-        raise UsageError("--poles is missing: with --loop it must be given")
-    if asked.model.fix:
-        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
-    state, offset = asked.treatment.initial_state or "rest", asked.treatment.offset or "none"
-    if state == "periodic":
-        raise UsageError("--initial-state periodic is not available for a record in a loop; use rest or estimate")
-    if offset == "drift":
-        raise UsageError("--offset drift is not available for a record in a loop; use estimate, remove or none")
-    with as_usage_errors():
-        degrees = asked.model.poles, asked.model.zeros or 0
-        return LoopOutputError(*degrees, asked.delay, state, offset, asked.integrators)
-
-
-def _submodels(asked: Asked) -> MeasuredSubmodels:
-    from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
-    from ctid_cli.models.additive import Term
-
-    if asked.model.terms is None:
-        if asked.model.poles is None:
-            raise UsageError("--poles is missing: with --reference it must be given")
-        terms: tuple[Term, ...] = (Term(asked.model.poles, asked.model.zeros or 0, asked.integrators),)
-    else:
-        first, *others = _terms(asked.model.terms, asked.integrators)
-        terms = (first, *others)
-    instruments: Instruments = "closed_loop" if asked.loop == "controller" else "open_loop"
-    instruments = "reference" if asked.loop == "reference" else instruments
-    return MeasuredSubmodels(
-        terms,
-        asked.delay[0],
-        instruments,
-        asked.treatment.initial_state or "rest",
-        asked.treatment.offset or "none",
-        factored=asked.model.model == "additive" or asked.integrators > 0,
-        fixed=fixed_of(asked.model.fix),
-    )
-
-
-def _refuse_other_form(asked: Asked) -> None:
-    """Options of one form of the model beside those of the other."""
-    if asked.model.model == "additive":
-        if asked.model.terms is None:
-            raise UsageError(
-                "--model additive needs --terms, poles/zeros of each submodel, for example --terms 2/0,2/1"
-            )
-        for name, value in (("--poles", asked.model.poles), ("--zeros", asked.model.zeros)):
-            if value is not None:
-                raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
-    elif asked.model.terms is not None:
-        raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
-    instead = "--initial-state" if asked.single else "--offset"
-    check_integrators(asked.integrators, asked.treatment.offset or "none", instead)
-
-
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
     """Refuse numbers of integrators, and what they make of a mean; a constant is estimated by another option."""
     from ctid_cli.estimation.common import MOST_INTEGRATORS
 
     if not 0 <= integrators <= MOST_INTEGRATORS:
         raise UsageError(f"--integrators must be 0 to {MOST_INTEGRATORS}; got {integrators}")
-    if integrators and offset == "remove":
-        raise UsageError(
-            "--offset remove subtracts the mean of the output, which is no offset of a system that integrates; use "
-            f"{instead} estimate"
-        )
-    if integrators and offset == "drift":
-        raise UsageError(
-            "--offset drift is a slope of the output, which a system that integrates has by itself; use "
-            f"{instead} estimate"
-        )
+    why = {
+        "remove": "subtracts the mean of the output, which is no offset of a system that integrates",
+        "drift": "is a slope of the output, which a system that integrates has by itself",
+    }
+    if integrators and offset in why:
+        raise UsageError(f"--offset {offset} {why[offset]}; use {instead} estimate")
 
 
-def _refuse_unable(asked: Asked) -> None:
-    """What refined instrumental variables at a known delay cannot do."""
-    in_loop = asked.loop != "none"
-    what = "a record in a loop" if in_loop else "a sum of submodels"
-    what = "the reference as an instrument" if asked.loop == "reference" else what
-    low, high = asked.delay
-    if low < high:
-        instead = "; with the controller (--loop FILE) it can be searched" * (asked.loop == "reference")
-        raise UsageError(
-            f"--delay {low:g}:{high:g} cannot be searched for {what}: a known delay is needed; give one value, "
-            f"--delay VALUE{instead}"
-        )
-    _refuse_of_loop(asked, what)
-    if asked.treatment.offset in ("estimate", "drift"):
-        raise UsageError(f"--offset {asked.treatment.offset} is not available for {what}; use --offset remove")
-    if in_loop and asked.treatment.hold not in ("auto", "zoh"):
-        raise UsageError(
-            f"--hold {asked.treatment.hold} does not go with --reference: a discrete controller holds its input (zoh)"
-        )
-    if in_loop and asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
-        raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
+def _refuse_other_form(asked: Asked) -> None:
+    """Options of one form of the model beside those of the other."""
+    model = asked.model
+    if model.model == "additive":
+        if model.terms is None:
+            what = "poles/zeros of each submodel, for example --terms 2/0,2/1"
+            raise UsageError(f"--model additive needs --terms, {what}")
+        for name, value in (("--poles", model.poles), ("--zeros", model.zeros)):
+            if value is not None:
+                raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
+    elif model.terms is not None:
+        raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
+    instead = "--initial-state" if asked.single else "--offset"
+    check_integrators(model.integrators or 0, asked.treatment.offset or "none", instead)
 
 
-def _refuse_of_loop(asked: Asked, what: str = "a record in a loop") -> None:
-    """What neither submodels nor simulated loops can do."""
-    if asked.treatment.input_before is not None:
-        raise UsageError(f"--input-before is not available for {what}; use --initial-state estimate")
-    if asked.treatment.loss != "squares":
-        why = "it is fitted by squares"
-        raise UsageError(f"--loss {asked.treatment.loss} is not available for {what}: {why}; drop --loss")
-    if asked.treatment.noise != "white":
-        direct = ", or fit to the input with --direct" * (asked.loop != "none")
-        raise UsageError(f"--noise {asked.treatment.noise} is not available for {what}; drop --noise{direct}")
+def _what(asked: Asked) -> str:
+    """Return what an estimator of one record is for."""
+    if asked.loop == "reference":
+        return "the reference as an instrument"
+    return "a sum of submodels" if asked.loop == "none" else "a record in a loop"
 
 
-def _terms(text: str, integrators: int) -> list[Term]:
-    """Terms such as ``2/0,2/1``; integrators belong to the first."""
-    from ctid_cli.models.additive import Term
-
-    found = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d{1,2})(?:/(\d{1,2}))?\s*", part)
-        if match is None:
-            allowed = "poles/zeros of each submodel with commas between them, for example 2/0,2/1"
-            raise UsageError(f"--terms must be {allowed}; got {text!r}")
-        found.append((int(match[1]), int(match[2] or 0)))
-    return [Term(*degrees, integrators * (k == 0)) for k, degrees in enumerate(found)]
-
-
-def fixed_of(given: Sequence[str] | None) -> tuple[Fixed, ...] | None:
-    """Known parameters, as they are given."""
-    from ctid_cli.estimation.common import Fixed
-
-    found = []
-    for text in given or ():
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if name == "delay":
-            raise UsageError("--fix delay=VALUE is --delay VALUE; use that")
-        try:
-            found.append(Fixed(name, float(value if equals and name else "")))
-        except ValueError:
-            raise UsageError(f"--fix must be NAME=VALUE with a finite number, for example a1=2; got {text!r}") from None
-    return tuple(found) or None
-
-
-def delay_bounds(text: str) -> tuple[float, float]:
-    """The range of the delay, or a known one twice."""
-    bounds = span(text, float)
-    if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
-        return bounds
-    allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
-    raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
+def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
+    """Yield what submodels and simulated loops cannot do: whether it is asked for, the option, and a remedy."""
+    model, treatment, loop = asked.model, asked.treatment, asked.loop != "none"
+    state, offset, hold = treatment.initial_state, treatment.offset, treatment.hold
+    low, high = model.bounds or (0.0, 0.0)
+    yield treatment.input_before is not None, "--input-before", "use --initial-state estimate"
+    yield treatment.loss != "squares", f"--loss {treatment.loss}", "drop --loss"
+    direct = ", or fit to the input with --direct" * loop
+    yield treatment.noise != "white", f"--noise {treatment.noise}", f"drop --noise{direct}"
+    one_fraction = loop and model.model == "fraction" and not (asked.iterated and model.integrators)
+    names = "its names are those of submodels: add --model additive --terms POLES/ZEROS"
+    yield bool(model.fix) and one_fraction, "--fix", names
+    if asked.simulated:
+        yield state == "periodic", "--initial-state periodic", "use rest or estimate"
+        yield offset == "drift", "--offset drift", "use estimate, remove or none"
+        return
+    controller = "; with the controller (--loop FILE) it can be searched" * (asked.loop == "reference")
+    one_value = f"the delay must be known: give one value, --delay VALUE{controller}"
+    yield low < high, f"a search of the delay (--delay {model.delay})", one_value
+    yield offset in ("estimate", "drift"), f"--offset {offset}", "use --offset remove"
+    yield loop and hold not in ("auto", "zoh"), f"--hold {hold}", "a discrete controller holds its input: use zoh"

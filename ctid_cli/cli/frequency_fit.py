@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.cli._options import RecordOptions
-from ctid_cli.cli.fit_structure import Asked, LoopOptions, as_usage_errors, check_integrators, fixed_of
+from ctid_cli.cli.fit_structure import Asked, LoopOptions, as_usage_errors, check_integrators
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def frequency_fit(
         )
     if model.poles is None:
         raise UsageError("--poles is missing: for a frequency response it must be given")
-    check_integrators(asked.integrators, "none")
+    check_integrators(model.integrators or 0, "none")
     data, weight = read_frequency_data(files[0], columns.start, columns.stop), asked.treatment.weight
     if weight is not None and data.standard_error is not None:
         raise UsageError(
@@ -59,8 +59,8 @@ def frequency_fit(
         )
     data = replace(data, weight=weight or "none")
     with as_usage_errors():
-        given: Any = {"integrators": asked.integrators, "fixed": fixed_of(model.fix)}
-        options = FrequencyDomain(model.poles, model.zeros or 0, asked.delay, **given)
+        given: Any = {"integrators": model.integrators or 0, "fixed": model.fixed}
+        options = FrequencyDomain(model.poles, model.zeros or 0, model.bounds or (0.0, 0.0), **given)
         return FrequencyFitResult.of(identify_frequency_response(data, options))
 
 

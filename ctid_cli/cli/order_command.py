@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
-from ctid_cli.cli._options import FormatOptions, RecordOptions
+from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import HoldOption, StructureOptions, TreatmentOptions, as_usage_errors, given_of
 from ctid_cli.errors import UsageError
@@ -19,23 +17,18 @@ from ctid_cli.errors import UsageError
 
 @guarded
 def order(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Records (.csv, .mat, .h5), an experiment each.")
-    ],
+    files: Records,
     structure: StructureOptions,
     treatment: TreatmentOptions,
     columns: RecordOptions,
     form: FormatOptions,
-    poles: Annotated[
-        str | None,
-        typer.Option("--poles", metavar="LOW:HIGH", help="Numbers of poles, 1 to 12; else as many as needed."),
-    ] = None,
-    zeros: Annotated[str | None, typer.Option("--zeros", metavar="LOW:HIGH", help="Numbers of zeros.")] = None,
+    poles: Annotated[str | None, flag("--poles", "Numbers of poles, 1 to 12; else as many as needed.", "LOW:HIGH")] = (
+        None
+    ),
+    zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None,
     hold: HoldOption = "auto",
-    validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Validate on this record too.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for order.json and order.svg.")] = Path("."),
+    validate: Validate = None,
+    out: Annotated[Path, flag("--out", "Folder for order.json and order.svg.", "DIR")] = Path("."),
 ) -> None:
     """Show the structures that ctid fit chooses from.
 
@@ -44,16 +37,12 @@ def order(
     """
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult
-    from ctid_cli.reporting.records import Records
 
     ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
     given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
-    measurements = [columns.read(file, "zoh") for file in files]
-    records = Records(measurements, None if validate is None else columns.read_whole(validate, "zoh"))
-    # Units that differ are refused before anything is computed.
-    records.units  # noqa: B018
+    records = columns.read_all(files, validate, "zoh")
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
-        choice = choose(records.data, given)
+        choice = choose(records.data, given, records.units.time)
         result = OrderSearchResult.of(choice, given, records)
     written = [out / "order.json", out / "order.svg"]
     content = json.dumps(plain({**result.json_content(), "written": list(map(str, written))}), allow_nan=False)

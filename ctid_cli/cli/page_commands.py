@@ -138,13 +138,9 @@ def report(
 
 def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str:
     """Return the page of a fit or a track, of which the file says which it is."""
-    from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
     from ctid_cli.reporting.fit_result import FitResult
-    from ctid_cli.reporting.frequency_fit import FrequencyFitResult
-    from ctid_cli.reporting.pages.fit_page import fit_page
-    from ctid_cli.reporting.pages.frequency_fit_page import frequency_fit_page
-    from ctid_cli.reporting.pages.track_page import track_page
     from ctid_cli.reporting.records import Records
+    from ctid_cli.reporting.track_result import TrackResult
     from ctid_cli.storage.fit_file import FIT, read_fit
     from ctid_cli.storage.track_file import TRACK, read_track
 
@@ -153,12 +149,12 @@ def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
     if FIT.kind_in(str(path)) != TRACK.kind:
         fit = read_fit(path, records or None, validate)
-        if isinstance(fit.result.fit, FrequencyDomainFit):
-            return frequency_fit_page(FrequencyFitResult.of(fit.result), fit.content)
-        return fit_page(FitResult(fit.result, Records(fit.measurements, fit.validation)), fit.content)
+        if not fit.sources:
+            return str(fit.result._result().page(fit.content))
+        return FitResult(fit.result, Records(fit.measurements, fit.validation)).page(fit.content)
     if validate:
         raise UsageError(f"{path} is a track, which has no validation record; leave --validate out")
     if len(records) > 1:
         raise UsageError(f"{path} is of one record; --record names {len(records)}")
     track = read_track(path, records[0] if records else None)
-    return track_page(track.track, track.source.read(), track.content)
+    return TrackResult(track.track, track.source.read(), track.content["accuracy_hz"]).page(track.content)

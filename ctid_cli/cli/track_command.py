@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwriting, write_files
-from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To
+from ctid_cli.cli._options import FormatOptions, From, TimeColumn, To, flag
 from ctid_cli.cli._progress import RecordProgress
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ctid_cli.signals.sampled_signal import SampledSignal
     from ctid_cli.storage.track_file import Reading
     from ctid_cli.tones.track import Track
@@ -25,9 +27,9 @@ class SignalOptions:
     """Which column and which part of a recorded signal is used, and its clock."""
 
     time: TimeColumn = None
-    signal: Annotated[str | None, typer.Option("--signal", metavar="NAME", help="Column or channel to use.")] = None
-    interval: Annotated[float | None, typer.Option("--interval", metavar="SECONDS", help="Sampling interval.")] = None
-    rate: Annotated[float | None, typer.Option("--rate", metavar="HERTZ", help="In place of the interval.")] = None
+    signal: Annotated[str | None, flag("--signal", "Column or channel to use.", "NAME")] = None
+    interval: Annotated[float | None, flag("--interval", "Sampling interval.", "SECONDS")] = None
+    rate: Annotated[float | None, flag("--rate", "In place of the interval.", "HERTZ")] = None
     start: From = None
     stop: To = None
 
@@ -37,9 +39,7 @@ class SignalOptions:
 
         if self.interval is not None and self.rate is not None:
             raise UsageError("--interval and --rate say the same; give one of them")
-        for name, value in (("--interval", self.interval), ("--rate", self.rate)):
-            if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
-                raise UsageError(f"{name} must be a positive number, not {value:g}")
+        _require_positive("number", {"--interval": self.interval, "--rate": self.rate})
         for name, value in (("--from", self.start), ("--to", self.stop)):
             if value is not None and not math.isfinite(value):
                 raise UsageError(f"{name} must be an instant, not {value:g}")
@@ -51,29 +51,20 @@ class SignalOptions:
 class ToneOptions:
     """How tones are followed; None where it is chosen from the record."""
 
-    tones: Annotated[str, typer.Option("--tones", metavar="N", help="Number of sinusoids, or auto.")] = "auto"
-    every: Annotated[
-        float | None, typer.Option("--every", metavar="SECONDS", help="Time between rows; about 1000 rows by default.")
-    ] = None
-    window: Annotated[float | None, typer.Option("--window", metavar="SECONDS", help="Length of the windows.")] = None
+    tones: Annotated[str, flag("--tones", "Number of sinusoids, or auto.", "N")] = "auto"
+    every: Annotated[float | None, flag("--every", "Time between rows; about 1000 rows by default.", "SECONDS")] = None
+    window: Annotated[float | None, flag("--window", "Length of the windows.", "SECONDS")] = None
     accuracy: Annotated[
         float | None,
-        typer.Option(
-            "--accuracy",
-            metavar="HZ",
-            help="Rows with a larger standard error are not valid; .001 of the tone's frequency if not given.",
-        ),
+        flag("--accuracy", "Largest standard error of a valid row; .001 of the tone's frequency if not given.", "HZ"),
     ] = None
 
     def require_sensible(self) -> None:
         """Refuse what no tones can be followed with."""
         from ctid_cli.tones.constants import MOST_ASKED
 
-        for name, value in (("--every", self.every), ("--window", self.window)):
-            if value is not None and not 0 < value < math.inf:
-                raise UsageError(f"{name} must be a positive number of seconds, not {value:g}")
-        if self.accuracy is not None and not 0 < self.accuracy < math.inf:
-            raise UsageError(f"--accuracy must be a positive number of hertz, not {self.accuracy:g}")
+        _require_positive("number of seconds", {"--every": self.every, "--window": self.window})
+        _require_positive("number of hertz", {"--accuracy": self.accuracy})
         if self.tones != "auto" and not (self.tones.isdecimal() and int(self.tones) <= MOST_ASKED):
             raise UsageError(f"--tones must be a number from 0 to {MOST_ASKED}, or auto, not {self.tones!r}")
 
@@ -96,8 +87,8 @@ def track(
     part: SignalOptions,
     options: ToneOptions,
     form: FormatOptions,
-    hdf5: Annotated[bool, typer.Option("--hdf5", help="Write track.h5 in place of track.csv.")] = False,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the track and its figure.")] = Path("."),
+    hdf5: Annotated[bool, flag("--hdf5", "Write track.h5 in place of track.csv.")] = False,
+    out: Annotated[Path, flag("--out", "Folder for the track and its figure.", "DIR")] = Path("."),
 ) -> None:
     """Follow the frequencies of a recorded sum of sinusoids.
 
@@ -131,6 +122,13 @@ def track(
     table = (hdf5_bytes if hdf5 else frame_bytes)(result.to_frame())
     write_files(dict(zip(written, (table, drawn.result(), text.encode() + b"\n"), strict=True)))
     emit(result, form.form, written)
+
+
+def _require_positive(what: str, options: Mapping[str, float | None]) -> None:
+    """Refuse options that are not positive, or so small that their reciprocal is infinite."""
+    for name, value in options.items():
+        if value is not None and not (0 < value < math.inf and 1.0 / value < math.inf):
+            raise UsageError(f"{name} must be a positive {what}, not {value:g}")
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:

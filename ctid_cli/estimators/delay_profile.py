@@ -168,6 +168,11 @@ class MeasuredFit(DeferredFields, Fit):
         cost = sum(float(e @ e) for e in innovations) / self.count
         return replace(self, sensitivities=psi, residuals=innovations, cost=cost, noise=None)
 
+    @property
+    def left_over(self) -> str:
+        """What the tests of residuals are of."""
+        return "residuals" if self.noise is None else "innovations"
+
     def prediction_fit(self, ahead: int) -> float:
         """Fit of predictions of the outputs; without a noise model that of the simulated ones.
 

@@ -24,6 +24,7 @@ from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
+from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
@@ -54,6 +55,12 @@ class Validation(DeferredFields):
     count: int
     #: Treatment of state and offset, where it was chosen for this record.
     options: DelayProfile | None = None
+
+    def prediction_fit(self, noise: NoiseEstimate, ahead: int) -> float:
+        """Return ``100 (1 - ||y - p|| / ||y - mean y||)`` of predictions p from outputs that are some samples old."""
+        y = self.record.y[self.applied.used[0]]
+        (errors,) = noise.prediction_errors(self.applied.residuals, self.applied.used, ahead)
+        return fit_percent(y, y - errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +122,11 @@ class Identification(DeferredFields, FittedModel, Shown):
         """Covariance that the standard errors are from, and how many of them intervals reach."""
         assert self.fit.law is not None
         return self.fit.law
+
+    @property
+    def driver(self) -> str:
+        """What residuals are tested against: the input, or the reference of a loop."""
+        return self.tests[0].driver if self.tests else "input"
 
     def predict(self, record: Record, ahead: int = 1) -> Array:
         """Predict the output of a record from its input and from outputs that are some samples old.
@@ -253,8 +265,11 @@ def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> t
     found = []
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
-            delayed = options._acting(record).input.at(record.t[use] - fit.model.delay)
-            found.append(residual_tests(eps, delayed, level=level, sensitivities=psi))
+            acting = options._acting(record)
+            tests = residual_tests(
+                eps, acting.input.at(record.t[use] - fit.model.delay), level=level, sensitivities=psi
+            )
+            found.append(tests if acting is record else replace(tests, driver="reference"))
     return tuple(found)
 
 
@@ -337,6 +352,10 @@ class DelayCosts(NamedTuple):
     least: float
     #: The data do not reject delays of a cost below this.
     allowed: float
+
+    def percent_above(self, costs: Any) -> Any:
+        """Return by how much costs are above the least [%]."""
+        return 100.0 * (costs / self.least - 1.0)
 
 
 def costs_about_delay(result: Identification) -> DelayCosts | None:

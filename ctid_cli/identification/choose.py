@@ -46,7 +46,7 @@ MUCH_NARROWER = 0.5
 TIE = 1e-3
 
 
-def choose(records: Record | Sequence[Record], given: Given | None = None) -> Choice:
+def choose(records: Record | Sequence[Record], given: Given | None = None, time_unit: str = "s") -> Choice:
     """Choose what is not given of the structure of a model and of the treatment of its records.
 
     Parameters
@@ -55,6 +55,8 @@ def choose(records: Record | Sequence[Record], given: Given | None = None) -> Ch
         One for each experiment.
     given : Given, optional
         What is given; by default nothing.
+    time_unit : str, default "s"
+        Unit of the records' times, for the sentences.
 
     Returns
     -------
@@ -74,14 +76,14 @@ def choose(records: Record | Sequence[Record], given: Given | None = None) -> Ch
     if given.delay_bounds is not None:
         for record in several:
             check_greatest_delay(record, given.delay_bounds[1])
-    return _Choosing(several, given).choice()
+    return _Choosing(several, given, time_unit).choice()
 
 
 class _Choosing:
     """The steps of a choice."""
 
-    def __init__(self, records: list[Record], given: Given) -> None:
-        self.records, self.given = records, given
+    def __init__(self, records: list[Record], given: Given, time_unit: str) -> None:
+        self.records, self.given, self.time_unit = records, given, time_unit
         drifts = len(given.span.integrators) > 1 and given.offset != "none" and changes_at_the_beginning_only(records)
         self.span = given.span._replace(integrators=(0,)) if drifts else given.span
         self.about_span = [sentences.NO_INTEGRATOR] if drifts else []
@@ -114,7 +116,7 @@ class _Choosing:
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
         measured = best.options.prepare(fitted).laid_out
         answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
-        said = [*self.said, *self.about_span, *sentences.of_grid(ranking, delays, self.given)]
+        said = [*self.said, *self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
         said += [sentences.of_criterion(ranking)] * bool(said)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
         return Choice(options, held, fitted, ranking, answer, tuple(said))

@@ -43,12 +43,12 @@ class FitWarning:
         return f"{self.observed}." if self.remedy is None else f"{self.observed}: {self.remedy}."
 
 
-def with_warnings(found: Identification) -> Identification:
+def with_warnings(found: Identification, time_unit: str = "s") -> Identification:
     """Return a fit with its warnings, after changes of it have been tried on its records."""
-    return replace(found, warnings=tuple(map(str, fit_warnings(found))))
+    return replace(found, warnings=tuple(map(str, fit_warnings(found, time_unit))))
 
 
-def fit_warnings(found: Identification) -> list[FitWarning]:
+def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning]:
     """Try changes of a fit, and return its warnings, the costliest first."""
     fit, records = found.fit, found.records
     growing = [
@@ -56,7 +56,7 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
     ]
     if any(np.isfinite(growing)):
         fastest = float(np.nanmin(growing))
-        what = f"The output diverges: it grows by a factor of e every {fastest:.2g}, and the input does not"
+        what = f"The output diverges: it grows by a factor of e every {fastest:.2g} {time_unit}, and the input does not"
         return [FitWarning(f"{what}; an unstable plant is not among the models")]
     if fit.status in UNFINISHED:
         loop = ". In a loop the plant may be unstable: that needs the controller (--loop FILE)"
@@ -69,15 +69,20 @@ def fit_warnings(found: Identification) -> list[FitWarning]:
     tried = Trials([], [])
     if fit.noise is None:
         tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
-    named = [FitWarning(_observed(remedy, found), remedy) for remedy in tried.remedies]
+    named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
     mended = {remedy.kind for remedy in tried.remedies}
     if not seen:
         no_model = f"No model: the output is not seen to respond to the input (p = {found.answer.p_value:.2g})"
         return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
-    others = list(_of_residuals(found, mended))
+    others = list(_of_residuals(found, mended, time_unit))
     if not named:
         # Of an estimate that will change, neither its search nor its errors need to be known.
-        others += [*_of_noise(fit), *_of_fit(fit, tried), *of_search(fit), *_of_uncertainty(found)]
+        others += [
+            *_of_noise(fit),
+            *_of_fit(fit, tried),
+            *of_search(fit, time_unit),
+            *_of_uncertainty(found, time_unit),
+        ]
     failed = list(_of_validation(found))
     return [*failed, *named, *(FitWarning(each) for each in dict.fromkeys(others))][:MOST]
 
@@ -89,21 +94,21 @@ def _used(found: Identification) -> Iterator[tuple[Record, BoolArray]]:
 # --- what a remedy is for ----------------------------------------------------------------------------
 
 
-def _observed(remedy: Remedy, found: Identification) -> str:
+def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
     """Return what a kind of remedy mends, as it was seen."""
     fit, options = found.fit, found.options
     if remedy.kind == "loss":
-        return _outliers(found)
+        return _outliers(found, time_unit)
     if remedy.kind == "hold":
         return f"The input is taken with --hold {found.records[0].input.hold}"
     if remedy.kind == "treatment":
         return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
     low, high = options.delay_bounds
     if remedy.kind == "delay" and fit.status is Status.DELAY_AT_BOUND:
-        return f"The delay lies at the end of its range, {fit.model.delay:.4g}"
+        return f"The delay lies at the end of its range, {fit.model.delay:.4g} {time_unit}"
     if remedy.kind == "delay" and low == high:
-        return f"The delay is taken as {low:g}"
-    if getattr(remedy.options, "integrators", 0) and (slow := _slow_pole(found)):
+        return f"The delay is taken as {low:g} {time_unit}"
+    if getattr(remedy.options, "integrators", 0) and (slow := _slow_pole(found, time_unit)):
         return slow
     return _dependence(found) or f"The model has {count(options.poles, 'pole')} and {count(options.zeros, 'zero')}"
 
@@ -121,7 +126,7 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
     return f"The residuals{of} depend on the input{', most on later values' * later} (p = {p:.2g})"
 
 
-def _outliers(found: Identification) -> str:
+def _outliers(found: Identification, time_unit: str) -> str:
     """Return which samples are far from their neighbours; nothing where none is."""
     listed_times, largest, total = [], 0.0, 0
     for k, ((record, use), e) in enumerate(zip(_used(found), found.fit.linear.residuals, strict=True), start=1):
@@ -130,22 +135,24 @@ def _outliers(found: Identification) -> str:
         largest = max(largest, float(np.abs(off).max(initial=0.0)))
         of = f" of experiment {k}" * (len(found.records) > 1)
         times = [f"{t:.6g}" for t in record.t[use][places][:LISTED]]
-        listed_times += [f"t = {', '.join(times)}{', ...' * (places.size > LISTED)}{of}"] * (places.size > 0)
+        listed_times += [f"t = {', '.join(times)}{', ...' * (places.size > LISTED)} {time_unit}{of}"] * (
+            places.size > 0
+        )
     if not total:
         return ""
     what = "1 output sample is an outlier" if total == 1 else f"{total} output samples are outliers"
     return f"{what} ({'; '.join(listed_times)}), up to {largest:.3g} away from the neighbours"
 
 
-def _slow_pole(found: Identification) -> str:
+def _slow_pole(found: Identification, time_unit: str) -> str:
     """Return that a real pole is slow for the record; nothing where none is."""
     poles = found.fit.model.poles
     sizes = np.abs(poles[(poles.imag == 0.0) & (poles.real != 0.0)])
     longest = max(record.duration for record in found.records)
     if not sizes.size or sizes.min() * longest * SLOW >= 1.0:
         return ""
-    what = f"A pole has a time constant of {1 / sizes.min():.4g}"
-    return f"{what}: over a record of {longest:.4g} it is nearly indistinguishable from an integrator"
+    what = f"A pole has a time constant of {1 / sizes.min():.4g} {time_unit}"
+    return f"{what}: over a record of {longest:.4g} {time_unit} it is nearly indistinguishable from an integrator"
 
 
 # --- what has no remedy ------------------------------------------------------------------------------
@@ -158,11 +165,11 @@ def _of_validation(found: Identification) -> Iterator[FitWarning]:
         yield FitWarning(f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: it does not carry over")
 
 
-def _of_residuals(found: Identification, mended: set[Kind]) -> Iterator[str]:
+def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> Iterator[str]:
     """What residuals and record show beside the model."""
     if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
         yield f"{what}: the model misses a part of the response"
-    outliers = _outliers(found)
+    outliers = _outliers(found, time_unit)
     if outliers and "loss" not in mended:
         yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
@@ -200,7 +207,7 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
         yield f"{what} {found}: the model of the plant or of the noise is too small"
 
 
-def of_search(fit: MeasuredFit) -> Iterator[str]:
+def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
     """How the search ended, where it did not end well."""
     if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not fit.held_poles:
         yield fit.status.value.removesuffix(".")
@@ -208,9 +215,9 @@ def of_search(fit: MeasuredFit) -> Iterator[str]:
         held = listed(f"{pole:.4g}" if pole.imag else f"{pole.real:.4g}" for pole in fit.held_poles)
         met = () if fit.box is None else fit.box.limits_met(fit.held_poles)
         why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
-        yield f"Held at the border of the admissible models: {held} (poles, rad per unit of time){why}"
+        yield f"Held at the border of the admissible models: {held} (poles, rad/{time_unit}){why}"
     if fit.status is Status.DELAY_AT_BOUND:
-        where = f"end of its range, {fit.model.delay:.4g}" if fit.model.delay else "least possible, 0"
+        where = f"end of its range, {fit.model.delay:.4g} {time_unit}" if fit.model.delay else "least possible, 0"
         yield f"The delay is at the {where}, and has no standard error"
     if fit.poles_at_infinity:
         lost = "1 pole runs" if fit.poles_at_infinity == 1 else f"{fit.poles_at_infinity} poles run"
@@ -232,9 +239,9 @@ def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
     yield from (each.removesuffix(".") for each in told)
 
 
-def _of_uncertainty(found: Identification) -> Iterator[str]:
+def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
     """What the record does not determine, and intervals that cannot be trusted."""
-    if slow := _slow_pole(found):
+    if slow := _slow_pole(found, time_unit):
         yield slow
     fit, uncertainty = found.fit, found.uncertainty
     yield from of_conditioning(fit, fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty)
@@ -252,6 +259,6 @@ def _of_uncertainty(found: Identification) -> Iterator[str]:
         [] if interval is None else [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
     )
     if ends:
-        yield f"The interval of the delay reaches the end of its range ({' and '.join(ends)})"
+        yield f"The interval of the delay reaches the end of its range ({' and '.join(ends)} {time_unit})"
     if len(found.tests) < len(fit.residuals):
         yield f"Fewer than {FEWEST_TESTED} residuals are too few to test; standard errors take them as white"

@@ -96,7 +96,7 @@ def _warnings(fit: FrequencyDomainFit, answer: AnswerTest) -> Iterator[str]:
         )
     if fit.fit_percent < LOW_FIT and fit.data.standard_error is None:
         yield f"The fit is {fit.fit_percent:.1f} % of the weighted values"
-    yield from of_search(fit)
+    yield from of_search(fit, fit.data.units[0])
     if fit.status in (Status.CONVERGED, Status.AT_BOUND, Status.DELAY_AT_BOUND):
         assert fit.law is not None
         yield from of_conditioning(fit, fit.law)

@@ -23,6 +23,7 @@ def identify(
     covariance: Covariance = "auto",
     bootstrap_draws: int = DRAWS,
     progress: Progress | None = None,
+    time_unit: str = "s",
 ) -> Identification:
     """Fit a model to records and judge it; what is not given of its structure and treatment is chosen.
 
@@ -43,6 +44,8 @@ def identify(
         Simulated noise sequences of a bootstrap [-].
     progress : callable, optional
         Told after each of them how many of how many are done.
+    time_unit : str, default "s"
+        Unit of the records' times, for the sentences.
 
     Returns
     -------
@@ -75,9 +78,9 @@ def identify(
     several = [records] if isinstance(records, Record) else list(records)
     noise = covariance, bootstrap_draws, progress
     if options is not None and not isinstance(options, Given):
-        return with_warnings(identification.identify(options, several, validation, *noise))
+        return with_warnings(identification.identify(options, several, validation, *noise), time_unit)
     given = options or Given()
-    choice = choose(several, given)
+    choice = choose(several, given, time_unit)
     if given.poles is None and not choice.seen:
         raise DataError(f"{choice.why_none} Give the number of poles (--poles) to fit a model all the same.")
     other = None if validation is None else with_hold(validation, choice.records[0].input.hold)
@@ -88,4 +91,4 @@ def identify(
     found = replace(found, choices=choice.sentences)
     if other is not None:
         found = replace(found, validation=judged_on(other, choice.options, found.fit, given))
-    return with_warnings(found)
+    return with_warnings(found, time_unit)

@@ -1,6 +1,7 @@
 """What is said of each choice: the criterion against the runner-up."""
 
 from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
 from ctid_cli.text import count
@@ -18,12 +19,19 @@ NO_INTEGRATOR = (
 )
 
 
-def spelled(candidate: Candidate) -> str:
-    """Return a structure in words."""
-    options = candidate.options
-    zeros = count(options.zeros, "zero") if options.zeros else "no zero"
-    besides = f" and {count(options.integrators, 'integrator')}" if options.integrators else ""
-    return f"{count(options.poles, 'pole')}, {zeros}{besides}"
+def spelled(options: Options) -> str:
+    """Return a structure in words: poles, zeros and integrators, of each submodel if there are several."""
+    if not isinstance(options, MeasuredSubmodels) or not options.factored:
+        zeros = count(options.zeros, "zero") if options.zeros else "no zero"
+        return f"{count(options.poles, 'pole')}, {zeros}{_integrators(getattr(options, 'integrators', 0))}"
+    terms = options.terms
+    parts = ", ".join(f"{term.poles}/{term.zeros}{_integrators(term.integrators)}" for term in terms)
+    what = f"sum of {len(terms)} submodels" if len(terms) > 1 else "one submodel"
+    return f"{what} with poles/zeros {parts}"
+
+
+def _integrators(number: int) -> str:
+    return f" and {count(number, 'integrator')}" if number else ""
 
 
 def rest_assumed(options: DelayProfile) -> str:
@@ -74,15 +82,15 @@ def of_hold(models: Ranking) -> str:
     return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else other.hold)}."
 
 
-def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list[str]:
+def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Return the structure and the range of the delay."""
     best = ranking.best
     other = ranking.runner_up("poles", "zeros", "integrators")
     found = []
     if other is not None:
-        found.append(f"Structure: {spelled(best)}; {_below(ranking, other, other.name)}.")
+        found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
     if given.delay_bounds is None:
-        found.append(f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {best.fit.model.delay:.4g}.")
+        found.append(f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay).")
     return found
 
 

@@ -22,7 +22,7 @@ from ctid_cli.text import Shown, wrapped
 class Status(Enum):
     """Outcome of an estimation: what happened, and the usual cause."""
 
-    CONVERGED = "The iterations converged to a minimum of the output-error cost."
+    CONVERGED = "The iterations converged to a minimum of the cost."
     LEAST_SQUARES = "A one-shot least-squares estimate: biased by output noise; use it as a start, not as a result."
     MAX_ITERATIONS = (
         "The iterations stopped at max_iterations before reaching the tolerance; raise max_iterations, or start closer."
@@ -32,17 +32,17 @@ class Status(Enum):
         "below what rounding allows."
     )
     AT_BOUND = (
-        "The least output-error cost is at the border of the admissible models: a pole is as fast, as slow or as "
+        "The least cost is at the border of the admissible models: a pole is as fast, as slow or as "
         "little damped as may be."
     )
     RIDGE = (
-        "The output-error cost is least and hardly changes along a line as far as models are admissible: the data do "
+        "The cost is least and hardly changes along a line as far as models are admissible: the data do "
         "not determine all parameters."
     )
     DELAY_AT_BOUND = "The delay stopped at one of its bounds."
     LOCAL = "A local minimum: at another delay within the bounds the cost is lower; start there, or use delay_profile."
     REFLECTED = (
-        "The last step led to an unstable model, whose poles were mirrored: this is no minimum of the output-error "
+        "The last step led to an unstable model, whose poles were mirrored: this is no minimum of the "
         "cost; use fewer poles or another start, or closed-loop instruments for an unstable plant in a loop."
     )
     SINGULAR = (

@@ -125,6 +125,8 @@ class ResidualTests:
     #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
     #: computed.
     cross_p_value: float
+    #: What drives the system, and the residuals are tested against: the input, or the reference of a loop.
+    driver: str = "input"
 
     @property
     def white(self) -> bool:
@@ -146,15 +148,15 @@ class ResidualTests:
             first = first.replace("pass as white", "are not white").removesuffix(".")
             first += ": the noise is coloured, so that standard errors for white noise do not hold."
         if np.isnan(self.cross_p_value):
-            second = "Their correlation with the input cannot be tested: the input does not vary enough."
+            second = f"Their correlation with the {self.driver} cannot be tested: it does not vary enough."
         elif self.uncorrelated:
-            second = f"They are not seen to depend on the input (p = {self.cross_p_value:.2g})."
+            second = f"They are not seen to depend on the {self.driver} (p = {self.cross_p_value:.2g})."
         elif int(np.argmax(np.abs(self.cross_correlation))) < self.lags:
             why = "as with feedback from the output, a delay that is too long, or clocks that differ"
-            second = f"They depend on the input, most on later values (p = {self.cross_p_value:.2g}), {why}."
+            second = f"They depend on the {self.driver}, most on later values (p = {self.cross_p_value:.2g}), {why}."
         else:
             what = "the model misses a part of the response"
-            second = f"They depend on the input (p = {self.cross_p_value:.2g}): {what}."
+            second = f"They depend on the {self.driver} (p = {self.cross_p_value:.2g}): {what}."
         return f"{first} {second}"
 
 

@@ -13,20 +13,20 @@ import pandas as pd
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimators.model_comparison import ModelOnRecord
 from ctid_cli.inference.fitted_model import FittedModel
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Column, Result, Section
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, outline, plain
+from ctid_cli.reporting.figures.style import DARK, LIGHT, Drawing, look, name_axes, outline, plain
 from ctid_cli.reporting.fit_plot import curve
 from ctid_cli.reporting.layout import picked
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.signals.table import split_header
 from ctid_cli.storage.fit_file import read_fit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: What is told of the tests of residuals.
-VERDICTS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value")
+TESTS = (("white", "whiteness_p_value"), ("uncorrelated", "cross_p_value"))
+VERDICTS = [key for pair in TESTS for key in pair]
 #: What the columns of the table mean.
 MEANING = (
     "fit: 100 (1 - ||y - x|| / ||y - mean y||) of the simulated output x. white, independent: whether the residuals "
@@ -74,11 +74,10 @@ def require_units(
     where: str, model: NamedFit, time: str | None, input: str | None, output: str | None, what: str = "the model"
 ) -> None:
     """Refuse signals in other units than a model has; a label that is missing contradicts nothing."""
-    given = {"time": time, "input": input, "output": output}
-    for (role, unit), default in zip(given.items(), ("s", "in", "out"), strict=True):
+    for role, unit in {"time": time, "input": input, "output": output}.items():
         own = getattr(model.units, role)
-        unlabelled = role != "time" and default in (own, unit)
-        if unit is not None and unit != own and not unlabelled:
+        known = unit is not None and model.units.is_known(own) and model.units.is_known(unit)
+        if known and unit != own:
             verb = "is" if what == "the model" else "are"
             raise DataError(f"{where}: the {role} is in {unit}, and {what} {verb} in {own}; convert one of them")
 
@@ -100,44 +99,28 @@ class ModelComparison(Result):
         samples = (
             f"{record.name}: {every} {record.n_samples} samples, from {one.t[0]:.6g} to {one.t[-1]:.6g} {unit.time}"
         )
-        formats = {"fit %": ".2f", "R2": ".5g", f"rms [{unit.output}]": ".4g"}
-        formats |= dict.fromkeys(("p, white", "p, independent"), ".2g")
+        rows = [row | {test: _verdict(row[test], row[p]) for test, p in TESTS} for row in self._rows()]
+        columns = (
+            Column("name", "model"),
+            Column("fit_percent", "fit %", ".2f"),
+            Column("r2", "R2", ".5g"),
+            Column("rms", form=".4g", unit=unit.output if unit.is_known(unit.output) else ""),
+            Column("white"),
+            Column("whiteness_p_value", "p, white", ".2g"),
+            Column("uncorrelated", "independent"),
+            Column("cross_p_value", "p, independent", ".2g"),
+            Column("initial_state", "initial state"),
+            Column("offset"),
+        )
+        best_first = sorted(rows, key=lambda row: -row["fit_percent"])
         return [
             Section(sentences=[f"{samples}, the same for all models."]),
-            Section(frame=self._table(), formats=formats, notes=[MEANING], drawing=self.drawing()),
+            Section.table(best_first, columns, notes=[MEANING], drawing=self.drawing()),
         ]
 
-    def _table(self) -> pd.DataFrame:
-        rows = []
-        for model, one in zip(self.models, self.found, strict=True):
-            test = one.tests
-            rows.append(
-                {
-                    "model": model.name,
-                    "fit %": one.fit_percent,
-                    "R2": one.r2,
-                    f"rms [{model.units.output}]": one.rms,
-                    "white": None if test is None else _verdict(test.white, test.whiteness_p_value),
-                    "p, white": test and test.whiteness_p_value,
-                    "independent": None if test is None else _verdict(test.uncorrelated, test.cross_p_value),
-                    "p, independent": test and test.cross_p_value,
-                    "initial state": one.initial_state,
-                    "offset": one.offset,
-                }
-            )
-        return pd.DataFrame(rows).sort_values("fit %", ascending=False, kind="stable")
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return the measured output, and that of each model, at the samples that all of them have."""
-        units, first = self.models[0].units, self.found[0]
-        columns = {f"t [{units.time}]": first.t, f"measured [{units.output}]": first.measured}
-        for model, one in zip(self.models, self.found, strict=True):
-            columns[f"simulated {model.name} [{units.output}]"] = one.simulated
-        return pd.DataFrame(columns)
-
-    def content(self) -> dict[str, Any]:
-        """Return the comparison for JSON."""
-        rows = [
+    def _rows(self) -> list[dict[str, Any]]:
+        """Return what is told of each model."""
+        return [
             {
                 "name": model.name,
                 "file": str(model.path),
@@ -148,10 +131,21 @@ class ModelComparison(Result):
             }
             for model, one in zip(self.models, self.found, strict=True)
         ]
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the measured output, and that of each model, at the samples that all of them have."""
+        units, first = self.models[0].units, self.found[0]
+        columns = {f"t [{units.time}]": first.t, units.label("measured", units.output): first.measured}
+        for model, one in zip(self.models, self.found, strict=True):
+            columns[units.label(f"simulated {model.name}", units.output)] = one.simulated
+        return pd.DataFrame(columns)
+
+    def content(self) -> dict[str, Any]:
+        """Return the comparison for JSON."""
         t = self.found[0].t
         used = {"count": t.size, "first": float(t[0]), "last": float(t[-1])}
         units = asdict(self.models[0].units)
-        return {"record": self.measurement.record.name, "units": units, "samples": used, "models": rows}
+        return {"record": self.measurement.record.name, "units": units, "samples": used, "models": self._rows()}
 
     def drawing(self) -> Drawing:
         """Return the figure of the outputs above the residuals."""
@@ -167,15 +161,13 @@ class ModelComparison(Result):
                 upper.plot(*curve(record.t, used, one.simulated), label=label, **style)
                 lower.plot(*curve(record.t, used, one.residuals), **style | {"linewidth": 0.7})
             lower.axhline(0.0, color=DARK, linewidth=0.6)
-            upper.set_ylabel(f"{plain(split_header(self.measurement.output)[0])} [{plain(units.output)}]")
-            lower.set_ylabel(f"residual [{plain(units.output)}]")
-            lower.set_xlabel(f"{plain(split_header(self.measurement.time)[0])} [{plain(units.time)}]")
+            name_axes(upper, y=units.column(self.measurement, "output"), legend="best")
+            name_axes(lower, units.column(self.measurement, "time"), units.label("residual", units.output))
             upper.margins(x=0.0)
-            upper.legend(loc="best", fontsize=8)
 
         return Drawing(8.0, 5.0, draw)
 
 
-def _verdict(passed: bool, p_value: float) -> bool | None:
+def _verdict(passed: bool | None, p_value: float | None) -> bool | None:
     """Return whether a test is passed, None where it could not be made."""
-    return None if np.isnan(p_value) else passed
+    return None if p_value is None or np.isnan(p_value) else passed

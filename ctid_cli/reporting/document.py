@@ -9,10 +9,11 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting.layout import latex, markdown_table
+from ctid_cli.reporting import markup
+from ctid_cli.reporting.layout import latex, markdown_table, picked
 from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
@@ -31,6 +32,26 @@ Tool = Literal["control", "matlab", "scipy"]
 LABEL = 16
 
 
+class Column(NamedTuple):
+    """A quantity of a result: its key in JSON and its unit, and its title and format in tables."""
+
+    key: str
+    #: The name of the column of a file, where it is empty.
+    title: str = ""
+    form: str = ".6g"
+    unit: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name of the column of a file: the key with the unit."""
+        return f"{self.key} [{self.unit}]" if self.unit else self.key
+
+    @property
+    def header(self) -> str:
+        """Title of the column of a table."""
+        return self.title or self.name
+
+
 @dataclass(frozen=True, eq=False)
 class Section:
     """One part of a result: a title, sentences, a table, and a figure, each of them optional."""
@@ -47,6 +68,16 @@ class Section:
     #: A figure that is still to be drawn, or an SVG file.
     drawing: Drawing | bytes | None = None
     caption: str = ""
+
+    @classmethod
+    def table(cls, rows: Iterable[object], columns: Sequence[Column], **parts: Any) -> Section:
+        """Return a table of objects, or of mappings; columns of which nothing is known are left out."""
+        import pandas as pd
+
+        keys = [column.key for column in columns]
+        frame = pd.DataFrame([picked(row, keys).values() for row in rows], columns=[each.header for each in columns])
+        formats = {column.header: column.form for column in columns}
+        return cls(frame=frame.dropna(axis=1, how="all"), formats=formats, **parts)
 
 
 class Result(ABC):
@@ -229,22 +260,10 @@ def render_html(sections: Iterable[Section]) -> str:
     blocks: list[str] = []
     for section in sections:
         blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
-        blocks += [f"<p>{html.escape(sentence)}</p>" for sentence in (*section.sentences, *section.lines)]
-        blocks += [html_table(section)] if section.frame is not None else []
-        blocks += [f"<p>{html.escape(note)}</p>" for note in section.notes]
-    return "\n".join(blocks)
-
-
-def html_table(section: Section) -> str:
-    """Return the table of a section as HTML, of a long one the first rows."""
-    (header, *rows), sides = aligned_lines(section)
-    styles = [f' style="text-align: {"left" if side == "l" else "right"}"' for side in sides]
-
-    def row(tag: str, texts: Sequence[str]) -> str:
-        cells = [f"<{tag}{style}>{html.escape(text)}</{tag}>" for text, style in zip(texts, styles, strict=True)]
-        return f"<tr>{''.join(cells)}</tr>"
-
-    return "<table>" + "\n".join([row("th", header), *(row("td", texts) for texts in rows)]) + "</table>"
+        blocks.append(markup.paragraphs([*section.sentences, *section.lines]))
+        blocks += [markup.table(*aligned_lines(section))] if section.frame is not None else []
+        blocks.append(markup.paragraphs(section.notes))
+    return "\n".join(filter(None, blocks))
 
 
 RENDERERS: Mapping[str, Callable[[Iterable[Section]], str]] = {

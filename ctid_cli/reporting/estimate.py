@@ -1,4 +1,4 @@
-"""One estimate: its parameters with their uncertainty, and as a row of an export."""
+"""Units of a record, and the parameters of an estimate with their uncertainty."""
 
 from __future__ import annotations
 
@@ -6,20 +6,18 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import nan
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ctid_cli.canonical import plain
 from ctid_cli.inference.intervals import NORMAL, UncertainValue
+from ctid_cli.reporting.document import Column
+from ctid_cli.reporting.layout import picked
+from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.sampled_signal import SECONDS
+from ctid_cli.signals.table import Role, split_header
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-#: Keys that every estimate carries in machine-readable output, in this order.
-ESTIMATE_KEYS = (
-    *("id", "experiment", "estimator", "cell", "replicate", "start", "status"),
-    *("delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent", "iterations", "seconds"),
-)
+#: What stands for a unit of input or output that is not known.
+INPUT, OUTPUT = "in", "out"
+UNKNOWN = {INPUT, OUTPUT}
 
 
 @dataclass(frozen=True)
@@ -27,13 +25,34 @@ class Units:
     """Units of a record, and those that follow for the parameters of a model."""
 
     time: str = "s"
-    input: str = "in"
-    output: str = "out"
+    input: str = INPUT
+    output: str = OUTPUT
 
     @property
     def gain(self) -> str:
         """Unit of a static gain."""
         return f"{self.output}/{self.input}"
+
+    def label(self, name: str, unit: str) -> str:
+        """Return a name with its unit in brackets, where the unit is known."""
+        return f"{name} [{unit}]" if self.is_known(unit) else name
+
+    def column(self, measurement: Measurement, role: Role) -> str:
+        """Return the name of a column of a record with its unit."""
+        return self.label(split_header(str(getattr(measurement, role)))[0], getattr(self, role))
+
+    def amount(self, text: str, unit: str) -> str:
+        """Return a number with its unit, where the unit is known."""
+        return f"{text} {unit}" if self.is_known(unit) else text
+
+    def is_known(self, unit: str) -> bool:
+        """Whether a unit is made of those of the record, and not of what stands for unknown ones."""
+        return UNKNOWN.isdisjoint(re.findall(r"\w+", unit))
+
+    @property
+    def square(self) -> str:
+        """Unit of a squared output."""
+        return f"({self.output})^2"
 
     @property
     def seconds(self) -> float | None:
@@ -113,34 +132,19 @@ def _delay_status(delay: float | None, bounds: Sequence[float] | None) -> str:
     return "at bound" if at_bound else "free"
 
 
-def parameter_object(item: UncertainValue) -> dict[str, Any]:
-    """A parameter for JSON."""
-    names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
-    return dict(plain({name: getattr(item, name) for name in names}))
+#: What is told of a parameter.
+PARAMETER = (
+    Column("name", "parameter"),
+    Column("estimate"),
+    Column("standard_error", "standard error", ".3g"),
+    Column("relative_percent", "relative %", ".2g"),
+    Column("low", "95 % low", ".5g"),
+    Column("high", "95 % high", ".5g"),
+    Column("unit"),
+    Column("status"),
+)
 
 
-#: Formats of the numbers of a table of parameters.
-PARAMETER_FORMATS = {
-    "estimate": ".6g",
-    "standard error": ".3g",
-    "relative %": ".2g",
-    "95 % low": ".5g",
-    "95 % high": ".5g",
-}
-
-
-def parameter_frame(found: Iterable[UncertainValue]) -> pd.DataFrame:
-    """Return parameters as a table."""
-    import pandas as pd
-
-    names = ("name", "estimate", "standard_error", "relative_percent", "low", "high", "unit", "status")
-    titles = ["parameter", *PARAMETER_FORMATS, "unit", "status"]
-    return pd.DataFrame([[getattr(item, name) for name in names] for item in found], columns=titles)
-
-
-def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
-    """An estimate for JSON: the documented keys first, then what else is stored."""
-    keys = list(ESTIMATE_KEYS)
-    if "parameters" in estimate:
-        keys.insert(keys.index("standard_errors"), "parameters")
-    return {key: estimate.get(key) for key in keys} | {key: item for key, item in estimate.items() if key not in keys}
+def parameter_rows(found: Iterable[UncertainValue]) -> list[dict[str, Any]]:
+    """Return parameters as data."""
+    return [picked(item, [column.key for column in PARAMETER]) for item in found]

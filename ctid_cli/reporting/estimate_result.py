@@ -1,25 +1,21 @@
-"""Estimates for other programs, and one of them in full: the results of ``ctid export``."""
+"""One stored estimate in full: the result of ``ctid export --id``."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from textwrap import indent
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from ctid_cli.inference.intervals import BIASED, NORMAL, UncertainValue
 from ctid_cli.kinds import KINDS
-from ctid_cli.reporting.document import Result, Section, pairs
-from ctid_cli.reporting.estimate import PARAMETER_FORMATS, as_object, parameter_frame, parameter_object, parameters
+from ctid_cli.reporting.document import Column, Result, Section, pairs
+from ctid_cli.reporting.estimate import PARAMETER, parameter_rows, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
-from ctid_cli.storage import columns
-from ctid_cli.storage.column_arrays import ROWS
-from ctid_cli.storage.estimates import Estimates, export_rows
-from ctid_cli.storage.manifest import swept_names
+from ctid_cli.storage.estimate_text import as_object
 
 if TYPE_CHECKING:
     from ctid_cli.storage.status import FoundEstimate
@@ -45,7 +41,7 @@ class EstimateResult(Result):
         """Return the estimate for JSON, with its parameters, data and settings."""
         manifest = self.found.stored.manifest
         return as_object(self.found.row) | {
-            "parameters": [parameter_object(item) for item in self.parameters],
+            "parameters": parameter_rows(self.parameters),
             "data": self.found.slot.cell["content"],
             "settings": self.found.slot.estimator["content"],
             "seed": manifest["seed"],
@@ -59,7 +55,10 @@ class EstimateResult(Result):
         head.append(f"{row['status']}: {row['message']}")
         if row.get("converged") is not None:
             head.append("It meets the success rule." if row["converged"] else "It does not meet the success rule.")
-        numbers = [_frequencies(row)] if "measures" in row else [self._fitted(), _facts(row)]
+        numbers = [self._fitted(), _facts(row)]
+        if "measures" in row:
+            columns = Column("measure"), Column("value"), Column("unit")
+            numbers = [Section.table(_measures(row), columns, notes=[f"Time: {_times(row)}."])]
         data = f"Data (cell {row['cell']}, seed {seed}, data set {row['replicate']})"
         return [
             Section(f"Estimate {row['id']} of {row['experiment']}", head),
@@ -70,11 +69,8 @@ class EstimateResult(Result):
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each parameter, or measure of frequencies."""
-        if "measures" in self.found.row:
-            frame = _frequencies(self.found.row).frame
-            assert frame is not None
-            return frame
-        return pd.DataFrame([parameter_object(item) for item in self.parameters])
+        rows = _measures(self.found.row) if "measures" in self.found.row else parameter_rows(self.parameters)
+        return pd.DataFrame(rows)
 
     def _fitted(self) -> Section:
         """Return the parameters of a model, and what their names and intervals mean."""
@@ -83,7 +79,7 @@ class EstimateResult(Result):
         if not names:
             return Section(notes=notes)
         meaning = " ".join([*_conventions(names), _interval(row)])
-        return Section(frame=parameter_frame(self.parameters), formats=PARAMETER_FORMATS, notes=[meaning, *notes])
+        return Section.table(self.parameters, PARAMETER, notes=[meaning, *notes])
 
 
 def _facts(row: Mapping[str, Any]) -> Section:
@@ -101,14 +97,17 @@ def _facts(row: Mapping[str, Any]) -> Section:
     return Section(frame=pairs(list(facts.items())))
 
 
-def _frequencies(row: Mapping[str, Any]) -> Section:
+def _measures(row: Mapping[str, Any]) -> list[dict[str, str]]:
     """Return what was measured of the frequencies of a signal."""
     measures = row["measures"] or {}
-    lines = [
-        (name, number(measures[name], 8 if name.startswith("omega") else 4), MEASURE_UNITS[base_name(name)[0]])
+    return [
+        {
+            "measure": name,
+            "value": number(measures[name], 8 if name.startswith("omega") else 4),
+            "unit": MEASURE_UNITS[base_name(name)[0]],
+        }
         for name in measure_names([measures])
     ]
-    return Section(frame=pd.DataFrame(lines, columns=["measure", "value", "unit"]), notes=[f"Time: {_times(row)}."])
 
 
 def _times(row: Mapping[str, Any]) -> str:
@@ -151,47 +150,3 @@ def _start(row: Mapping[str, Any]) -> str:
         return f", start {row['start']}"
     drawn = f" ({number(row['start_delay'])} s)" if row["initial_delay"] == "random" else ""
     return f", start {delay_label(row['initial_delay'])}{drawn}"
-
-
-# --- all of an experiment ---------------------------------------------------------------------------------------------
-
-
-def csv_lines(stored: Estimates) -> Iterator[str]:
-    """The estimates as CSV, the head first."""
-    types = _types(stored)
-    head = _head(stored, types)
-    yield str(head.to_csv(index=False, lineterminator="\n"))
-    for start in range(0, len(stored), ROWS):
-        flat = export_rows(stored.part(start, start + ROWS).frame(types=types))
-        yield str(flat.reindex(columns=head.columns).to_csv(index=False, lineterminator="\n", header=False))
-
-
-def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
-    """A table without rows, with the columns of an estimate that has all that any of them has."""
-    some: dict[str, Any] = dict.fromkeys(map(str, stored.part(0, 0).frame(types=types)))
-    for column in columns.COLUMNS:
-        if column.name not in some:
-            continue
-        if column.type == "by name" and stored.has(column.name):
-            there: Any = stored.column(f"{column.name}_present").any(axis=0).tolist()
-            parts = zip(stored.export.parts(column.name), there, strict=True)
-            some[column.name] = {name: 0.0 for name, one in parts if one}
-        elif column.type == "coefficients" and stored.has(column.name):
-            some[column.name] = [0.0] * max(0, int(stored.column(f"{column.name}_length").max(initial=0)))
-    whole = pd.DataFrame({name: pd.Series([value], dtype="object") for name, value in some.items()})
-    return export_rows(whole).iloc[:0]
-
-
-def _types(stored: Estimates) -> dict[str, Any]:
-    """Types that columns of swept fields have over all estimates."""
-    swept = [{**block.cell["swept"], **block.estimator["swept"]} for block in stored.blocks]
-    return {name: pd.Series([part.get(name) for part in swept]).dtype for name in swept_names(stored.manifest)}
-
-
-def json_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """The estimates as one list of objects."""
-    before = "[\n"
-    for row in rows:
-        yield before + indent(json.dumps(as_object(row), indent=1, allow_nan=False), " ")
-        before = ",\n"
-    yield "[]\n" if before == "[\n" else "\n]\n"

@@ -17,18 +17,28 @@ from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.reporting.estimate import Units, parameter_object
+from ctid_cli.reporting.document import Column
+from ctid_cli.reporting.estimate import Units, parameter_rows
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 
-DERIVED_KEYS = ("name", "estimate", "standard_error", "low", "high", "unit", "reason")
+#: What is told of a derived quantity.
+DERIVED = (
+    Column("name", "derived"),
+    Column("estimate"),
+    Column("standard_error", "standard error", ".3g"),
+    Column("low", "95 % low"),
+    Column("high", "95 % high"),
+    Column("unit"),
+)
+DERIVED_KEYS = (*(column.key for column in DERIVED), "reason")
 TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
 
 def fit_content(
-    fitted: Identification, records: Records, ahead: int | None = None, units: Units | None = None
+    fitted: Identification, records: Records, predicted: Sequence[int] = (), units: Units | None = None
 ) -> dict[str, Any]:
     """Return the fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
@@ -43,10 +53,10 @@ def fit_content(
             "delay": fit.model.delay,
             **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
         },
-        "parameters": [parameter_object(item) for item in parameters_of(fitted, units)],
+        "parameters": parameter_rows(parameters_of(fitted, units)),
         **picked(fit, ("fit_percent", "r2", "cost")),
         "loss": _loss_object(fit, records.data),
-        "noise_model": fit.noise and _noise_object(fit, fit.noise, ahead),
+        "noise_model": fit.noise and _noise_object(fit, fit.noise, predicted),
         "status": fit.status.name,
         "message": fit.status.value,
         "starts": fit.starts and fit.starts._asdict(),
@@ -74,7 +84,7 @@ def fit_content(
         "iterations": fit.iterations,
         "residual_tests": [picked(test, TEST_KEYS) for test in fitted.tests],
         "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
-        "validation": validation and _validation_object(validation, records.validation),
+        "validation": validation and _validation_object(validation, records.validation, fit.noise, predicted),
         "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=False)],
         "units": asdict(units),
         "settings": asdict(options) | {"kind": options.kind, "hold": hold},
@@ -165,11 +175,15 @@ def _modes(fit: MeasuredFit, units: Units) -> list[dict[str, float | None]]:
     ]
 
 
-def _validation_object(outcome: Validation, validation: Measurement | None) -> dict[str, Any]:
+def _validation_object(
+    outcome: Validation, validation: Measurement | None, noise: NoiseEstimate | None, predicted: Sequence[int]
+) -> dict[str, Any]:
+    fits = None if noise is None else {str(k): outcome.prediction_fit(noise, k) for k in predicted}
     return {
         "file": outcome.name,
         **picked(outcome, ("fit_percent", "r2")),
         "samples": outcome.count,
+        "prediction_fits": fits,
         "initial_state": outcome.applied.initial_states[0],
         "offset": outcome.applied.offsets[0],
         "notes": () if validation is None else validation.notes,
@@ -189,13 +203,13 @@ def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
     }
 
 
-def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None) -> dict[str, Any]:
+def _noise_object(fit: MeasuredFit, estimate: NoiseEstimate, predicted: Sequence[int]) -> dict[str, Any]:
     """Return the noise model for JSON, and the output-error fit beside it."""
     errors = estimate.output_error_errors
     return {
         **picked(estimate.noise, ("numerator", "denominator", "innovation_variance")),
         **picked(estimate, ("covariance", "deviance", "chosen")),
-        "prediction_fits": {str(k): fit.prediction_fit(k) for k in (1, *([ahead] if ahead else []))},
+        "prediction_fits": {str(k): fit.prediction_fit(k) for k in predicted},
         "output_error": {
             "values": estimate.output_error,
             "standard_errors": errors,

@@ -2,114 +2,173 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray, IntArray
 from ctid_cli.estimators.identification import Identification
-from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline, plain
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, name_axes, outline, plain
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: The figure of ``ctid fit``, and its parts.
-Kind = Literal["all", "overlay", "residuals", "correlation", "profile"]
 #: Experiments that are drawn; more do not fit into one figure.
 MOST_DRAWN = 3
 #: A profile whose greatest cost is this many times its least one has a logarithmic scale.
 STEEP = 5.0
+#: Lines of the correlations of experiments.
+LINES = ("o-", "s--", "^:")
 
 
-def identification_drawing(
-    result: Identification, measurements: Sequence[Measurement], units: Units, kind: Kind | None = None
-) -> Drawing:
-    """The figure of a fit, or one part of it."""
-    drawn = measurements[:MOST_DRAWN]
+@dataclass(frozen=True, eq=False)
+class FitFigures:
+    """The figure of a fit and its parts."""
 
-    def draw(figure: Figure) -> None:
-        if kind in ("overlay", "residuals"):
-            part = _draw_output if kind == "overlay" else _draw_residuals
-            for k, measurement in enumerate(drawn):
-                axes = figure.add_subplot(len(drawn), 1, k + 1)
-                part(axes, result, measurement, k, units)
+    result: Identification
+    measurements: Sequence[Measurement]
+    units: Units
+
+    @property
+    def _drawn(self) -> int:
+        return min(len(self.measurements), MOST_DRAWN)
+
+    def all(self) -> Drawing:
+        """Output and residuals of each experiment, autocorrelation, and the search over the delay."""
+        n = self._drawn
+
+        def draw(figure: Figure) -> None:
+            grid = figure.add_gridspec(2 * n + 1, 2, height_ratios=[2, 1.2] * n + [2])
+            for k in range(n):
+                output = figure.add_subplot(grid[2 * k, :])
+                self.draw_output(output, k)
+                output.tick_params(labelbottom=False)
+                output.margins(x=0.0)
+                error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
+                self.draw_residuals(error, k)
+                self._name_panels(output, error, k)
+            self.draw_autocorrelation(figure.add_subplot(grid[-1, 0]))
+            self.draw_profile(figure.add_subplot(grid[-1, 1]))
+
+        return Drawing(8.0, 3.4 * n + 2.8, draw)
+
+    def outputs(self) -> Drawing:
+        """Measured and simulated output of each experiment."""
+        return self._by_experiment(self.draw_output)
+
+    def residuals(self) -> Drawing:
+        """Residuals of each experiment."""
+        return self._by_experiment(self.draw_residuals)
+
+    def _by_experiment(self, part: Callable[[Any, int], None]) -> Drawing:
+        def draw(figure: Figure) -> None:
+            for k, axes in enumerate(figure.subplots(self._drawn, 1, squeeze=False)[:, 0]):
+                part(axes, k)
                 axes.margins(x=0.0)
-                _name_panels(axes, axes, measurement, k, len(measurements), units)
-        elif kind == "correlation":
+                self._name_panels(axes, axes, k)
+
+        return Drawing(8.0, 2.8 * self._drawn, draw)
+
+    def correlations(self) -> Drawing:
+        """Correlation of the residuals, or innovations, with themselves and with the input."""
+
+        def draw(figure: Figure) -> None:
             both = figure.subplots(1, 2)
-            draw_autocorrelation(both[0], result.tests, len(measurements), _tested(result))
-            draw_cross_correlation(both[1], result.tests, len(measurements), _tested(result))
-        elif kind == "profile":
-            draw_profile(figure.add_subplot(), result, units)
-        else:
-            _draw_all(figure, result, measurements, units)
+            self.draw_autocorrelation(both[0])
+            tests = self.result.tests
+            name_axes(
+                both[1], y=f"correlation of the {self.result.fit.left_over}\nwith the delayed {self.result.driver} [-]"
+            )
+            self._draw_lags(both[1], [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests])
+            _draw_band(both[1], [test.cross_correlation_band for test in tests], tests[0].level, "independent")
 
-    if kind == "correlation":
         return Drawing(8.0, 3.0, draw)
-    if kind == "profile":
-        return Drawing(5.5, 3.4, draw)
-    return Drawing(8.0, 2.8 * len(drawn) if kind in ("overlay", "residuals") else 3.4 * len(drawn) + 2.8, draw)
 
+    # --- panels ------------------------------------------------------------------------------------
 
-def _tested(result: Identification) -> str:
-    """What the tests are of."""
-    return "residuals" if result.fit.noise is None else "innovations"
+    def draw_output(self, axes: Any, k: int) -> None:
+        """The measured output of an experiment, the simulated one, and what counts for little."""
+        record, fit = self.measurements[k].record, self.result.fit
+        if fit.weighting is not None and fit.weighting.outliers[k].any():
+            little = np.flatnonzero(fit.used[k])[fit.weighting.outliers[k]]
+            axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
+        draw_overlay(axes, self.measurements[k], fit.used[k], fit.residuals[k], self.units)
 
+    def draw_residuals(self, axes: Any, k: int) -> None:
+        """The residuals of an experiment."""
+        fit, t = self.result.fit, self.measurements[k].record.t
+        axes.plot(*curve(t, fit.used[k], fit.residuals[k]), color=DARK, linewidth=0.7)
+        axes.axhline(0.0, color="black", linewidth=0.6)
+        name_axes(axes, y=self.units.label("residual", self.units.output))
 
-def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Measurement], units: Units) -> None:
-    drawn = measurements[:MOST_DRAWN]
-    grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
-    for k, measurement in enumerate(drawn):
-        output = figure.add_subplot(grid[2 * k, :])
-        error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
-        _draw_output(output, result, measurement, k, units)
-        output.tick_params(labelbottom=False)
-        output.margins(x=0.0)
-        _draw_residuals(error, result, measurement, k, units)
-        _name_panels(output, error, measurement, k, len(measurements), units)
-    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements), _tested(result))
-    draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+    def _name_panels(self, upper: Any, lower: Any, k: int) -> None:
+        """Name the axis of time below the lower panel, and above the upper one which experiment it is."""
+        t, n = self.measurements[k].record.t, len(self.measurements)
+        thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
+        label = self.units.column(self.measurements[k], "time")
+        name_axes(lower, label + thinned * (outline(t, t)[0].size < t.size))
+        if n > 1:
+            upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
+    def draw_autocorrelation(self, axes: Any) -> None:
+        """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
+        tests = self.result.tests
+        name_axes(axes, y=f"autocorrelation\nof the {self.result.fit.left_over} [-]")
+        self._draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests])
+        if tests:
+            _draw_band(axes, [test.autocorrelation_band for test in tests], tests[0].level, "white")
 
-def _draw_output(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
-    record, use, weighting = measurement.record, result.fit.used[k], result.fit.weighting
-    if weighting is not None and weighting.outliers[k].any():
-        little = np.flatnonzero(use)[weighting.outliers[k]]
-        axes.plot(record.t[little], record.y[little], "x", color="black", markersize=4, label="counts for little")
-    draw_overlay(axes, measurement, use, result.fit.residuals[k], units)
+    def _draw_lags(self, axes: Any, curves: Sequence[tuple[IntArray, Array]]) -> None:
+        axes.set_xlabel("lag [samples]")
+        if not curves:
+            axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
+        for k, ((lags, values), line) in enumerate(zip(curves, LINES, strict=False), start=1):
+            label = f"experiment {k}" if len(self.measurements) > 1 else None
+            axes.plot(lags, values, line, color=DARK, markersize=3, linewidth=0.8, label=label)
+
+    def draw_profile(self, axes: Any) -> None:
+        """The search over the delay."""
+        fit, units = self.result.fit, self.units
+        profile, found = fit.profile, f"{fit.model.delay:.4g} {units.time}"
+        if profile is None:
+            low, high = self.result.options.delay_bounds
+            label = plain(f"{'estimated' if low < high else 'known'} delay {found}")
+            axes.plot([fit.model.delay], [fit.cost], "o", color=DARK, label=label)
+        else:
+            whole = profile.samples >= fit.count
+            part = "" if whole else f" of the liveliest {profile.samples} samples"
+            part += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
+            axes.plot(profile.delays, profile.costs, ".-", color=DARK, lw=0.8, ms=4, label=plain(f"profile{part}"))
+            if profile.cutoff is None and whole and fit.noise is None:
+                axes.plot([fit.model.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
+            else:
+                # The cost of the estimate is that of all frequencies and samples, or of the innovations.
+                what = "minimum at" if fit.noise is None else "estimate with the noise model:"
+                axes.axvline(fit.model.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
+        low, high = axes.get_ylim()
+        if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
+            # The least cost would lie on the axis of a straight scale, whatever the others around it are.
+            axes.set_yscale("log")
+            low, high = axes.get_ylim()
+            axes.set_ylim(low, high * (high / low) ** 0.35)
+        else:
+            axes.set_ylim(low, high + 0.35 * (high - low))
+        name_axes(axes, f"delay [{units.time}]", units.label("cost", units.square), legend="upper right")
 
 
 def draw_overlay(axes: Any, measurement: Measurement, use: BoolArray, residuals: Array, units: Units) -> None:
     """The measured output, and the simulated one at its used samples."""
     record = measurement.record
-    simulated = curve(record.t, use, record.y[use] - residuals)
     axes.plot(*outline(record.t, record.y), color=LIGHT, linewidth=2.2, zorder=1.9, label="measured")
-    axes.plot(*simulated, color=DARK, linewidth=0.9, label="simulated")
-    axes.set_ylabel(plain(measurement.label("output", units.output)))
+    axes.plot(*curve(record.t, use, record.y[use] - residuals), color=DARK, linewidth=0.9, label="simulated")
+    name_axes(axes, y=units.column(measurement, "output"))
     axes.legend(loc="lower right", ncols=3, fontsize=8)
     low, high = axes.get_ylim()
     axes.set_ylim(low - 0.18 * (high - low), high)  # room for the legend below the curves
-
-
-def _draw_residuals(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
-    t = measurement.record.t
-    axes.plot(*curve(t, result.fit.used[k], result.fit.residuals[k]), color=DARK, linewidth=0.7)
-    axes.axhline(0.0, color="black", linewidth=0.6)
-    axes.set_ylabel(plain(f"residual [{units.output}]"))
-
-
-def _name_panels(upper: Any, lower: Any, measurement: Measurement, k: int, n: int, units: Units) -> None:
-    """Name the axis of time below the lower panel, and above the upper one which of n experiments it is."""
-    t = measurement.record.t
-    thinned = f"; the least and the greatest of each {t.size // STRIPES} samples are drawn"
-    label = plain(measurement.label("time", units.time))
-    lower.set_xlabel(label + thinned * (outline(t, t)[0].size < t.size))
-    if n > 1:
-        upper.set_title(f"experiment {k + 1} of {n}", loc="left")
 
 
 def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, Array]:
@@ -119,72 +178,10 @@ def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, 
     return outline(t, full)
 
 
-def draw_autocorrelation(
-    axes: Any, tests: Sequence[ResidualTests], experiments: int = 1, what: str = "residuals"
-) -> None:
-    """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
-    axes.set_ylabel(f"autocorrelation\nof the {what} [-]")
-    _draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests], experiments)
-    if tests:
-        _draw_band(axes, tests[0].autocorrelation_band, f"{100 * tests[0].level:.3g} % band if white")
-
-
-def draw_cross_correlation(
-    axes: Any, tests: Sequence[ResidualTests], experiments: int = 1, what: str = "residuals"
-) -> None:
-    """Correlation of the residuals, or innovations, with the input, with the band where they do not depend on it."""
-    axes.set_ylabel(f"correlation of the {what}\nwith the delayed input [-]")
-    _draw_lags(axes, [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests], experiments)
-    if tests:
-        _draw_band(axes, tests[0].cross_correlation_band, f"{100 * tests[0].level:.3g} % band if independent")
-
-
-def _draw_lags(axes: Any, curves: Sequence[tuple[IntArray, Array]], experiments: int) -> None:
-    axes.set_xlabel("lag [samples]")
-    if not curves:
-        axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
-    styles = ("o-", "s--", "^:")
-    for k, ((lags, values), style) in enumerate(zip(curves[:MOST_DRAWN], styles, strict=False), start=1):
-        label = f"experiment {k}" if experiments > 1 else None
-        axes.plot(lags, values, style, color=DARK, markersize=3, linewidth=0.8, label=label)
-
-
-def _draw_band(axes: Any, band: float, label: str) -> None:
-    axes.axhspan(-band, band, color=BAND, zorder=0, label=label)
+def _draw_band(axes: Any, bands: Sequence[float], level: float, what: str) -> None:
+    """The band that correlations of the first experiment stay in, and the legend above it."""
+    axes.axhspan(-bands[0], bands[0], color=BAND, zorder=0, label=f"{100 * level:.3g} % band if {what}")
     axes.axhline(0.0, color="black", linewidth=0.6)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.25 * (high - low))
-    axes.legend(loc="upper right", fontsize=8)
-
-
-def draw_profile(axes: Any, result: Identification, units: Units) -> None:
-    """The search over the delay."""
-    profile, delay = result.fit.profile, result.fit.model.delay
-    axes.set_xlabel(plain(f"delay [{units.time}]"))
-    axes.set_ylabel(plain(f"cost [({units.output})²]"))
-    if profile is None:
-        low, high = result.options.delay_bounds
-        what = "estimated delay" if low < high else "known delay"
-        axes.plot([delay], [result.fit.cost], "o", color=DARK, label=plain(f"{what} {delay:.4g} {units.time}"))
-    else:
-        whole = profile.samples >= result.fit.count
-        behind = "" if whole else f" of the liveliest {profile.samples} samples"
-        behind += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
-        label = plain(f"profile{behind}")
-        axes.plot(profile.delays, profile.costs, ".-", color=DARK, linewidth=0.8, markersize=4, label=label)
-        noisy = result.fit.noise is not None
-        label = plain(f"{'estimate with the noise model:' if noisy else 'minimum at'} {delay:.4g} {units.time}")
-        if profile.cutoff is None and whole and not noisy:
-            axes.plot([delay], [result.fit.cost], "v", color="black", markersize=7, label=label)
-        else:
-            # The cost of the estimate is that of all frequencies and samples, or of the innovations.
-            axes.axvline(delay, color="black", linewidth=0.8, label=label)
-    low, high = axes.get_ylim()
-    if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
-        # The least cost would lie on the axis of a straight scale, whatever the others around it are.
-        axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high * (high / low) ** 0.35)
-    else:
-        axes.set_ylim(low, high + 0.35 * (high - low))
-    axes.legend(loc="upper right", fontsize=8)
+    name_axes(axes, legend="upper right")

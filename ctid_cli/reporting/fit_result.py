@@ -17,18 +17,22 @@ from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
+from ctid_cli.estimators.measured_submodels import Options, SubmodelsFit
+from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import BIASED
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.reporting.document import Result, Section, pairs
-from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_frame, parameter_object
+from ctid_cli.reporting.document import Section, pairs
+from ctid_cli.reporting.estimate import PARAMETER, Units, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
-from ctid_cli.reporting.fit_content import additive_of, derived_of, fit_content, parameters_of
-from ctid_cli.reporting.fit_plot import identification_drawing
+from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
+from ctid_cli.reporting.fit_plot import FitFigures
 from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.model_plot import figure_chapters
+from ctid_cli.reporting.pages.page import Chapter, PagedResult
+from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
 from ctid_cli.signals.measurement import Measurement
@@ -56,6 +60,8 @@ TREATMENTS = {
     "none": "none",
     "remove": "means of input and output subtracted",
 }
+#: Digits of the coefficients in the equation.
+DIGITS = 5
 #: Instants of outliers that the text names.
 MOST_NAMED = 5
 #: What a loss does to the samples that are listed, and its name.
@@ -64,8 +70,10 @@ LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult(Result):
+class FitResult(PagedResult):
     """A fit with the records that it was made from."""
+
+    fine = "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."
 
     fitted: Identification
     records: Records
@@ -83,27 +91,61 @@ class FitResult(Result):
         """Units of the records."""
         return self.records.units
 
+    @property
+    def figures(self) -> FitFigures:
+        """The figure of the fit and its parts."""
+        return FitFigures(self.fitted, self.records.measurements, self.units)
+
     def sections(self) -> list[Section]:
         """Return records, settings, parameters, derived quantities, diagnostics and warnings."""
-        warnings = [f"- {warning}" for warning in self.fitted.warnings]
-        return [
-            *([Section("Chosen:", [f"- {choice}" for choice in self.fitted.choices])] if self.fitted.choices else []),
-            self.data(),
-            Section(frame=pairs(self.settings())),
-            self.parameters(),
-            self.derived(),
-            Section(frame=pairs(self.quality()), drawing=self.drawing()),
-            *([Section("Warnings:", warnings)] if warnings else []),
-        ]
+        lists = {"Chosen:": self.fitted.choices, "Warnings:": self.fitted.warnings}
+        chosen, warnings = (
+            [Section(title, [f"- {text}" for text in texts])] if texts else [] for title, texts in lists.items()
+        )
+        quality = Section(frame=pairs(self.quality()), drawing=self.drawing())
+        settings = Section(frame=pairs(self.settings()))
+        return [*chosen, self.data(), settings, self.parameters(), self.derived(), quality, *warnings]
 
     def to_frame(self) -> pd.DataFrame:
         """Return a row for each parameter: estimate, standard error, interval, unit and status."""
-        rows = [parameter_object(item) for item in parameters_of(self.fitted, self.units)]
-        return pd.DataFrame(rows).set_index("name")
+        return pd.DataFrame(parameter_rows(parameters_of(self.fitted, self.units))).set_index("name")
 
     def drawing(self) -> Drawing:
         """Return the figure of output, residuals, their correlation, and the search over the delay."""
-        return identification_drawing(self.fitted, self.records.measurements, self.units)
+        return self.figures.all()
+
+    def page_head(self) -> tuple[str, str]:
+        """Return the title of the page, and how well the model simulates."""
+        fit, validation = self.fitted.fit, self.fitted.validation
+        lead = f"{spelled(self.fitted.options)}: simulates {number(fit.fit_percent, 4)} % of "
+        lead += count(fit.count, "sample")
+        if validation is not None:
+            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
+        title = "Fit of " + ", ".join(record.name or "a record" for record in self.records.data)
+        return title, f"{lead}. {fit.status.value}"
+
+    def chapters(self) -> Iterator[Chapter]:
+        """Return data, model and figures."""
+        yield from self.chapters_of_numbers()
+        yield from figure_chapters(self.figures, self.records.validation)
+
+    def chapters_of_numbers(self) -> Iterator[Chapter]:
+        """Return data and model."""
+        model = self.fitted.fit.model
+        terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+        equation = Section(sentences=[formula(terms, delayed=model.delay > 0, digits=DIGITS)])
+        quality = Section("How good it is", frame=pairs(self.quality()))
+        yield Chapter("Data", [self.data(), Section(frame=pairs(self.settings()))])
+        yield Chapter("Model", [equation, self.parameters(), self.derived(), quality])
+
+    def cited(self) -> list[str]:
+        """Return the articles whose methods the fit used, and the frequency response that stands beside it."""
+        fitted = self.fitted
+        keys = ["gonzalez2025" if fitted.options.kind == "additive_srivc" else "kaufman1975"]
+        keys += ["huber2009"] if fitted.fit.weighting is not None else []
+        keys += ["harvey1979", "hausman1978"] if fitted.fit.noise is not None else []
+        keys += ["patterson1971"] if fitted.uncertainty.kind in ("robust", "bootstrap") else []
+        return [*keys, "pintelon2012"]
 
     # --- sections ----------------------------------------------------------------------------------
 
@@ -116,24 +158,19 @@ class FitResult(Result):
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
-        frame = parameter_frame(parameters_of(self.fitted, self.units))
-        return Section(frame=frame, formats=PARAMETER_FORMATS, notes=[_covariance_line(self.fitted)])
+        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=[_covariance_line(self.fitted)])
 
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
         rows = derived_of(self.fitted, self.units)
-        names = ("estimate", "standard_error", "low", "high", "unit")
-        titles = ["derived", "estimate", "standard error", "95 % low", "95 % high", "unit"]
-        frame = pd.DataFrame([(row.name, *(getattr(row, name) for name in names)) for row in rows], columns=titles)
-        reasons = list(dict.fromkeys(row.reason for row in rows if row.reason))
-        return Section(frame=frame, formats={"standard error": ".3g"}, notes=reasons)
+        return Section.table(rows, DERIVED, notes=list(dict.fromkeys(row.reason for row in rows if row.reason)))
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
         hold, (low, high) = first.record.input.hold, options.delay_bounds
         searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-        yield "model", f"{structure_text(options)}; delay {searched}"
+        yield "model", f"{spelled(options)}; delay {searched}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
         yield from _loop(options, first)
@@ -155,27 +192,65 @@ class FitResult(Result):
         yield "R2", f"{number(fit.r2, 6)} = {R2_DEFINITION}"
         yield "", "y measured, x simulated, over the samples used"
         if fit.noise is not None:
-            yield from _noise_lines(fit, fit.noise, self.ahead, units)
+            yield from self._noise(fit.noise)
         if validation is not None:
             text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
             text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
             yield "validation", text
+            for k in self.predicted:
+                assert fit.noise is not None
+                yield f"  {k} ahead", f"fit {number(validation.prediction_fit(fit.noise, k), 5)} % of predictions"
         what = "mean squared output error" if fit.weighting is None else "twice the mean loss"
-        yield "cost", f"{number(fit.cost)} ({units.output})^2, {what}"
+        yield "cost", f"{units.amount(number(fit.cost), units.square)}, {what}"
         per = "cost" if fit.noise is None else "var e"
         sizes = f"N = {criteria.count} samples and p = {criteria.parameters} parameters"
         yield "AIC", f"{number(criteria.aic)} = N ln {per} + 2 p with {sizes}"
         yield "AICc", f"{number(criteria.aicc)} = AIC + 2 (p + 1)(p + 2) / (N - p - 2)"
         yield "BIC", f"{number(criteria.bic)} = N ln {per} + p ln N"
-        yield "FPE", f"{number(criteria.fpe)} ({units.output})^2 = {per} (N + p) / (N - p)"
+        yield "FPE", f"{units.amount(number(criteria.fpe), units.square)} = {per} (N + p) / (N - p)"
         yield "YIC, R_T^2", f"{number(self.fitted.yic, 5)}, {number(self.fitted.r_t_squared, 6)}"
         yield "condition number", number(fit.condition_number, 3)
         if isinstance(fit, SubmodelsFit):
             yield from _conditions(fit)
-        yield from search_lines(fit, units)
+        yield from self.search()
         for k, test in enumerate(self.fitted.tests, start=1):
-            what = "residuals" if fit.noise is None else "innovations"
-            yield what if len(fit.residuals) == 1 else f"{what} {k}", _tested(test)
+            yield fit.left_over if len(fit.residuals) == 1 else f"{fit.left_over} {k}", _tested(test)
+
+    def search(self) -> Iterator[tuple[str, str]]:
+        """Return how the search went, and the bounds of the admissible models where it ended at them."""
+        fit, units = self.fitted.fit, self.units
+        if fit.starts is not None:
+            yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
+        if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
+            yield "admissible", _box_text(fit.box, units)
+            for name, limit, value in fit.box.limits_met(fit.held_poles):
+                unit = "" if name == "least_damping" else f" rad/{units.time}"
+                yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
+
+    @property
+    def predicted(self) -> list[int]:
+        """How many samples ahead predictions are judged; nothing without a noise model."""
+        return [] if self.fitted.fit.noise is None else list(dict.fromkeys([1, self.ahead or 1]))
+
+    def _noise(self, estimate: NoiseEstimate) -> Iterator[tuple[str, str]]:
+        """Return the noise model, how well it predicts, and the output-error fit beside it."""
+        fit, units, noise, (p, q) = self.fitted.fit, self.units, estimate.noise, estimate.orders
+        errors = np.sqrt(np.diag(estimate.covariance))
+        d, c = _polynomial(noise.denominator, errors[:p]), _polynomial(noise.numerator, errors[p:])
+        chosen = ", orders of least BIC" * estimate.chosen
+        variance = units.amount(number(noise.innovation_variance or 0.0), units.square)
+        yield "noise", f"ARMA({p},{q}){chosen}: v = C/D e, D = {d}, C = {c}; variance of e {variance}"
+        for k in self.predicted:
+            old = count(k, "sample")
+            yield (
+                f"fit {k} ahead",
+                f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {old} old",
+            )
+        ratios = zip(fit.parameter_names, estimate.error_ratios(fit.covariance).tolist(), strict=True)
+        each = ", ".join(f"{name} {number(ratio, 3)}" for name, ratio in ratios if np.isfinite(ratio))
+        text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {each}"
+        test = f"Hausman's test of the difference: p = {number(estimate.test.p_value, 2)}"
+        yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
         """Return the text of ``fit.json`` in a folder, from which the records are named."""
@@ -184,43 +259,7 @@ class FitResult(Result):
 
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
-        return fit_content(self.fitted, self.records, self.ahead)
-
-
-def search_lines(fit: MeasuredFit, units: Units) -> Iterator[tuple[str, str]]:
-    """Return how the search went, and the bounds of the admissible models where it ended at them."""
-    if fit.starts is not None:
-        yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
-    if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
-        yield "admissible", _box_text(fit.box, units)
-        for name, limit, value in fit.box.limits_met(fit.held_poles):
-            unit = "" if name == "least_damping" else f" rad/{units.time}"
-            yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
-
-
-def _noise_lines(
-    fit: MeasuredFit, estimate: NoiseEstimate, ahead: int | None, units: Units
-) -> Iterator[tuple[str, str]]:
-    """Return the noise model, how well it predicts, and the output-error fit beside it."""
-    noise, (p, q) = estimate.noise, estimate.orders
-    errors = np.sqrt(np.diag(estimate.covariance))
-    d, c = _polynomial(noise.denominator, errors[:p]), _polynomial(noise.numerator, errors[p:])
-    chosen = ", orders of least BIC" * estimate.chosen
-    variance = f"variance of e {number(noise.innovation_variance or 0.0)} ({units.output})^2"
-    yield "noise", f"ARMA({p},{q}){chosen}: v = C/D e, D = {d}, C = {c}; {variance}"
-    for k in dict.fromkeys((1, *([ahead] if ahead else []))):
-        old = count(k, "sample")
-        yield f"fit {k} ahead", f"{number(fit.prediction_fit(k), 5)} % of predictions from outputs at least {old} old"
-    with np.errstate(invalid="ignore"):
-        ratios = estimate.output_error_errors / np.sqrt(np.diag(fit.covariance))
-    each = [
-        f"{name} {number(ratio, 3)}"
-        for name, ratio in zip(fit.parameter_names, ratios.tolist(), strict=True)
-        if np.isfinite(ratio)
-    ]
-    text = f"fit {number(estimate.output_error_fit, 5)} %; its standard errors over those here: {', '.join(each)}"
-    test = f"Hausman's test of the difference: p = {number(estimate.test.p_value, 2)}"
-    yield "output error", f"{text}. {test if estimate.test.freedom else 'Nothing is gained that a test could use'}"
+        return fit_content(self.fitted, self.records, self.predicted)
 
 
 def _polynomial(coefficients: Sequence[float], errors: Array) -> str:
@@ -236,23 +275,10 @@ def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> s
     if signal.hold != "band-limited" or options.initial_state == "periodic":
         return ""
     doubt = band_limited_doubt(signal.t, signal.values)
-    known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {doubt.ends:.2g} {units.input}"
+    level = units.amount(f"{doubt.ends:.2g}", units.input)
+    known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {level}"
     rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
     return f", {known}{rough}"
-
-
-def structure_text(options: Options) -> str:
-    """Poles and zeros, of each submodel if there are several."""
-    if not isinstance(options, MeasuredSubmodels) or not options.factored:
-        integrators = getattr(options, "integrators", 0)
-        besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
-        return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}{besides}"
-    parts = ", ".join(
-        f"{term.poles}/{term.zeros}" + f" and {count(term.integrators, 'integrator')}" * (term.integrators > 0)
-        for term in options.terms
-    )
-    what = f"sum of {len(options.terms)} submodels with" if len(options.terms) > 1 else "one submodel with"
-    return f"{what} poles/zeros {parts}"
 
 
 def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str]]:
@@ -298,13 +324,14 @@ def _box_text(box: Box, units: Units) -> str:
 
 
 def _record_line(measurement: Measurement, used: int, units: Units) -> str:
-    """One record: its samples, clock and columns."""
+    """One record: its samples, those that are missing or not used, clock and columns."""
     record = measurement.record
-    part = "" if used == record.n_samples else f" ({used} used)"
+    missing = record.n_samples - int(np.count_nonzero(record.valid))
+    less = [f"{used} used"] * (used < record.n_samples) + [f"{missing} missing"] * (missing > 0)
+    part = f" ({', '.join(less)})" if less else ""
     clock = "regular clock" if record.interval is not None else "irregular clock"
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
-    labels = measurement.label("input", units.input), measurement.label("output", units.output)
-    columns = f"input {labels[0]}, output {labels[1]}"
+    columns = f"input {units.column(measurement, 'input')}, output {units.column(measurement, 'output')}"
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
@@ -319,26 +346,34 @@ def _offset(result: Identification, units: Units) -> str:
     fit, options = result.fit, result.options
     if options.offset != "remove":
         return TREATMENTS[options.offset]
-    pairs = zip(fit.input_offsets, fit.offsets, strict=True)
-    means = "; ".join(f"{u:.6g} {units.input}, {y:.6g} {units.output}" for u, y in pairs)
-    return f"{TREATMENTS['remove']}: {means}"
+    means = (
+        f"{units.amount(f'{u:.6g}', units.input)}, {units.amount(f'{y:.6g}', units.output)}"
+        for u, y in zip(fit.input_offsets, fit.offsets, strict=True)
+    )
+    return f"{TREATMENTS['remove']}: {'; '.join(means)}"
 
 
 def _covariance_line(result: Identification) -> str:
-    """What the standard errors hold for."""
-    found, asked = result.uncertainty, all(test.white for test in result.tests)
-    what = "residuals" if result.fit.noise is None else "innovations"
-    text = f"Standard errors are those for white {what}"
+    """What the standard errors hold for, and how coefficients are scaled and counted."""
+    form = "Monic denominator, descending powers."
+    if additive_of(result.fit) is not None:
+        form = "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
+    return f"{_errors_line(result)} {form}"
+
+
+def _errors_line(result: Identification) -> str:
+    found, what = result.uncertainty, result.fit.left_over
     if not result.answer.seen:
-        return f"There are no standard errors, as no answer to the input is seen. {form_of(result.fit)}"
+        return "There are no standard errors, as no answer to the input is seen."
     if found.kind == "biased":
-        return f"{BIASED} {form_of(result.fit)}"
+        return BIASED
     if not np.isfinite(np.diag(found.covariance)).any():
-        return f"There are no standard errors. {form_of(result.fit)}"
-    if found.kind != "white":
-        text = f"Standard errors are those for coloured noise{f', because the {what} are not white' * (not asked)}"
-    elif result.tests:
-        text += f", as the {what} pass the test"
+        return "There are no standard errors."
+    if found.kind == "white":
+        text = f"Standard errors are those for white {what}" + f", as the {what} pass the test" * bool(result.tests)
+    else:
+        why = "" if all(test.white for test in result.tests) else f", because the {what} are not white"
+        text = f"Standard errors are those for coloured noise{why}"
     if found.bootstrap is None:
         text += f"; intervals are estimate -+ {found.quantile(np.zeros(1)):.3g} of them"
         text += f" (t, {found.degrees_of_freedom:.4g} degrees of freedom)"
@@ -347,21 +382,15 @@ def _covariance_line(result: Identification) -> str:
         text += f"; intervals are estimate -+ as many of them as {draws} keep within (bootstrap-t)"
     if result.delay_interval is not None:
         text += ", that of the delay from the profile of the cost, which is not quadratic there"
-    return f"{text}. {form_of(result.fit)}"
-
-
-def form_of(fit: MeasuredFit) -> str:
-    """How coefficients are scaled and counted."""
-    if additive_of(fit) is None:
-        return "Monic denominator, descending powers."
-    return "g1_a2 multiplies p^2 in the denominator of the first submodel, whose constant term is 1."
+    return f"{text}."
 
 
 def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record], units: Units) -> str:
     """Return the scale of a loss other than squares, and the samples that count for little."""
     kind, times = weighting.kind, weighting.outlier_times(records, fit.used)
     scales = ", ".join(number(loss.scale, 3) for loss in weighting.losses)
-    text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {scales} {units.output} from the median absolute error"
+    deviation = units.amount(scales, units.output)
+    text = f"{LOSSES[kind]} (--loss {kind}), standard deviation {deviation} from the median absolute error"
     total = sum(each.size for each in times)
     samples = f"{total} of {count(fit.count, 'sample')} {'has' if total == 1 else 'have'} {LITTLE[kind]}"
     if not total:
@@ -378,7 +407,7 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
 def _tested(test: ResidualTests) -> str:
     """Return the outcome of the tests of residuals; the warnings say what to do."""
     white = "white" if test.white else "not white"
-    free = "independent of the input" if test.uncorrelated else "dependent on the input"
+    free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
     return f"{white} (p = {number(test.whiteness_p_value, 2)}), {free} (p = {number(test.cross_p_value, 2)})"
 
 

@@ -14,7 +14,7 @@ from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.reporting.document import Tool
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.frequency_fit import line_frame
+from ctid_cli.reporting.layout import picked
 
 if TYPE_CHECKING:
     from ctid_cli.reporting.fit_result import FitResult
@@ -24,7 +24,7 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
     """Return what the page of a fit shows as tables by the names of their files; several records are numbered."""
     fitted, units = result.fitted, result.units
     tables = {
-        "step.csv": response_frame(fitted.step_response(), units.gain, units),
+        "step.csv": response_frame(fitted.step_response(), units),
         "bode.csv": frequency_frame(fitted.frequency_response(), units),
     }
     if isinstance(fitted.fit, FrequencyDomainFit):
@@ -33,29 +33,43 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"
         used, residuals = fitted.fit.used[k], fitted.fit.residuals[k]
-        columns = {t: record.t[used], f"input [{units.input}]": record.input.at(record.t[used])}
-        columns[f"measured [{units.output}]"] = record.y[used]
-        columns[f"simulated [{units.output}]"] = record.y[used] - residuals
+        columns = {t: record.t[used], units.label("input", units.input): record.input.at(record.t[used])}
+        columns[units.label("measured", units.output)] = record.y[used]
+        columns[units.label("simulated", units.output)] = record.y[used] - residuals
         tables[f"simulation{number}.csv"] = pd.DataFrame(columns)
-        tables[f"residuals{number}.csv"] = pd.DataFrame({t: record.t[used], f"residual [{units.output}]": residuals})
+        left = {t: record.t[used], units.label("residual", units.output): residuals}
+        tables[f"residuals{number}.csv"] = pd.DataFrame(left)
     return tables
 
 
-def response_frame(band: ResponseBand, unit: str, units: Units) -> pd.DataFrame:
+def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
+    """Return values, model and residuals at each line of a frequency response."""
+    data, model = fit.data, fit.answers(fit.data.frequencies)
+    columns = {f"frequency [rad/{units.time}]": data.frequencies}
+    for name, values in (("", data.response), ("model_", model), ("residual_", data.response - model)):
+        columns[units.label(f"{name}real", units.gain)] = values.real
+        columns[units.label(f"{name}imaginary", units.gain)] = values.imag
+    if data.standard_error is not None:
+        columns[units.label("standard_error", units.gain)] = data.standard_error
+    return pd.DataFrame(columns)
+
+
+def response_frame(band: ResponseBand, units: Units) -> pd.DataFrame:
     """Return a response over time with its standard error and pointwise band."""
-    parts = ("value", "standard_error", "lower", "upper")
-    return pd.DataFrame({f"t [{units.time}]": band.t} | {f"{part} [{unit}]": getattr(band, part) for part in parts})
+    values = picked(band, ("value", "standard_error", "lower", "upper"))
+    return pd.DataFrame(
+        {f"t [{units.time}]": band.t} | {units.label(part, units.gain): value for part, value in values.items()}
+    )
 
 
 def frequency_frame(band: FrequencyBand, units: Units) -> pd.DataFrame:
     """Return a frequency response as complex numbers, and as gain and phase with their pointwise bands."""
     columns = {f"frequency [rad/{units.time}]": band.frequencies}
-    columns |= {f"real [{units.gain}]": band.value.real, f"imaginary [{units.gain}]": band.value.imag}
-    for part in ("gain", "gain_error", "gain_lower", "gain_upper"):
-        columns[f"{part} [{units.gain}]"] = getattr(band, part)
-    for part in ("phase", "phase_error", "phase_lower", "phase_upper"):
-        columns[f"{part} [deg]"] = np.rad2deg(getattr(band, part))
-    return pd.DataFrame(columns)
+    gains = {"real": band.value.real, "imaginary": band.value.imag}
+    gains |= picked(band, ("gain", "gain_error", "gain_lower", "gain_upper"))
+    phases = picked(band, ("phase", "phase_error", "phase_lower", "phase_upper"))
+    columns |= {units.label(name, units.gain): values for name, values in gains.items()}
+    return pd.DataFrame(columns | {f"{name} [deg]": np.rad2deg(values) for name, values in phases.items()})
 
 
 def model_code(fit: FittedModel, tool: Tool, time_unit: str, pade: int | None = None) -> tuple[str, str]:

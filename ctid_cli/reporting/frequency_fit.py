@@ -7,18 +7,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
-from ctid_cli.canonical import plain as as_plain
+from ctid_cli.canonical import plain
 from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification
+from ctid_cli.identification.sentences import spelled
 from ctid_cli.reporting.document import Section
-from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_frame
-from ctid_cli.reporting.figures.style import BAND, DARK, MIDDLE, Drawing, plain
+from ctid_cli.reporting.estimate import PARAMETER, Units
+from ctid_cli.reporting.figures.style import BAND, DARK, MIDDLE, Drawing, name_axes
+from ctid_cli.reporting.figures.style import plain as plain_text
 from ctid_cli.reporting.fit_content import fit_content, parameters_of
-from ctid_cli.reporting.fit_result import FitResult, form_of, search_lines, structure_text
-from ctid_cli.reporting.frf_plot import decibels, name_axes
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.frf_plot import decibels, name_response
 from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.model_plot import bode_drawing, poles_drawing, step_drawing
+from ctid_cli.reporting.pages.page import Chapter
 from ctid_cli.reporting.records import Records
 from ctid_cli.text import count
 
@@ -37,6 +40,8 @@ FIT_DEFINITION = "100 (1 - ||W (G - M)|| / ||W G||)"
 @dataclass(frozen=True, eq=False)
 class FrequencyFitResult(FitResult):
     """A fit to a frequency response."""
+
+    fine = "The search ended well, and the residuals agree with what is known of the data."
 
     @classmethod
     def of(cls, fitted: Identification) -> FrequencyFitResult:
@@ -69,7 +74,7 @@ class FrequencyFitResult(FitResult):
         options, data, time = self.fitted.options, self.fit.data, self.units.time
         low, high = options.delay_bounds
         searched = f"searched from {low:g} to {high:g} {time}" if low < high else f"known, {low:g} {time}"
-        yield "model", f"{structure_text(options)}; delay {searched}"
+        yield "model", f"{spelled(options)}; delay {searched}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
         sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
@@ -81,8 +86,8 @@ class FrequencyFitResult(FitResult):
 
     def parameters(self) -> Section:
         """Return the parameters with their uncertainty."""
-        frame = parameter_frame(parameters_of(self.fitted, self.units))
-        return Section(frame=frame, formats=PARAMETER_FORMATS, notes=[f"{self._errors()} {form_of(self.fit)}"])
+        notes = [f"{self._errors()} Monic denominator, descending powers."]
+        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
 
     def _errors(self) -> str:
         """What the standard errors hold for."""
@@ -112,7 +117,7 @@ class FrequencyFitResult(FitResult):
         sizes = f"N = {criteria.count} real equations and p = {criteria.parameters} parameters"
         yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)} with {sizes}"
         yield "condition number", number(fit.condition_number, 3)
-        yield from search_lines(fit, self.units)
+        yield from self.search()
         yield (
             "lines",
             "errors of neighbours pass as uncorrelated" if fit.white else "errors of neighbours are correlated",
@@ -121,6 +126,25 @@ class FrequencyFitResult(FitResult):
     def drawing(self) -> Drawing:
         """Return the figure of gain, phase and residuals."""
         return frequency_fit_drawing(self.fit, self.units)
+
+    def page_head(self) -> tuple[str, str]:
+        """Return the title of the page, and how well the model fits."""
+        fit = self.fit
+        lines = count(fit.data.frequencies.size, "weighted line")
+        lead = f"{spelled(self.fitted.options)}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
+        return f"Fit of {fit.data.name or 'a frequency response'}", lead
+
+    def chapters(self) -> Iterator[Chapter]:
+        """Return data, model and figures."""
+        found, units = self.fitted, self.units
+        bode = bode_drawing(found.frequency_response(), None, units)
+        bands = "of the model, with pointwise 95 % bands."
+        poles = poles_drawing(found.poles(), self.fit.model.zeros, units)
+        yield from self.chapters_of_numbers()
+        yield Chapter("Values and model", [Section(drawing=self.drawing(), caption="Values, model and residuals.")])
+        step = Section(drawing=step_drawing(found.step_response(), units), caption=f"Response to a unit step {bands}")
+        yield Chapter("Responses", [Section(drawing=bode, caption=f"Frequency response {bands}"), step])
+        yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
 
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""
@@ -134,49 +158,30 @@ class FrequencyFitResult(FitResult):
             "misfit_p_value": fit.misfit_p_value,
             "correlated": fit.correlated,
         }
-        return {**fit_content(self.fitted, self.records, units=self.units), "frequency_response": as_plain(response)}
-
-
-def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
-    """Return values, model and residuals at each line."""
-    data, model = fit.data, fit.answers(fit.data.frequencies)
-    columns = {f"frequency [rad/{units.time}]": data.frequencies}
-    for name, values in (("", data.response), ("model_", model), ("residual_", data.response - model)):
-        columns |= {f"{name}real [{units.gain}]": values.real, f"{name}imaginary [{units.gain}]": values.imag}
-    if data.standard_error is not None:
-        columns[f"standard_error [{units.gain}]"] = data.standard_error
-    return pd.DataFrame(columns)
+        return {**fit_content(self.fitted, self.records, units=self.units), "frequency_response": plain(response)}
 
 
 def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
-    """Gain and phase of values and model, and the residuals against the standard errors."""
-    data = fit.data
-    w = data.frequencies
-    model = fit.answers(w)
-    seen = w > 0.0
+    """Gain and phase of values and model, and the residuals beside the standard errors."""
+    data, seen = fit.data, fit.data.frequencies > 0.0
+    w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
+    angle = np.unwrap(np.angle(model))
+    near = angle + np.angle(values * np.exp(-1j * angle))
+    panels = ((decibels(np.abs(values)), decibels(np.abs(model))), (np.rad2deg(near), np.rad2deg(angle)))
 
     def draw(figure: Figure) -> None:
         gain, phase, error = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.0, 1.0])
-        angle = np.unwrap(np.angle(model))
-        near = angle + np.angle(data.response * np.exp(-1j * angle))
-        for axes, measured, fitted in (
-            (gain, decibels(np.abs(data.response)), decibels(np.abs(model))),
-            (phase, np.rad2deg(near), np.rad2deg(angle)),
-        ):
-            axes.semilogx(w[seen], measured[seen], ".", color=MIDDLE, markersize=3, label="values")
-            axes.semilogx(w[seen], fitted[seen], color=DARK, linewidth=1.2, label="model")
+        for axes, (measured, fitted) in zip((gain, phase), panels, strict=True):
+            axes.semilogx(w, measured, ".", color=MIDDLE, markersize=3, label="values")
+            axes.semilogx(w, fitted, color=DARK, linewidth=1.2, label="model")
         if data.standard_error is not None:
-            level = decibels(data.standard_error)
-            error.fill_between(
-                w[seen], np.min(level) - 40.0, level[seen], color=BAND, linewidth=0.0, label="standard error"
-            )
-            error.set_ylim(bottom=float(np.min(level)) - 20.0)
-        error.semilogx(
-            w[seen], decibels(np.abs(data.response - model))[seen], ".", color=DARK, markersize=3, label="residual"
-        )
-        error.set_ylabel(f"residual [dB re 1 {plain(units.gain)}]")
-        error.legend(loc="best", fontsize=8)
-        name_axes(gain, phase, error, units)
-        gain.set_title(plain(data.name), loc="left")
+            level = decibels(data.standard_error[seen])
+            lowest = float(np.min(level)) - 20.0
+            error.fill_between(w, lowest, level, color=BAND, linewidth=0.0, label="standard error")
+            error.set_ylim(bottom=lowest)
+        error.semilogx(w, decibels(np.abs(values - model)), ".", color=DARK, markersize=3, label="residual")
+        name_response(gain, phase, error, units)
+        name_axes(error, y=f"residual [{units.amount('dB re 1', units.gain)}]", legend="best")
+        gain.set_title(plain_text(data.name), loc="left")
 
     return Drawing(8.0, 7.0, draw)

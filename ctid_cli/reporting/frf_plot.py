@@ -9,7 +9,7 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, plain
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, name_axes, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,23 +33,22 @@ def frf_drawing(found: FrequencyResponse, units: Units, title: str) -> Drawing:
                 gain.semilogx(found.frequencies, decibels(level), **look, label=label)
         coherence.semilogx(found.frequencies, found.coherence, ".", color=DARK, markersize=2.5)
         coherence.set_ylim(-0.05, 1.05)
-        coherence.set_ylabel("coherence [-]")
+        name_axes(coherence, y="coherence [-]")
         gain.margins(x=0.02)
         # The bound falls for ever towards low frequencies.
         lowest = np.nanmin(decibels(np.minimum(np.abs(found.response), np.maximum(found.standard_error, 1e-12))))
         gain.set_ylim(bottom=max(gain.get_ylim()[0], float(lowest) - 12.0))
-        name_axes(gain, phase, coherence, units)
+        name_response(gain, phase, coherence, units)
         gain.set_title(plain(title), loc="left")
 
     return Drawing(7.5, 6.4, draw)
 
 
-def name_axes(gain: Any, phase: Any, lowest: Any, units: Units) -> None:
+def name_response(gain: Any, phase: Any, lowest: Any, units: Units) -> None:
     """The axes of a frequency response, and the legend."""
-    gain.set_ylabel(f"gain [dB re 1 {plain(units.gain)}]")
-    phase.set_ylabel("phase [°]")
-    lowest.set_xlabel(rf"frequency $\omega$ [rad/{plain(units.time)}]")
-    gain.legend(loc="lower left", fontsize=8)
+    name_axes(gain, y=f"gain [{units.amount('dB re 1', units.gain)}]", legend="lower left")
+    name_axes(phase, y="phase [°]")
+    name_axes(lowest, f"frequency ω [rad/{units.time}]")
 
 
 def draw_points(

@@ -1,7 +1,7 @@
 """How numbers and tables are written as text."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ctid_cli.text import count as count  # for those who draw
@@ -31,8 +31,8 @@ def latex(text: str) -> str:
 
 
 def picked(item: object, names: Iterable[str]) -> dict[str, Any]:
-    """Some attributes of an object, as data."""
-    return {name: getattr(item, name) for name in names}
+    """Some attributes of an object, or values of a mapping, as data; None where a mapping lacks one."""
+    return {name: item.get(name) if isinstance(item, Mapping) else getattr(item, name) for name in names}
 
 
 def number(value: object, digits: int = 6) -> str:

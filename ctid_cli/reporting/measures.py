@@ -31,7 +31,6 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, wilson_interval
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.model_measures import distances, pole_errors, system_of
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import base_name
@@ -39,6 +38,7 @@ from ctid_cli.storage.columns import COUNTS, reserved_names
 from ctid_cli.storage.estimates import CLOCKS
 from ctid_cli.storage.groups import places_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
+from ctid_cli.storage.model_errors import distances, pole_errors, system_of
 from ctid_cli.text import did_you_mean, listed
 
 if TYPE_CHECKING:

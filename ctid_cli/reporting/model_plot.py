@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctid_cli.arrays import ComplexArray
-from ctid_cli.estimators.identification import DelayCosts, Identification, Validation
-from ctid_cli.inference.frequency_response import FrequencyResponse
+from ctid_cli.errors import DataError
+from ctid_cli.estimators.identification import DelayCosts, Validation, costs_about_delay
+from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
+from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.estimate import Units
-from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, plain
-from ctid_cli.reporting.fit_plot import draw_overlay, draw_profile
-from ctid_cli.reporting.frf_plot import decibels, draw_points, name_axes
+from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, name_axes, plain
+from ctid_cli.reporting.fit_plot import MOST_DRAWN, FitFigures, draw_overlay
+from ctid_cli.reporting.frf_plot import decibels, draw_points, name_response
+from ctid_cli.reporting.pages.page import Chapter
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -21,6 +25,10 @@ if TYPE_CHECKING:
 
 #: Points of an ellipse.
 AROUND = np.linspace(0.0, 2 * np.pi, 121)
+#: Frequencies at which a model is drawn.
+POINTS = 500
+#: The line of a model.
+LINE: dict[str, Any] = {"color": DARK, "linewidth": 1.2}
 #: Bands of the gain [dB] are cut at this distance from it; a wider band of the phase [degrees] says nothing.
 WIDEST_GAIN, WIDEST_PHASE = 40.0, 180.0
 
@@ -32,37 +40,29 @@ def validation_drawing(outcome: Validation, measurement: Measurement, units: Uni
         axes = figure.add_subplot()
         draw_overlay(axes, measurement, outcome.applied.used[0], outcome.applied.residuals[0], units)
         axes.margins(x=0.0)
-        axes.set_xlabel(plain(measurement.label("time", units.time)))
+        name_axes(axes, units.column(measurement, "time"))
 
     return Drawing(8.0, 2.8, draw)
 
 
 def bode_drawing(band: FrequencyBand, found: FrequencyResponse | None, units: Units) -> Drawing:
-    """Gain and phase of a model with their bands, over what the record says without a model."""
+    """Gain [dB] and phase [degrees] of a model with their bands, over what the record says without a model."""
 
     def draw(figure: Figure) -> None:
         gain, phase = figure.subplots(2, 1, sharex=True, height_ratios=[1.4, 1.0])
         if found is not None:
             around = np.interp(found.frequencies, band.frequencies, band.phase)
             draw_points(gain, phase, found, "without a model", around)
-        draw_bode(gain, phase, band)
-        name_axes(gain, phase, phase, units)
+        w, size, angle = band.frequencies, decibels(band.gain), np.rad2deg(band.phase)
+        low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
+        gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **_shade(band.level))
+        lower, upper = np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper)
+        phase.fill_between(w, lower, upper, where=upper - lower <= WIDEST_PHASE, **_shade(band.level))
+        for axes, values in ((gain, size), (phase, angle)):
+            axes.semilogx(w, values, label="model", **LINE)
+        name_response(gain, phase, phase, units)
 
     return Drawing(8.0, 4.8, draw)
-
-
-def draw_bode(gain: Any, phase: Any, band: FrequencyBand, label: str = "model", **look: Any) -> None:
-    """One model's gain [dB] and phase [degrees] with their bands, on logarithmic frequency."""
-    style: dict[str, Any] = {"color": DARK, "linewidth": 1.2, **look}
-    shade: dict[str, Any] = {"color": style["color"], "alpha": 0.25, "linewidth": 0.0}
-    w, size, angle = band.frequencies, decibels(band.gain), np.rad2deg(band.phase)
-    shade["label"] = f"{100 * band.level:.3g} % band of the {label}"
-    low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
-    gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **shade)
-    lower, upper = np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper)
-    phase.fill_between(w, lower, upper, where=upper - lower <= WIDEST_PHASE, **shade)
-    gain.semilogx(w, size, label=label, **style)
-    phase.semilogx(w, angle, label=label, **style)
 
 
 def step_drawing(band: ResponseBand, units: Units) -> Drawing:
@@ -70,21 +70,17 @@ def step_drawing(band: ResponseBand, units: Units) -> Drawing:
 
     def draw(figure: Figure) -> None:
         axes = figure.add_subplot()
-        draw_response(axes, band)
-        axes.set_xlabel(f"time after the step [{plain(units.time)}]")
-        axes.set_ylabel(f"output [{plain(units.gain)}]")
+        axes.fill_between(band.t, band.lower, band.upper, **_shade(band.level))
+        axes.plot(band.t, band.value, label="model", **LINE)
         axes.margins(x=0.0)
-        axes.legend(loc="best", fontsize=8)
+        name_axes(axes, f"time after the step [{units.time}]", units.label("output", units.gain), legend="best")
 
     return Drawing(8.0, 2.8, draw)
 
 
-def draw_response(axes: Any, band: ResponseBand, label: str = "model", **look: Any) -> None:
-    """One model's response over time with its band."""
-    style: dict[str, Any] = {"color": DARK, "linewidth": 1.2, **look}
-    words = f"{100 * band.level:.3g} % band of the {label}"
-    axes.fill_between(band.t, band.lower, band.upper, color=style["color"], alpha=0.25, linewidth=0.0, label=words)
-    axes.plot(band.t, band.value, label=label, **style)
+def _shade(level: float) -> dict[str, Any]:
+    """Look of the band of a model."""
+    return {"color": DARK, "alpha": 0.25, "linewidth": 0.0, "label": f"{100 * level:.3g} % band of the model"}
 
 
 def poles_drawing(band: PoleBand, zeros: ComplexArray, units: Units) -> Drawing:
@@ -97,13 +93,12 @@ def poles_drawing(band: PoleBand, zeros: ComplexArray, units: Units) -> Drawing:
         draw_poles(axes, band)
         if zeros.size:
             axes.plot(zeros.real, zeros.imag, "o", color=MARK, markersize=6, markerfacecolor="none", label="zero")
-        axes.set_xlabel(f"real part [rad/{plain(units.time)}]")
-        axes.set_ylabel(f"imaginary part [rad/{plain(units.time)}]")
         axes.margins(0.12)
         if not (band.value.imag.any() or zeros.imag.any()):
             reach = 0.3 * float(np.ptp(axes.get_xlim()))
             axes.set_ylim(-reach, reach)
-        axes.legend(loc="best", fontsize=8)
+        rate = f"rad/{units.time}"
+        name_axes(axes, f"real part [{rate}]", f"imaginary part [{rate}]", legend="best")
 
     return Drawing(5.5, 3.8, draw)
 
@@ -127,23 +122,64 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
     axes.plot(band.value.real, band.value.imag, "x", color=DARK, markersize=5, markeredgewidth=1.2, label="pole")
 
 
-def delay_drawing(result: Identification, near: DelayCosts | None, units: Units) -> Drawing:
+def delay_drawing(figures: FitFigures, near: DelayCosts | None) -> Drawing:
     """The search over the delay, and beside it the cost so close to the estimate that its minimum is seen."""
+    delay, time = figures.result.fit.model.delay, figures.units.time
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 1 if near is None else 2, squeeze=False)[0]
-        draw_profile(panels[0], result, units)
+        figures.draw_profile(panels[0])
         if near is None:
             return
-        axes, delay = panels[1], result.fit.model.delay
-        share = 100.0 * (near.costs / near.least - 1.0)
-        allowed = 100.0 * (near.allowed / near.least - 1.0)
+        axes, allowed = panels[1], near.percent_above(near.allowed)
+        share = near.percent_above(near.costs)
         axes.plot(near.delays, share, ".-", color=DARK, linewidth=0.8, markersize=4, label="all other parameters free")
-        axes.plot([delay], [0.0], "v", color="black", markersize=7, label=f"estimate {delay:.5g} {plain(units.time)}")
+        axes.plot([delay], [0.0], "v", color="black", markersize=7, label=f"estimate {delay:.5g} {plain(time)}")
         axes.axhline(allowed, color=MARK, linewidth=0.9, linestyle="--", label="95 % interval: below this")
-        axes.set_xlabel(f"delay [{plain(units.time)}]")
-        axes.set_ylabel("cost above the least [%]")
         axes.set_ylim(top=1.35 * max(float(np.max(share)), allowed))
-        axes.legend(loc="upper center", fontsize=8)
+        name_axes(axes, f"delay [{time}]", "cost above the least [%]", legend="upper center")
 
     return Drawing(5.5 if near is None else 8.0, 3.2, draw)
+
+
+def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iterator[Chapter]:
+    """Return the figures of a page: outputs, residuals, responses, poles, and the search over the delay."""
+    result, units = figures.result, figures.units
+    output = [Section(drawing=figures.outputs(), caption="Measured and simulated.")]
+    outcome, more = result.validation, len(figures.measurements) - MOST_DRAWN
+    if outcome is not None and validation is not None:
+        caption = f"The same on {outcome.name}, from which nothing was estimated but the initial state and the offset."
+        output.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
+    output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
+    yield Chapter("Output", output)
+    what = result.fit.left_over
+    caption = f"Correlation of the {what} with themselves and with the {result.driver}."
+    correlations = [Section(drawing=figures.correlations(), caption=caption)] if result.tests else []
+    notes = Section(notes=[test.sentence for test in result.tests])
+    yield Chapter("Residuals", [Section(drawing=figures.residuals(), caption="Residuals."), *correlations, notes])
+    yield Chapter("Responses", _responses(figures))
+    poles = poles_drawing(result.poles(), result.fit.model.zeros, units)
+    yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
+    if result.fit.profile is not None:
+        near = costs_about_delay(result)
+        caption = "The search over the whole range" + (", and the cost about the estimate." if near else ".")
+        yield Chapter("Delay", [Section(drawing=delay_drawing(figures, near), caption=caption)])
+
+
+def _responses(figures: FitFigures) -> list[Section]:
+    """Return the model over frequency and time, with the frequency response of the first record without a model."""
+    result, units, found = figures.result, figures.units, None
+    notes: list[str] = []
+    w = result.frequency_response().frequencies
+    try:
+        found = estimate_frequency_response(figures.measurements[0].record, time_unit=units.time)
+        notes += found.notes
+        w = np.geomspace(min(w[0], found.frequencies[0]), max(w[-1], found.frequencies[-1]), POINTS)
+    except DataError as error:
+        notes.append(f"The record gives no frequency response without a model: {error}.")
+    bode, step = bode_drawing(result.frequency_response(w), found, units), step_drawing(result.step_response(), units)
+    return [
+        Section(drawing=bode, caption="Frequency response, with pointwise 95 % bands."),
+        Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
+        Section(notes=notes),
+    ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctid_cli.identification.choice import Choice
-from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, plain
+from ctid_cli.reporting.figures.style import LOOKS, MARK, Drawing, name_axes, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,10 +39,8 @@ def order_drawing(choice: Choice, title: str) -> Drawing:
         error.set_yscale("log")
         # Linear where structures differ by little, logarithmic beyond.
         criterion.set_yscale("symlog", linthresh=10.0)
-        error.set_ylabel("root mean square output error")
-        criterion.set_ylabel("criterion above the least")
-        for axes in (error, criterion):
-            axes.set_xlabel("poles, integrators included")
+        for axes, name in ((error, "root mean square output error"), (criterion, "criterion above the least")):
+            name_axes(axes, "poles, integrators included", name)
             axes.set_xticks(sorted({each.options.order for each in by_size}))
         handles, labels = criterion.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 6), frameon=False)

@@ -12,7 +12,7 @@ import pandas as pd
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.judged import JudgedCandidate, judged_candidates
 from ctid_cli.identification.sentences import spelled
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Column, Result, Section
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.order_plot import order_drawing
@@ -21,7 +21,6 @@ from ctid_cli.reporting.records import Records
 #: Rows of the printed table.
 ROWS = 12
 STRUCTURE = ("poles", "zeros", "integrators")
-FORMATS = {**dict.fromkeys(("fit %", "validation %"), ".2f"), "criterion": "+.1f"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,21 +36,18 @@ class OrderSearchResult(Result):
     @classmethod
     def of(cls, choice: Choice, given: Given, records: Records) -> OrderSearchResult:
         """Judge the structures of a choice."""
-        other = None if records.validation is None else records.validation.record
-        return cls(choice, judged_candidates(choice, given, other), records)
+        return cls(choice, judged_candidates(choice, given, records.validation_record), records)
 
     def sections(self) -> list[Section]:
         """Return the choice, the best structures, and what else was chosen."""
         choice = self.choice
-        verdict = f"Chosen: {spelled(choice.ranking.best)}." if choice.seen else choice.why_none
-        formats = FORMATS | {f"delay [{self.records.units.time}]": ".4g"}
+        verdict = f"Chosen: {spelled(choice.ranking.best.options)}." if choice.seen else choice.why_none
         notes = [f"- {note}" for note in (*choice.sentences, *self.records.notes)]
         if len(self.judged) > ROWS:
             notes.append(f"- The best {ROWS} of {len(self.judged)} structures; all are in order.json.")
-        frame = self.to_frame().head(ROWS)
         return [
             Section("", [self.records.line, verdict]),
-            Section(frame=frame, formats=formats, drawing=self.drawing()),
+            self._table(ROWS, drawing=self.drawing()),
             Section("", notes),
         ]
 
@@ -62,20 +58,23 @@ class OrderSearchResult(Result):
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row for each structure, the best first; the criterion is relative to that of the first row."""
-        least = self.choice.ranking.best.criterion
-        rows = [
-            {
-                "chosen": "*" if k == 0 and self.choice.seen else "",
-                **picked(each.candidate.options, STRUCTURE),
-                "criterion": each.candidate.criterion - least,
-                "fit %": each.candidate.fit.fit_percent,
-                "validation %": each.validation_percent,
-                f"delay [{self.records.units.time}]": each.candidate.fit.model.delay,
-            }
-            for k, each in enumerate(self.judged)
-        ]
-        frame = pd.DataFrame(rows).set_index("chosen")
-        return frame if self.records.validation else frame.drop(columns="validation %")
+        frame = self._table().frame
+        assert frame is not None
+        return frame.set_index("chosen")
+
+    def _table(self, most: int | None = None, **parts: Any) -> Section:
+        """Return the best structures."""
+        columns = (
+            Column("chosen"),
+            *(Column(name) for name in STRUCTURE),
+            Column("criterion_above_least", "criterion", "+.1f"),
+            Column("fit_percent", "fit %", ".2f"),
+            Column("validation_percent", "validation %", ".2f"),
+            Column("delay", form=".4g", unit=self.records.units.time),
+        )
+        rows = [self._content(each) for each in self.judged[:most]]
+        marked = [row | {"chosen": "*" * (k == 0 and self.choice.seen)} for k, row in enumerate(rows)]
+        return Section.table(marked, columns, **parts)
 
     def content(self) -> dict[str, Any]:
         """Return the structures for ``order.json``."""

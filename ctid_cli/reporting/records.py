@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.identification import Identification
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
@@ -27,13 +28,29 @@ class Records:
         """The records themselves."""
         return [each.record for each in self.measurements]
 
-    def with_data(self, data: Sequence[Record], validation: Record | None) -> Records:
-        """Return the same files with their records as they were taken."""
-        pairs = zip(self.measurements, data, strict=True)
-        other = self.validation
+    @property
+    def all(self) -> list[Record]:
+        """The records and the one for validation."""
+        return [*self.data, *filter(None, [self.validation_record])]
+
+    @property
+    def validation_record(self) -> Record | None:
+        """The record for validation."""
+        return None if self.validation is None else self.validation.record
+
+    def treated(self, treat: Callable[[Measurement], Measurement]) -> Records:
+        """Return all measurements after a treatment."""
+        return Records(list(map(treat, self.measurements)), self.validation and treat(self.validation))
+
+    def of_fit(self, fitted: Identification) -> Records:
+        """Return the same files with their records as a fit has taken them."""
+        measured = [
+            replace(each, record=record) for each, record in zip(self.measurements, fitted.records, strict=True)
+        ]
+        other, validation = self.validation, fitted.validation
         if other is not None and validation is not None:
-            other = replace(other, record=validation)
-        return Records([replace(each, record=record) for each, record in pairs], other)
+            other = replace(other, record=validation.record)
+        return Records(measured, other)
 
     @cached_property
     def units(self) -> Units:
@@ -45,9 +62,8 @@ class Records:
             If two records have different units.
         """
         found: dict[str, str] = {}
-        every = [*self.measurements, *([self.validation] if self.validation else [])]
-        for role in ("time", "input", "output"):
-            for measurement in every:
+        for role in ROLES:
+            for measurement in filter(None, [*self.measurements, self.validation]):
                 unit = getattr(measurement, f"{role}_unit")
                 if unit is not None and found.setdefault(role, unit) != unit:
                     where = f"{measurement.record.name}: the {role} is in {unit}, that of another file in {found[role]}"

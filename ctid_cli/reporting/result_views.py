@@ -15,7 +15,7 @@ from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.inference.fit import Fit
 from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting.document import Result, Section
-from ctid_cli.reporting.estimate import PARAMETER_FORMATS, parameter_frame, parameter_object
+from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.frequency_fit import FrequencyFitResult
 from ctid_cli.reporting.layout import number
@@ -45,19 +45,19 @@ class SingleFit(Result):
         fit = self.fit
         note = f"fit {number(fit.fit_percent, 5)} % of {fit.count} samples: {fit.status.value}"
         return [
-            Section(frame=parameter_frame(self._parameters()), formats=PARAMETER_FORMATS),
+            Section.table(self._parameters(), PARAMETER),
             Section(sentences=[note]),
         ]
 
     def content(self) -> dict[str, Any]:
         """Return the parameters for JSON."""
         fit = self.fit
-        parameters = [parameter_object(item) for item in self._parameters()]
+        parameters = parameter_rows(self._parameters())
         return {"parameters": parameters, "fit_percent": fit.fit_percent, "status": fit.status.name}
 
     def to_frame(self) -> pd.DataFrame:
         """Return a row for each parameter."""
-        return pd.DataFrame([parameter_object(item) for item in self._parameters()]).set_index("name")
+        return pd.DataFrame(parameter_rows(self._parameters())).set_index("name")
 
     def plot(self) -> Any:
         """Refuse: there is no record to draw."""

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, outline, plain, ramp
+from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, MARK, MIDDLE, Drawing, name_axes, outline, plain, ramp
 from ctid_cli.signals.sampled_signal import SampledSignal
-from ctid_cli.tones.residual import LeftOver, without_spikes
+from ctid_cli.tones.residual import LeftOver
+from ctid_cli.tones.spectrogram import spectrogram
 from ctid_cli.tones.track import Track
 
 if TYPE_CHECKING:
@@ -25,13 +26,8 @@ MARGIN = 0.35
 LOGARITHMIC = 10.0
 #: The frequency axes end at this multiple of the highest tone or line, or at the Nyquist frequency.
 BEYOND = 2.0
-#: Of a spectrogram: columns; distance in bins of the closest tones in a segment, where the record is long enough;
-#: range in dB; most rows.
-COLUMNS = 480
-RESOLVED_BINS = 8.0
-SHORTEST, LONGEST = 64, 2**15
+#: Range of a spectrogram [dB].
 RANGE_DB = 70.0
-MOST_ROWS = 360
 #: Missing lines that have their frequency beside them, and how far the axes go below the median of what is left.
 NAMED_LINES = 8
 BELOW = 30.0
@@ -52,12 +48,12 @@ def track_drawing(track: Track, start: float, unit: str | None, title: str) -> D
         colours = [style["color"] for style in ramp(count)]
         for panel, tones in zip(axes, panels, strict=False):
             _draw_frequencies(panel, track, t, tones, colours)
-            panel.set_ylabel("frequency [Hz]" if len(panels) == 1 else f"tone {tones[0] + 1} [Hz]")
+            name_axes(panel, y="frequency [Hz]" if len(panels) == 1 else f"tone {tones[0] + 1} [Hz]")
         if has_amplitudes:
             _draw_amplitudes(axes[-1], track, t, colours)
-            axes[-1].set_ylabel(f"amplitude [{plain(unit)}]" if unit else "amplitude")
+            name_axes(axes[-1], y=f"amplitude [{unit}]" if unit else "amplitude")
         axes[0].set_title(plain(title), loc="left")
-        axes[-1].set_xlabel("t [s]")
+        name_axes(axes[-1], "t [s]")
         axes[-1].margins(x=0.0)
 
     return Drawing(7.2, 1.1 + sum(heights), draw)
@@ -140,46 +136,18 @@ def signal_drawing(signal: SampledSignal, track: Track) -> Drawing:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.0, 1.6])
         t = signal.start + signal.interval * np.arange(signal.samples.size, dtype=np.float64)
         upper.plot(*outline(t, signal.samples), color=DARK, linewidth=0.6)
-        upper.set_ylabel(f"{plain(signal.column)} [{plain(signal.unit)}]" if signal.unit else plain(signal.column))
+        name_axes(upper, y=f"{signal.column} [{signal.unit}]" if signal.unit else signal.column)
         top = highest_shown(track, signal.interval)
-        levels, first, last = _spectrogram(signal, track, top)
-        place: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": (first, last, 0.0, top)}
+        levels, first, last = spectrogram(signal.samples, signal.interval, track, top, RANGE_DB)
+        extent = (signal.start + first, signal.start + last, 0.0, top)
+        place: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": extent}
         image = lower.imshow(levels, cmap="Greys", vmin=-RANGE_DB, vmax=0.0, **place)
         lower.grid(visible=False)
-        lower.set(xlabel="t [s]", ylabel="frequency [Hz]")
+        name_axes(lower, "t [s]", "frequency [Hz]")
         upper.set_xlim(t[0], max(t[-1], t[0] + signal.interval))
         figure.colorbar(image, ax=lower, label="dB below the strongest", pad=0.01)
 
     return Drawing(8.0, 4.8, draw)
-
-
-def _spectrogram(signal: SampledSignal, track: Track, top: float) -> tuple[Array, float, float]:
-    """Return levels [dB] over frequency, from 0 to `top` [Hz], and time, with its first and last instant."""
-    from scipy.signal import spectrogram
-
-    values = np.nan_to_num(without_spikes(signal.samples))
-    size = min(_segment(values.size, signal.interval, track), values.size)
-    step = max(1, (values.size - size) // COLUMNS)
-    segments: dict[str, Any] = {"nperseg": size, "noverlap": size - step, "nfft": 2 * size}
-    hertz, t, levels = spectrogram(values, 1.0 / signal.interval, "hann", mode="magnitude", **segments)
-    levels = levels[: max(2, int(np.searchsorted(hertz, top, "right")))]
-    # Of neighbouring bins that share a row the strongest is shown.
-    together = -(-levels.shape[0] // MOST_ROWS)
-    padded = np.pad(levels, ((0, -levels.shape[0] % together), (0, 0)))
-    table = padded.reshape(-1, together, t.size).max(axis=1)
-    strongest = float(table.max()) or 1.0
-    decibels = 20.0 * np.log10(np.maximum(table / strongest, 10.0 ** (-RANGE_DB / 20.0)))
-    return decibels, signal.start + t[0], signal.start + max(t[-1], t[0] + signal.interval)
-
-
-def _segment(count: int, interval: float, track: Track) -> int:
-    """Return the samples of a segment: enough to tell the closest tones apart, not too many to see what moves."""
-    columns = [column[np.isfinite(column)] for column in track.omega.T]
-    middles = [float(np.median(column)) for column in columns if column.size]
-    apart = np.diff(np.sort([0.0, *middles, *(line.omega for line in track.missing)])) / TURN
-    apart = apart[apart > 0.0]
-    wanted = RESOLVED_BINS / (float(apart.min()) * interval) if apart.size else 256.0
-    return int(np.clip(2.0 ** np.ceil(np.log2(wanted)), SHORTEST, max(SHORTEST, min(LONGEST, count // 8))))
 
 
 def spectra_drawing(left: LeftOver, track: Track, unit: str | None) -> Drawing:
@@ -198,9 +166,7 @@ def spectra_drawing(left: LeftOver, track: Track, unit: str | None) -> Drawing:
             axes.set_ylim(max(floor / BELOW, 1e-9 * peak), 4.0 * peak)
         _mark_lines(axes, track)
         axes.set_xlim(0.0, top)
-        axes.set_xlabel("frequency [Hz]")
-        axes.set_ylabel(f"amplitude [{plain(unit)}]" if unit else "amplitude")
-        axes.legend(loc="upper right", fontsize=8)
+        name_axes(axes, "frequency [Hz]", f"amplitude [{unit}]" if unit else "amplitude", legend="upper right")
 
     return Drawing(8.0, 3.4, draw)
 

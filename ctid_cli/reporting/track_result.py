@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ctid_cli.frequency.flags import MEANINGS, Flag
-from ctid_cli.reporting.document import Result, Section
+from ctid_cli.reporting.document import Column, Section
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.layout import number, with_error
-from ctid_cli.reporting.track_plot import track_drawing
+from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
+from ctid_cli.reporting.track_plot import signal_drawing, spectra_drawing, track_drawing
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.text import count, listed
 from ctid_cli.tones.constants import METHOD, MOST_ASKED, USUAL_ACCURACY
+from ctid_cli.tones.residual import LeftOver, left_over
 from ctid_cli.tones.summary import ToneSummary, summarise
 from ctid_cli.tones.track import MissingLine, Track
 
@@ -33,10 +35,11 @@ TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True, eq=False)
-class TrackResult(Result):
+class TrackResult(PagedResult):
     """Tones over time, with the signal that they were found in, where it is known."""
 
     schema = "ctid-track-1"
+    fine = "Nothing that was tested speaks against these tones: nearly all rows are valid, and no line is left over."
 
     track: Track
     signal: SampledSignal | None = None
@@ -59,32 +62,27 @@ class TrackResult(Result):
         if not track.omega.shape[1]:
             return []
         partly, start = not track.there.all(), signal.start if signal else 0.0
-        unit = f" [{signal.unit}]" if signal and signal.unit else ""
         rows = [
-            {
-                "tone": tone.tone,
-                "frequency [Hz]": _with_error(tone),
-                "spread [Hz]": tone.spread_hz,
-                f"amplitude{unit}": tone.amplitude,
-                "from [s]": start + tone.begins if partly else math.nan,
-                "to [s]": start + tone.ends if partly else math.nan,
-                "valid %": tone.valid_percent,
-            }
+            asdict(tone)
+            | {"frequency": _with_error(tone)}
+            | ({"from": start + tone.begins, "to": start + tone.ends} if partly else {})
             for tone in summarise(track)
         ]
-        formats = {
-            "spread [Hz]": ".2g",
-            f"amplitude{unit}": ".4g",
-            "from [s]": ".5g",
-            "to [s]": ".5g",
-            "valid %": ".4g",
-        }
+        columns = (
+            Column("tone"),
+            Column("frequency", unit="Hz"),
+            Column("spread_hz", "spread [Hz]", ".2g"),
+            Column("amplitude", "", ".4g", (signal and signal.unit) or ""),
+            Column("from", "", ".5g", "s"),
+            Column("to", "", ".5g", "s"),
+            Column("valid_percent", "valid %", ".4g"),
+        )
         counted = f"{count(track.t.size, 'row')}, one every {track.every:.4g} s"
         note = f"Medians over the valid ones of {counted}; the spread is half the width of the central 68 %: how far a "
         note += "tone moves."
         note += " A standard error (±) is that of the mean frequency." if np.isfinite(track.error).any() else ""
         note += " Valid is a share of the rows where the tone is there." if partly else ""
-        return [Section(frame=pd.DataFrame(rows).dropna(axis=1, how="all"), formats=formats, notes=[note])]
+        return [Section.table(rows, columns, notes=[note])]
 
     def drawing(self) -> Drawing:
         """Return the figure of frequencies and amplitudes over time."""
@@ -96,6 +94,38 @@ class TrackResult(Result):
     def plot(self) -> Any:
         """Draw frequencies and amplitudes over time."""
         return self.drawing().figure()
+
+    def page_head(self) -> tuple[str, str]:
+        """Return the title of the page, and how many tones there are."""
+        track, signal = self.track, self.shown_signal
+        tones = count(track.omega.shape[1], "tone")
+        share = 100.0 * float(track.valid.sum() / max(track.there.sum(), 1))
+        valid = f", {number(share, 4)} % of whose rows are valid" if track.omega.shape[1] else ""
+        lines = f" {count(len(track.missing), 'line')} left over." if track.missing else ""
+        return f"Tones of {signal.file}", f"{tones}{valid} (method: {METHOD}).{lines}"
+
+    def chapters(self) -> Iterator[Chapter]:
+        """Return the signal, its tones, and what they leave."""
+        track, signal = self.track, self.shown_signal
+        bands = ", with bands of one standard error" if track.states_errors and track.omega.size else ""
+        caption = f"Frequencies and amplitudes over time{bands}; grey where no tone that is drawn is valid."
+        drawn = track_drawing(track, signal.start, signal.unit, "")
+        yield Chapter("Data", [Section(sentences=[signal_line(signal), *signal.notes, *self.chosen()])])
+        yield Chapter("Tones", [*self.tones(), Section(drawing=drawn, caption=caption)])
+        drawn = signal_drawing(signal, track)
+        yield Chapter("Signal", [Section(drawing=drawn, caption="The signal, and its spectrogram.")])
+        left = left_over(signal.samples, signal.interval, track)
+        yield Chapter("What the tones leave", [_left(track, signal, left)])
+
+    @property
+    def shown_signal(self) -> SampledSignal:
+        """The signal, without the folder that it is in."""
+        assert self.signal is not None
+        return replace(self.signal, file=shown(self.signal.file))
+
+    def cited(self) -> list[str]:
+        """Return the article whose method it is."""
+        return ["rife1976"]
 
     def chosen(self) -> list[str]:
         """Return what was chosen and why, and what a standard error must not exceed where one is known."""
@@ -161,6 +191,24 @@ class TrackResult(Result):
             "chosen": self.chosen(),
             "settings": track.settings,
         }
+
+
+def _left(track: Track, signal: SampledSignal, left: LeftOver | None) -> Section:
+    """What the tones leave of the signal."""
+    if left is None:
+        return Section(notes=["Nowhere are all tones known, so that nothing can be compared."])
+    unit = f" {signal.unit}" if signal.unit else ""
+    whole, rest = left.root_mean_squares
+    notes = [
+        f"The tones leave {number(left.percent_of_power, 3)} % of the power of the signal: {number(rest, 3)}{unit} of "
+        f"{number(whole, 3)}{unit} (root mean squares about the mean), compared over "
+        f"{number(left.percent_known, 3)} % of the record, where all tones are known.",
+        f"Spectra are medians over segments of {number(left.segment, 3)} s; a steady tone stands as high as its "
+        "amplitude. A line that is left beside a tone may be the tone itself, where it moves faster than its rows.",
+    ]
+    caption = "Amplitude spectra of the signal and of what the tones leave"
+    caption += "; triangles mark the lines that are missing." if track.missing else "."
+    return Section(notes=notes, drawing=spectra_drawing(left, track, signal.unit), caption=caption)
 
 
 def flag_names(flags: NDArray[np.uint16]) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from ctid_cli.signals.array_file import HDF5, MATLAB, read_array_table
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import ROLES, Role, Table, split_header
+from ctid_cli.signals.table import ROLES, Table
 from ctid_cli.signals.text_file import read_text_table
 
 Offset = Literal["none", "remove"]
@@ -43,10 +43,6 @@ class Measurement:
     def of(cls, record: Record) -> "Measurement":
         """A record of which nothing else is known."""
         return cls(record, None, None, None, "t", "u", "y")
-
-    def label(self, role: Role, unit: str) -> str:
-        """Name of a column, with a unit, whether or not its header has one too."""
-        return f"{split_header(str(getattr(self, role)))[0]} [{unit}]"
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:

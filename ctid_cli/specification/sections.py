@@ -27,6 +27,7 @@ from ctid_cli.specification.messages import Complaint, explained, option_docs, s
 from ctid_cli.specification.sweeps import MAX_COMBINATIONS, option_complaints
 from ctid_cli.specification.values import ByShape, Coefficients, Number, OneOf, Swept, Text, Whole
 from ctid_cli.specification.yaml_source import KEY
+from ctid_cli.text import closest
 
 
 class Section(BaseModel):
@@ -66,7 +67,12 @@ class Section(BaseModel):
         try:
             section = handler(value)
         except ValidationError as error:
-            problems += [explained(detail, cls.descriptions()) for detail in cls.details(error, value)]
+            details, known = cls.details(error, value), cls.descriptions()
+            # The key that a misspelt one was meant to be is not missing too.
+            unknown = [str(each["loc"][-1]) for each in details if each["type"] == "extra_forbidden"]
+            meant = {closest(name, known) for name in unknown}
+            told = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
+            problems += [explained(each, known) for each in told]
         else:
             problems = problems or option_complaints(section) or list(section.complaints())
             if not problems:

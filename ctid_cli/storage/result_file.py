@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 import ctid_cli
 from ctid_cli.canonical import content_hash
@@ -190,8 +191,8 @@ def decoded(content: Any, hint: Any, place: str = "result") -> Any:
         return _one_of(content, choices, place)
     if origin is Literal:
         return content if content in choices else _refuse_part(place)
-    if origin is np.ndarray:
-        return _array(content, np.dtype(get_args(choices[1])[0]), place)
+    if origin in (np.ndarray, NDArray):  # the latter from NumPy 2.5 on, without the type of the shape
+        return _array(content, np.dtype((get_args(choices[-1]) or choices)[-1]), place)
     if origin in (tuple, Sequence):
         return _sequence(content, choices, place)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):

@@ -46,6 +46,17 @@ class LeftOver(NamedTuple):
         signal, residual = (np.sqrt(np.mean(each[~self.unknown] ** 2)) for each in (self.signal, self.residual))
         return float(signal), float(residual)
 
+    @property
+    def percent_of_power(self) -> float:
+        """Share of the power of the signal that the tones leave [%]."""
+        signal, residual = self.root_mean_squares
+        return 100.0 * (residual / signal) ** 2 if signal else 0.0
+
+    @property
+    def percent_known(self) -> float:
+        """Share of the record where all tones are known [%]."""
+        return 100.0 * float(1.0 - self.unknown.mean())
+
 
 def without_spikes(samples: Array) -> Array:
     """Return the record with its spikes as missing samples."""

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from ctid_cli import Record, load_fit
 from ctid_cli.cli import _progress
-from ctid_cli.cli.fit_structure import delay_bounds
+from ctid_cli.cli.fit_structure import StructureOptions
 from ctid_cli.errors import UsageError
 from tests.cli.records import rows, write
 
@@ -72,7 +72,8 @@ def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
     values = rows()
     values[:, 2] += lfilter([0.1], [1.0, -0.8], np.random.default_rng(1).standard_normal(len(values)))
     file = write(tmp_path / "noisy.csv", values)
-    arguments = ("fit", file, "--poles", 2, "--delay", "0:3", "--noise", "arma:1,1", "--predict", 5, "--out", tmp_path)
+    noise = ("--noise", "arma:1,1", "--predict", 5, "--validate", file)
+    arguments = ("fit", file, "--poles", 2, "--delay", "0:3", *noise, "--out", tmp_path)
     text = " ".join(ctid(*arguments).stdout.split())
     for part in ("ARMA(1,1): v = C/D e", "fit 1 ahead", "fit 5 ahead", "Hausman's test", "innovations white (p ="):
         assert part in text
@@ -81,6 +82,8 @@ def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
     noise = content["noise_model"]
     assert noise["denominator"][1] == pytest.approx(-0.8, abs=4 * noise["covariance"][0][0] ** 0.5)
     assert noise["prediction_fits"]["1"] > noise["prediction_fits"]["5"] > content["fit_percent"]
+    # On the record of the fit itself the validation says the same.
+    assert content["validation"]["prediction_fits"] == pytest.approx(noise["prediction_fits"], rel=1e-6)
     again, record = load_fit(tmp_path / "fit.json"), Record.from_arrays(*values.T)
     assert again.fit.prediction_fit(5) == pytest.approx(noise["prediction_fits"]["5"], rel=1e-9)
     assert np.isfinite(again.predict(record, 5)).all()
@@ -137,6 +140,8 @@ def refused(ctid, tmp_path, *arguments):
         (("--poles", 2, "--noise", "auto", "--loss", "tukey"), ["--noise", "loss squares"]),
         (("--poles", 2, "--predict", 5), ["--predict", "add --noise auto"]),
         (("--poles", 2, "--noise", "auto", "--predict", 0), ["--predict", "at least 1"]),
+        (("--poles", 2, "--noise", "auto", "--predict", 500), ["--predict 500", "record.csv", "500 samples"]),
+        (("--loop", "missing.yaml", "--reference", "y"), ["missing.yaml", "does not exist"]),
         (("--model", "additive", "--terms", "2/0", "--noise", "auto"), ["--noise auto", "a sum of submodels"]),
     ],
 )
@@ -149,7 +154,7 @@ def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_pat
 @pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
 def test_a_range_of_delays_is_low_high_and_not_negative(text):
     with pytest.raises(UsageError, match="--delay must be LOW:HIGH"):
-        delay_bounds(text)
+        _ = StructureOptions(delay=text).bounds
 
 
 def test_a_long_fit_shows_its_time_on_a_terminal(monkeypatch):

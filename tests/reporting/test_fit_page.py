@@ -11,9 +11,8 @@ import pytest
 
 from ctid_cli import DelayProfile, HeldSignal, Record, TransferFunction, identify, simulate
 from ctid_cli.estimators.identification import costs_about_delay
-from ctid_cli.reporting.citations import bibtex
 from ctid_cli.reporting.fit_result import FitResult
-from ctid_cli.reporting.pages.fit_page import fit_page
+from ctid_cli.reporting.pages.page import bibtex
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.storage.fit_file import read_fit
@@ -47,7 +46,7 @@ def page_of(result, measured, other, folder):
     path.write_text(found.file_text(folder, command), encoding="utf-8")
     stored = read_fit(path)
     again = FitResult(stored.result, Records(measured, other))
-    return fit_page(found, stored.content), fit_page(again, stored.content)
+    return found.page(stored.content), again.page(stored.content)
 
 
 def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
@@ -84,7 +83,7 @@ def test_nothing_of_the_machine_is_on_the_page(fitted, tmp_path):
     (tmp_path / "near").mkdir()
     found = FitResult(replace(result, validation=None), Records(moved))
     (tmp_path / "near" / "fit.json").write_text(found.file_text(tmp_path / "near"), encoding="utf-8")
-    page = fit_page(found, read_fit(tmp_path / "near" / "fit.json").content)
+    page = found.page(read_fit(tmp_path / "near" / "fit.json").content)
     assert "r.csv, hold zoh" in page
     assert str(tmp_path) not in page
 
@@ -115,10 +114,10 @@ def test_a_known_delay_and_a_model_of_nothing_have_pages_too(tmp_path):
 
 
 def test_what_a_fit_used_is_cited(fitted):
-    entries = bibtex(fitted[0])
+    result = FitResult.of(fitted[0])
+    entries = bibtex(*result.cited())
     assert entries.count("{") == entries.count("}")
     keys = re.findall(r"^@\w+\{(\w+),$", entries, re.MULTILINE)
-    assert keys == ["ctid", "kaufman1975", "pintelon2012"]
-    kind, squares = SimpleNamespace(kind="additive_srivc"), SimpleNamespace(weighting=None)
-    additive = SimpleNamespace(options=kind, fit=squares, uncertainty=fitted[0].uncertainty)
-    assert "{Gonz{\\'a}lez, R. A. and" in bibtex(additive)
+    assert keys == ["kaufman1975", "pintelon2012"]
+    noisy = replace(result, fitted=replace(fitted[0], fit=replace(fitted[0].fit, noise=SimpleNamespace())))
+    assert bibtex(*noisy.cited()).count("hausman1978") == 1

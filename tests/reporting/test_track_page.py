@@ -8,7 +8,6 @@ import pytest
 
 from ctid_cli.canonical import plain
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.reporting.pages.track_page import track_page
 from ctid_cli.reporting.track_result import TrackResult
 from ctid_cli.signals.sampled_signal import SampledSignal
 from ctid_cli.tones.residual import left_over
@@ -42,7 +41,7 @@ def page_of(followed, name=HOSTILE):
     content = plain(TrackResult(replace(followed, reasons=(f"A reason, {name}.",)), signal(name)).content())
     source = SOURCE | {"columns": {"time": None, "signal": name}}
     content |= {"ctid": "1", "command": "ctid track /far/away.csv", "checksum": "x", "record": source}
-    return track_page(followed, signal(name), content)
+    return TrackResult(replace(followed, reasons=(f"A reason, {name}.",)), signal(name)).page(content)
 
 
 def test_a_page_says_all_and_needs_nothing_but_itself():

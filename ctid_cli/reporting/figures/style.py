@@ -135,6 +135,16 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
+def name_axes(axes: Any, x: str = "", y: str = "", legend: str = "") -> None:
+    """Name the axes of a panel in plain text, and place its legend."""
+    if x:
+        axes.set_xlabel(plain(x))
+    if y:
+        axes.set_ylabel(plain(y))
+    if legend:
+        axes.legend(loc=legend, fontsize=8)
+
+
 def look(k: int) -> dict[str, Any]:
     """The look of the k-th estimator."""
     return LOOKS[k % len(LOOKS)]

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import ctid_cli
-from ctid_cli.reporting.document import Section, aligned_lines, pairs
+from ctid_cli.reporting import markup
+from ctid_cli.reporting.document import Result, Section, aligned_lines, pairs
 from ctid_cli.reporting.figures.style import Drawing
 
 if TYPE_CHECKING:
@@ -19,8 +21,6 @@ if TYPE_CHECKING:
 
 #: Rows of a table that a page shows; the tables of ``ctid table`` have all of them.
 ROWS = 200
-#: A cell with more letters than these may be broken into lines.
-WORDS = 32
 #: A drawing as wide as a page of paper, 7.5 inch, has 52 rem on the screen.
 REM_PER_POINT = 52.0 / (7.5 * 72.0)
 
@@ -51,50 +51,22 @@ def _template() -> Template:
     environment = Environment(
         loader=folder, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["marked"] = _marked
     environment.globals |= {"row_limit": ROWS, "paragraphs": _paragraphs, "table": _table, "drawn": _drawn}
     return environment.get_template("page.html")
 
 
-def _marked(text: str) -> Markup:
-    """Escape a text, in which backquotes mark names and commands."""
-    from markupsafe import Markup, escape
-
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
-
-
 def _paragraphs(sentences: Sequence[str], style: str = "") -> Markup:
-    """Return paragraphs; a text with line ends is drawn already, one that begins with a hyphen is an item of a list."""
     from markupsafe import Markup
 
-    shown = []
-    for text in sentences:
-        if "\n" in text:
-            shown.append(Markup("<pre>{}</pre>").format(text))
-        elif text.startswith("- "):
-            shown.append(Markup("<ul><li>{}</li></ul>").format(_marked(text[2:])))
-        else:
-            shown.append(Markup('<p class="{}">{}</p>').format(style, _marked(text)))
-    return Markup("\n").join(shown)
+    return Markup(markup.paragraphs(sentences, style))
 
 
 def _table(section: Section) -> Markup:
-    """Return the first rows of a table; one without titles of its columns is a list of pairs."""
+    """Return the first rows of a table."""
     from markupsafe import Markup
 
-    (header, *rows), sides = aligned_lines(section)
-    titles = [Markup('<th scope="col" class="{}">{}</th>').format(*pair) for pair in zip(sides, header, strict=True)]
-    head = Markup("<thead><tr>{}</tr></thead>").format(Markup("").join(titles)) if any(header) else ""
-    body = []
-    for row in rows[:ROWS]:
-        looks = ["words" if side == "l" and len(text) > WORDS else side for side, text in zip(sides, row, strict=True)]
-        cells = [
-            Markup('<td class="{}" data-title="{}">{}</td>').format(look, name, _marked(text))
-            for look, name, text in zip(looks, header, row, strict=True)
-        ]
-        body.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-    kind = "" if any(header) else "pairs"
-    return Markup('<table class="{}">{}<tbody>{}</tbody></table>').format(kind, head, Markup("\n").join(body))
+    lines, sides = aligned_lines(section)
+    return Markup(markup.table(lines[: ROWS + 1], sides))
 
 
 def _drawn(drawing: Drawing | bytes, name: str) -> Markup:
@@ -127,15 +99,60 @@ def shown_command(command: str | None) -> str:
     return shlex.join(map(shown, shlex.split(command or "")))
 
 
-def provenance(origin: Iterable[Sequence[str]], command: str | None) -> list[Section]:
+class PagedResult(Result):
+    """A result of a record that has a page: what it is, whether to believe it, and how to get it again."""
+
+    #: What stands in the place of warnings.
+    fine: ClassVar[str]
+
+    @abstractmethod
+    def page_head(self) -> tuple[str, str]:
+        """Return the title of the page, and its first sentence."""
+
+    @abstractmethod
+    def chapters(self) -> Iterable[Chapter]:
+        """Return what the page shows."""
+
+    @abstractmethod
+    def cited(self) -> Sequence[str]:
+        """Return keys of ``citations.bib``."""
+
+    def page(self, stored: Mapping[str, Any]) -> str:
+        """Return the page as HTML, with what the file of the result says of its origin."""
+        warnings = [f"- {text}" for text in stored["warnings"]] or [self.fine]
+        words = ["ctid, and what this result used of others:", bibtex("ctid", *self.cited())]
+        chapters = [
+            Chapter("Before using it", [Section(sentences=warnings)]),
+            *self.chapters(),
+            Chapter("Provenance", _provenance(stored)),
+            Chapter("How to cite", [Section(sentences=words)]),
+        ]
+        return write_page(*self.page_head(), chapters)
+
+
+def bibtex(*keys: str) -> str:
+    """Return entries of ``citations.bib``."""
+    text = Path(__file__).parents[1].joinpath("citations.bib").read_text(encoding="utf-8")
+    found = {key: entry for entry, key in re.findall(r"(?ms)^(@\w+\{(\w+),.*?^\})", text)}
+    return "\n\n".join(found[key] for key in keys).replace("VERSION", ctid_cli.__version__)
+
+
+def _provenance(stored: Mapping[str, Any]) -> list[Section]:
     """Return what a result was made from, and the command that makes it again."""
-    again = ["The same again, in the folder that it was given in:", shown_command(command) + "\n"] if command else []
-    return [Section(frame=pairs(origin)), Section(sentences=again)]
-
-
-def citation(bibtex: str) -> list[Section]:
-    """Return what to cite."""
-    return [Section(sentences=["ctid, and what this result used of others:", bibtex])]
+    sources = [("record", each) for each in stored.get("records", [stored.get("record")])]
+    sources += [("validation record", stored["validation"])] if stored.get("validation") else []
+    rows = [("ctid", str(stored["ctid"]))]
+    for label, each in sources:
+        if each["path"] is None:
+            rows.append((label, "its samples are in the file"))
+            continue
+        how = [f"{key} {each[key]}" for key in ("hold", "interval", "from", "to") if each.get(key) is not None]
+        how += [f"{role} {name!r}" for role, name in each["columns"].items() if name is not None]
+        rows += [(label, ", ".join([shown(each["path"]), *how])), ("its SHA-256", each["sha256"])]
+    rows.append(("checksum of the file", str(stored.get("checksum", ""))))
+    command = shown_command(stored["command"]) + "\n"
+    again = ["The same again, in the folder that it was given in:", command] if stored["command"] else []
+    return [Section(frame=pairs(rows)), Section(sentences=again)]
 
 
 def sections_of(markdown: str) -> list[Section]:

@@ -1,0 +1,202 @@
+"""What the facts on a record mean: a sentence for each, with its level."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from ctid_cli.inference.record_facts import FEWEST_SAMPLES, HIGHEST_ORDER, LONG_INTERVAL, RecordFacts
+from ctid_cli.inference.record_tests import LEVEL, SlowTerm
+from ctid_cli.inference.response_estimates import Estimate
+from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
+from ctid_cli.text import count, listed
+
+Level = Literal["ok", "note", "warning", "problem"]
+#: From the best to the worst.
+LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
+#: An irregular clock is regular but for jitter where the standard deviation of its intervals is below this fraction.
+JITTER = 0.05
+#: Below this order of excitation no model with a delay can be told from one without.
+ENOUGH_ORDER = 4
+#: A mean below this fraction of the standard deviation is what rounding leaves where a mean was subtracted.
+ROUNDING = 1e-9
+
+
+class Finding(NamedTuple):
+    """One fact on a record."""
+
+    level: Level
+    topic: str
+    sentence: str
+
+
+def findings(facts: RecordFacts, time: str, input: str, output: str) -> list[Finding]:
+    """Return the facts on a record in sentences, with the units of its signals, the worst first."""
+    return sorted(_Sentences(facts, time, input, output), key=lambda finding: -LEVELS.index(finding.level))
+
+
+def _digits(x: float, digits: int) -> str:
+    """Rounded, without an exponent that is not needed."""
+    return f"{float(f'{x:.{digits}g}'):.12g}"
+
+
+def _probability(p: float) -> str:
+    return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
+
+
+@dataclass(frozen=True)
+class _Sentences:
+    """The facts on a record in sentences, in the order of signals and time."""
+
+    facts: RecordFacts
+    time: str
+    input: str
+    output: str
+
+    def t(self, x: float) -> str:
+        return f"{_digits(x, 4)} {self.time}"
+
+    def u(self, x: float) -> str:
+        return f"{_digits(x, 4)} {self.input}".rstrip()
+
+    def y(self, x: float) -> str:
+        return f"{_digits(x, 3)} {self.output}".rstrip()
+
+    def __iter__(self) -> Iterator[Finding]:
+        yield from self._clock()
+        yield self._input()
+        yield from self._output()
+        if self.facts.input_kind != "constant" and self.facts.output_deviation > 0:
+            yield self._response()
+        yield from self._tests()
+
+    def _clock(self) -> Iterator[Finding]:
+        f = self.facts
+        present = f.n_samples - f.n_masked
+        if present < FEWEST_SAMPLES:
+            text = f"Only {present} output samples: offset, drift, start, outliers, feedback and noise are not tested."
+            yield Finding("warning", "samples", text)
+        spread = f"{self.t(f.interval_min)} to {self.t(f.interval_max)}, median {self.t(f.interval)}"
+        if f.regular:
+            yield Finding("ok", "sampling", f"The clock is regular, one sample every {self.t(f.interval)}.")
+        elif f.gaps and f.interval_deviation < 1e-6 * f.interval:
+            yield Finding(
+                "ok", "sampling", f"The clock is regular but for gaps, one sample every {self.t(f.interval)}."
+            )
+        elif f.interval_deviation < JITTER * f.interval:
+            share = f"{100 * f.interval_deviation / f.interval:.2g} %"
+            yield Finding("note", "sampling", f"The clock jitters: intervals of {spread}, standard deviation {share}.")
+        elif math.isfinite(f.interval):
+            yield Finding("note", "sampling", f"The clock is irregular: intervals of {spread}.")
+        if f.gaps:
+            longest = max(f.gaps, key=lambda gap: gap.length)
+            many = f"{len(f.gaps)} gaps" if len(f.gaps) > 1 else "A gap"
+            where = f"the longest of {self.t(longest.length)} after t = {self.t(longest.start)}"
+            yield Finding("warning", "gaps", f"{many} longer than {LONG_INTERVAL:g} median intervals, {where}.")
+        if f.n_masked:
+            share, verb = f"{100 * f.n_masked / f.n_samples:.2g} %", "is" if f.n_masked == 1 else "are"
+            text = f"{f.n_masked} of {f.n_samples} output samples ({share}) {verb} missing."
+            yield Finding("note", "missing", text)
+
+    def _input(self) -> Finding:
+        f = self.facts
+        if f.input_kind == "constant":
+            text = f"The input is constant at {self.u(f.input_low)}: it shows no response"
+            remedy = "where it was at another level before the record, type that level (ctid fit --input-before VALUE)"
+            return Finding("problem", "input", f"{text}; {remedy}.")
+        if f.input_kind == "steps":
+            times = "once" if f.input_changes == 1 else f"{f.input_changes} times"
+            return Finding("note", "input", f"The input changes only {times}, {self._levels()}.")
+        least = "at least " if f.excitation_order >= HIGHEST_ORDER else ""
+        text = f"It is persistently exciting of order {least}{f.excitation_order}"
+        band = f"{_digits(f.input_band[0], 2)} to {_digits(f.input_band[1], 3)} rad/{self.time}"
+        moves = f"The input moves continuously between {self.u(f.input_low)} and {self.u(f.input_high)}."
+        if f.input_kind == "levels":
+            times = f"{f.input_changes} times {self._levels()}"
+            moves = f"The input switches {times} and holds for {self.t(f.shortest_hold)} or longer."
+        period = f" It repeats itself every {self.t(f.input_period)}." if math.isfinite(f.input_period) else ""
+        level: Level = "warning" if f.excitation_order < ENOUGH_ORDER else "ok"
+        return Finding(level, "input", f"{moves} {text}; 95 % of its power lies from {band}.{period}")
+
+    def _levels(self) -> str:
+        f = self.facts
+        if 0 < len(f.input_levels) <= 4:
+            return f"between {listed(f'{level:.4g}' for level in f.input_levels)} {self.input}".rstrip()
+        return f"between many levels from {self.u(f.input_low)} to {self.u(f.input_high)}"
+
+    def _output(self) -> Iterator[Finding]:
+        f = self.facts
+        if not f.output_deviation > ROUNDING * abs(f.output_mean):
+            yield Finding(
+                "problem", "output", f"The output is constant at {self.y(f.output_mean)}: it does not respond."
+            )
+        if f.saturated:
+            text = f"{100 * f.saturated:.2g} % of the output samples sit exactly at the least or greatest value"
+            yield Finding("warning", "saturation", f"{text}, as at a limit.")
+        if math.isfinite(f.output_quantum):
+            share = f.output_quantum / f.output_deviation
+            text = f"The output was recorded in steps of {self.y(f.output_quantum)}"
+            level: Level = "warning" if share > 0.1 else "note"
+            yield Finding(level, "resolution", f"{text}, {100 * share:.2g} % of its standard deviation.")
+        if f.beside.outliers:
+            where = ", ".join(self.t(t) for t in f.beside.outliers[:3]) + (
+                ", ..." if len(f.beside.outliers) > 3 else ""
+            )
+            lies = count(len(f.beside.outliers), "output sample") + (" lies" if len(f.beside.outliers) == 1 else " lie")
+            yield Finding("warning", "outliers", f"{lies} farther from the others than noise explains (t = {where}).")
+
+    def _response(self) -> Finding:
+        f = self.facts
+        p = _probability(f.answer_p_value)
+        if f.answer_p_value > NO_RESPONSE:
+            text = (
+                f"No response of the output to the input is seen: noise of its colour follows the input as much ({p})."
+            )
+            few = f.n_samples - f.n_masked < FEWEST_SAMPLES
+            return Finding("warning" if few else "problem", "response", text)
+        ratio, time, delay = f.beside.signal_to_noise, f.beside.response_time, f.beside.delay
+        parts = [f"The output responds to the input ({p})"]
+        if not math.isnan(ratio.value):
+            parts.append(f"signal-to-noise ratio {self._interval(ratio, 'dB')}")
+        if not math.isnan(delay.value):
+            parts.append(
+                f"the response begins {_digits(delay.low, 3)} to {self.t(delay.high)} after a change of the input"
+            )
+        ended = "its end is not seen" if not math.isnan(ratio.value) else ""
+        if not math.isnan(time.value):
+            ended = f"63 % of it are reached after {self._interval(time, self.time)}"
+        return Finding("ok", "response", "; ".join(filter(None, [*parts, ended])) + ".")
+
+    def _interval(self, estimate: Estimate | SlowTerm, unit: str) -> str:
+        ends = f"{_digits(estimate.low, 3)} to {_digits(estimate.high, 3)}"
+        return f"{_digits(estimate.value, 3)} {unit}".rstrip() + f" ({ends})"
+
+    def _tests(self) -> Iterator[Finding]:
+        """What stands beside the response, and what of it is not detected."""
+        beside = self.facts.beside
+        if beside.offset is None or beside.drift is None or beside.start is None:
+            return
+        rest = f"an input of {self.u(beside.input_at_rest)}"
+        named = [
+            ("offset", beside.offset, f"At {rest} the output rests at"),
+            ("drift", beside.drift, "Beside the response the output drifts over the record by"),
+            ("start", beside.start, "The record does not begin at rest: at first the output is off by"),
+        ]
+        missed = []
+        for topic, term, words in named:
+            size = self._interval(term, self.output)
+            if term.detected:
+                yield Finding("warning", topic, f"{words} {size}, {_probability(term.p_value)}.")
+            else:
+                missed.append(f"{topic} {size}")
+        p = _probability(beside.feedback_p_value)
+        if beside.feedback_p_value <= LEVEL:
+            yield Finding("warning", "feedback", f"The input goes with the noise of the output, as in a loop ({p}).")
+        else:
+            missed.append(f"feedback ({p})")
+        missed += ["outliers"] * (not beside.outliers) + ["saturation"] * (not self.facts.saturated)
+        if missed:
+            text = "; ".join(missed)
+            yield Finding("ok", "not detected", f"{text}. This rules nothing out: the intervals hold 95 %.")
