@@ -98,7 +98,7 @@ class FrequencyFitResult(FitResult):
             return "There are no standard errors."
         if law.kind == "robust":
             why = "the lines share samples" if fit.data.correlated else "the residuals of neighbouring lines are"
-            text = f"Standard errors are those for correlated errors of neighbouring lines, as {why}"
+            text = f"Standard errors are rough, those for correlated errors of neighbouring lines, as {why}"
         elif fit.errors_known:
             text = "Standard errors are from those of the data, which the residuals agree with"
         else:
