@@ -37,10 +37,11 @@ class MeasuredLines(MeasuredRecords):
     def check(self) -> None:
         """Refuse data from which the structure cannot be estimated."""
         what, size = f"{self.source.name}: " if self.source.name else "", self.structure.size
-        if self.lines.count <= size:
+        count = min(self.lines.count, 2 * np.unique(self.lines.frequencies).size)
+        if count <= size:
             raise DataError(
-                f"{what}{self.lines.count} real equations are too few for {size} parameters; give more frequencies, or "
-                "fit a smaller model"
+                f"{what}{count} real equations are too few for {size} parameters; give more frequencies, or fit a "
+                "smaller model"
             )
         if self.treatment.integrators and self.lines.frequencies[0] == 0.0:
             raise DataError(

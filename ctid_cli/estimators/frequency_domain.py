@@ -24,6 +24,8 @@ from ctid_cli.signals.frequency_data import FrequencyData
 
 #: Residuals that exceed the given standard errors by chance less often than this count as larger.
 MISFIT = 0.01
+#: Share of the weighted values' squares below which residuals are rounding.
+ROUNDING = 1e-14
 #: Options of a record in time.
 OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model")
 
@@ -91,8 +93,8 @@ class FrequencyDomainFit(MeasuredFit):
 
     @property
     def white(self) -> bool:
-        """Whether residuals over frequency pass as uncorrelated."""
-        return all_white(np.split(self.residuals[0], [self.data.frequencies.size]))
+        """Whether residuals over frequency pass as uncorrelated; of exact values they are rounding."""
+        return self.r2 > 1.0 - ROUNDING or all_white(np.split(self.residuals[0], [self.data.frequencies.size]))
 
     @property
     def errors_known(self) -> bool:

@@ -71,7 +71,8 @@ class FrequencyLines:
     @property
     def length(self) -> float:
         """Length of a record that resolves as much [s]."""
-        return 2.0 * np.pi / float(min(self.lowest, np.diff(self.frequencies).min()))
+        gaps = np.diff(np.unique(self.frequencies))
+        return 2.0 * np.pi / min(self.lowest, float(np.median(gaps)) if gaps.size else self.lowest)
 
     @property
     def shift(self) -> ComplexArray:

@@ -125,6 +125,16 @@ def test_lines_with_common_errors_have_the_standard_errors_of_correlated_noise()
     assert fit.standard_errors["b1"] > 1.5 * np.sqrt(fit.uncertainty("white").covariance[3, 3])
 
 
+def test_a_line_that_was_measured_twice_counts_twice():
+    data = noisy(SECOND, 7)
+    errors = data.standard_error / np.sqrt(2.0)
+    twice = [np.tile(values, 2) for values in (LINES, data.response, data.standard_error)]
+    fits = [
+        FrequencyDomain(2, 1).fit(each) for each in (FrequencyData(*twice), FrequencyData(LINES, data.response, errors))
+    ]
+    np.testing.assert_allclose(fits[0].theta, fits[1].theta, rtol=1e-8)
+
+
 @pytest.mark.parametrize("weight", ["inverse", "inverse-sqrt", "none"])
 def test_weights_do_not_matter_to_values_without_errors(weight):
     data = FrequencyData(LINES, 1e-3 * SECOND.frequency_response(LINES), weight=weight)
@@ -170,6 +180,8 @@ def test_what_a_frequency_response_cannot_have():
         FrequencyDomain(1, 0, integrators=1).fit(data)
     with pytest.raises(DataError, match="too few"):
         FrequencyDomain(4, 3).fit(FrequencyData(LINES[:3], SECOND.frequency_response(LINES[:3])))
+    with pytest.raises(DataError, match="too few"):
+        FrequencyDomain(1, 1).fit(FrequencyData(np.ones(9), SECOND.frequency_response(np.ones(9))))
     t = 0.1 * np.arange(100)
     with pytest.raises(DataError, match="takes a frequency response"):
         FrequencyDomain(1, 0).fit(Record.from_arrays(t, np.sin(t), np.sin(t)))
