@@ -12,6 +12,7 @@ import time
 import numpy as np
 
 from ctid_cli import FrequencyData, FrequencyDomain, TransferFunction
+from ctid_cli.estimators.frequency_domain import fit_of
 
 #: Model, degrees, integrators and sampling interval; 0 is G(jw).
 SYSTEMS = {
@@ -60,7 +61,7 @@ def main() -> None:
             values = exact.response + errors * (parts[0] + 1j * parts[1])
             prepared = options.prepare(FrequencyData(exact.frequencies, values, known, interval))
             measured = prepared.laid_out
-            fit = options.fit_of(measured, measured.local((model.denominator[: poles + 1], model.delay)))
+            fit = fit_of(measured, measured.local((model.denominator[: poles + 1], model.delay)))
             if k < given.searched:
                 searched += 1
                 agree += abs(prepared.fit().cost / fit.cost - 1.0) < 1e-6

@@ -13,7 +13,7 @@ from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwritin
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
-from ctid_cli.cli.frequency_fit import frequency_files, frequency_fit
+from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 
@@ -94,7 +94,7 @@ def fit(
     writing: WritingOptions,
     judging: JudgingOptions,
 ) -> None:
-    """Fit a transfer function with a delay to measured records, or to a frequency response.
+    """Fit a transfer function to records or a frequency response.
 
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
     fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and

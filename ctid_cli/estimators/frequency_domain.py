@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -192,8 +192,6 @@ class FrequencyDomain(DelayProfile):
     {'a1': 1.0, 'b0': 2.0, 'delay': 0.3}
     """
 
-    kind: ClassVar[str] = "frequency_domain"
-
     delay_bounds: tuple[float, float] = (0.0, 0.0)
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
@@ -217,11 +215,11 @@ class FrequencyDomain(DelayProfile):
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         if not isinstance(measured, MeasuredLines):
             raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
-        return self.fit_of(measured, measured.best([], True))
+        return fit_of(measured, measured.best([], True))
 
-    @staticmethod
-    def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
-        """Return the fit that an optimum is, with its standard errors."""
-        found = fitted(measured, optimum, None, None)
-        values = {each.name: getattr(found, each.name) for each in fields(found)}
-        return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)
+
+def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
+    """Return the fit that an optimum is, with its standard errors."""
+    found = fitted(measured, optimum, None, None)
+    values = {each.name: getattr(found, each.name) for each in fields(found)}
+    return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)

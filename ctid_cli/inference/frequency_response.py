@@ -20,7 +20,7 @@ from ctid_cli.inference.spectral_methods import (
     welch,
 )
 from ctid_cli.signals.checks import require_choice, require_integer
-from ctid_cli.signals.frequency_data import FrequencyData
+from ctid_cli.signals.frequency_data import FrequencyData, held_data
 from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import ResponseMethod
@@ -101,7 +101,7 @@ class FrequencyResponse:
         values = self.frequencies, self.response, self.standard_error
         others: Any = {"correlated": self.method != "periodic", "freedom": float(np.median(self.freedom))}
         if self.interval:
-            return FrequencyData.of_held(*values, self.interval, **others)
+            return held_data(*values, self.interval, **others)
         return FrequencyData(*values, **others)
 
     @property

@@ -134,13 +134,13 @@ class FrequencyData:
     def _what(self) -> str:
         return f"{self.name}: " if self.name else ""
 
-    @classmethod
-    def of_held(
-        cls, frequencies: Array, response: ComplexArray, standard_error: Array, interval: float, **others: Any
-    ) -> FrequencyData:
-        """Return the values of samples from those that the response of a zero-order hold was divided out of."""
-        factor = hold_factor("zoh", frequencies, interval)
-        return cls(frequencies, response * factor, standard_error * np.abs(factor), interval, **others)
+
+def held_data(
+    frequencies: Array, response: ComplexArray, standard_error: Array, interval: float, **others: Any
+) -> FrequencyData:
+    """Return the values of samples from those that the response of a zero-order hold was divided out of."""
+    factor = hold_factor("zoh", frequencies, interval)
+    return FrequencyData(frequencies, response * factor, standard_error * np.abs(factor), interval, **others)
 
 
 # --- reading -------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def read_frequency_data(
     others["freedom"] = float(np.median(values.get("freedom", np.full(1, np.inf))))
     held = values.get("hold_interval", np.full(1, np.nan))
     if interval is None and errors is not None and np.isfinite(held).all():
-        return FrequencyData.of_held(w[used], response[used], errors[used], float(held[0]), **others)
+        return held_data(w[used], response[used], errors[used], float(held[0]), **others)
     return FrequencyData(w[used], response[used], None if errors is None else errors[used], interval or 0.0, **others)
 
 

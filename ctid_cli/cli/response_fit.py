@@ -34,7 +34,7 @@ def frequency_fit(
 ) -> FrequencyFitResult:
     """Fit a model to the one frequency response that is given; a UsageError where options do not go with one."""
     from ctid_cli.estimators.frequency_domain import FrequencyDomain
-    from ctid_cli.identification.frequency_domain import identify_frequency_response
+    from ctid_cli.identification.identify_response import identify_frequency_response
     from ctid_cli.reporting.frequency_fit import FrequencyFitResult
     from ctid_cli.signals.frequency_data import read_frequency_data
 
