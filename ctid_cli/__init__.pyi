@@ -8,6 +8,7 @@ __version__: str
 from .signals.held import HeldSignal as HeldSignal
 from .signals.record import Loop as Loop, Record as Record
 from .signals.measurement import read_record as read_record
+from .signals.frequency_data import FrequencyData as FrequencyData, read_frequency_data as read_frequency_data
 from .signals.excitation import Gaussian as Gaussian, Prbs as Prbs, Step as Step
 from .signals.multisine import Multisine as Multisine
 from .signals.sampling import RegularSampling as RegularSampling, UniformIntervals as UniformIntervals
@@ -35,12 +36,14 @@ from .estimators.delay_profile import DelayProfile as DelayProfile
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.loop_output_error import LoopOutputError as LoopOutputError
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
+from .estimators.frequency_domain import FrequencyDomain as FrequencyDomain
 from .estimation.common import Fixed as Fixed
 from .estimators.identification import Identification as Identification
 from .identification.choice import Choice as Choice, Given as Given
 from .identification.choose import choose as choose
 from .identification.criterion import Candidate as Candidate
 from .identification.identify import identify as identify
+from .identification.identify_response import identify_frequency_response as identify_frequency_response
 
 # Results
 from .inference.fit import Fit as Fit, Status as Status
@@ -51,6 +54,7 @@ from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit
 from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
+from .estimators.frequency_domain import FrequencyDomainFit as FrequencyDomainFit
 from .estimators.useful_redundancy import RedundantFit as RedundantFit
 from .inference.criteria import fit_percent as fit_percent
 from .inference.frequency_response import FrequencyResponse as FrequencyResponse

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +14,7 @@ from ctid_cli.cli._common import emit, given_command, guarded, refuse_overwritin
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
 from ctid_cli.cli.fit_structure import Asked, FitOptions, LoopOptions, ModelOptions, as_usage_errors, options_of
+from ctid_cli.cli.response_fit import frequency_files, frequency_fit
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 
@@ -93,29 +94,40 @@ def fit(
     writing: WritingOptions,
     judging: JudgingOptions,
 ) -> None:
-    """Fit a transfer function with a delay to measured records.
+    """Fit a transfer function to records or a frequency response.
 
     Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
     fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and
-    offset are chosen by one criterion where they are not given.
+    offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
+    writes, needs --poles.
     """
-    from ctid_cli.identification.identify import identify
-    from ctid_cli.reporting.fit_result import FitResult
-
-    judging.check(treatment.noise, {})
-    loop.check()
     asked = Asked(model, treatment, loop.use)
-    options = options_of(asked)
-    if asked.single and len(files) > 1:
-        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
-    hold = "zoh" if treatment.hold == "auto" else treatment.hold
-    records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
-    judging.check(treatment.noise, {record.name: record.n_samples for record in records.all})
-    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
-        draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
-        found = identify(records.data, options, records.validation_record, **draws)
-    result = FitResult(found, records.of_fit(found), judging.predict)
+    if frequency_files(files):
+        result: FitResult = frequency_fit(files, asked, loop, columns, asdict(judging))
+    else:
+        result = _fit_of_records(files, asked, loop, columns, judging)
     contents = writing.contents(result, given_command(context))
     refuse_overwriting([*files, *([judging.validate] if judging.validate else [])], contents)
     write_files(contents)
     emit(result, form.form, list(contents), stored=next(iter(contents.values())).decode())
+
+
+def _fit_of_records(
+    files: list[Path], asked: Asked, loop: LoopOptions, columns: RecordOptions, judging: JudgingOptions
+) -> FitResult:
+    """Fit a model to records in time, with a bar of progress where it takes long."""
+    from ctid_cli.identification.identify import identify
+    from ctid_cli.reporting.fit_result import FitResult
+
+    judging.check(asked.treatment.noise, {})
+    loop.check()
+    options = options_of(asked)
+    if asked.single and len(files) > 1:
+        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+    hold = "zoh" if asked.treatment.hold == "auto" else asked.treatment.hold
+    records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
+    judging.check(asked.treatment.noise, {record.name: record.n_samples for record in records.all})
+    with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:
+        draws = judging.draws | {"progress": progress, "time_unit": records.units.time}
+        found = identify(records.data, options, records.validation_record, **draws)
+    return FitResult(found, records.of_fit(found), judging.predict)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from ctid_cli.cli._common import span
 from ctid_cli.cli._options import flag
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset, Weight
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
@@ -184,6 +184,9 @@ class FitOptions(TreatmentOptions):
     loss: Annotated[LossKind, flag("--loss", "Loss function of the output errors.")] = "squares"
     noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
     hold: HoldOption = "auto"
+    weight: Annotated[Weight | None, flag("--weight", "Weights of a frequency response without standard errors.")] = (
+        None
+    )
 
 
 # --- the estimator ---------------------------------------------------------------------------------
@@ -229,6 +232,8 @@ def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 
     model, treatment = asked.model, asked.treatment
+    if treatment.weight is not None:
+        raise UsageError("--weight is for a frequency response; the samples of a record weigh the same, drop --weight")
     _refuse_other_form(asked)
     for wrong, option, remedy in _unavailable(asked) if asked.single else ():
         if wrong:

@@ -149,6 +149,8 @@ def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str
         raise UsageError(f"{path} is neither a fit nor a track: {pages}")
     if FIT.kind_in(str(path)) != TRACK.kind:
         fit = read_fit(path, records or None, validate)
+        if not fit.sources:
+            return str(fit.result._result().page(fit.content))
         return FitResult(fit.result, Records(fit.measurements, fit.validation)).page(fit.content)
     if validate:
         raise UsageError(f"{path} is a track, which has no validation record; leave --validate out")

@@ -27,6 +27,7 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
+from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
@@ -283,6 +284,16 @@ class MeasuredRecords:
             return self.data[0]
         return self._lay_out(without_means(self.records[0])[0])
 
+    @property
+    def spread(self) -> float:
+        """Sum of the squares of the outputs about the mean of each record."""
+        return float(sum(np.sum((y - y.mean()) ** 2) for y in self.outputs))
+
+    @property
+    def regular(self) -> bool:
+        """Whether lags counted in samples are lags in time, up to jitter."""
+        return all(nearly_regular(data.t) for data in self.data)
+
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""
         return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
@@ -292,7 +303,7 @@ class MeasuredRecords:
     def with_outputs(self, outputs: Sequence[Array]) -> "MeasuredRecords":
         """The same with other outputs at the used samples of each record."""
         records = []
-        for data, values in zip(self.problem.records, outputs, strict=True):
+        for data, values in zip(self.problem.sampled, outputs, strict=True):
             y = data.y.copy()
             y[data.use] = values
             records.append(data._replace(y=y))

@@ -18,7 +18,6 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
 from ctid_cli.filtering.bank import Equations
-from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
@@ -443,8 +442,7 @@ def fitted(
     gradient = np.sum([psi.T @ eps for psi, eps in each], axis=0)
     equations = Equations(hessian, gradient, hessian, sum(float(eps @ eps) for eps in residuals), 0.0)
     count = sum(eps.size for eps in residuals)
-    outputs = np.concatenate([y - y.mean() for y in measured.outputs])
-    values = quality(equations, float(outputs @ outputs), count)
+    values = quality(equations, measured.spread, count)
     if robust is not None:
         values["cost"] = robust.cost(robust.losses) / count
     states, offsets = measured.own(layout, theta)
@@ -470,7 +468,7 @@ def fitted(
         held_poles=tuple(found.held_poles.tolist()),
         tangent=_tangent(layout, found, given),
         known=tuple(np.array(layout.names)[given].tolist()),
-        regular=all(nearly_regular(data.t) for data in measured.problem.records),
+        regular=measured.regular,
         **values,
     )
 

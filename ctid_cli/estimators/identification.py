@@ -12,6 +12,7 @@ from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.estimators.loop_output_error import LoopFit
 from ctid_cli.estimators.measured_submodels import LaidOut, Options, SubmodelsFit
 from ctid_cli.inference import criteria as criteria_of
@@ -68,9 +69,9 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     Parameters
     ----------
-    options : DelayProfile, MeasuredSubmodels or LoopOutputError
+    options : DelayProfile, MeasuredSubmodels, LoopOutputError or FrequencyDomain
         What was asked for.
-    fit : MeasuredFit, SubmodelsFit or LoopFit
+    fit : MeasuredFit, SubmodelsFit, LoopFit or FrequencyDomainFit
         The estimate.
     answer : AnswerTest
         Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
@@ -99,7 +100,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
-    fit: MeasuredFit | SubmodelsFit | LoopFit
+    fit: MeasuredFit | SubmodelsFit | LoopFit | FrequencyDomainFit
     answer: AnswerTest
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -228,18 +229,8 @@ def identify(
     if fit.noise is not None:
         squared_error, size = fit.count * np.exp(fit.noise.deviance / fit.count), size + sum(fit.noise.orders)
     tests = tests_of(options, linear, records)
-    # What the data determine can be told even where no standard error can be given.
-    biased = uncertainty.kind == "biased"
-    known = fit.uncertainty("white") if biased else uncertainty
-    matrix = known.covariance
-    free, hessian = free_directions(linear)
-    singular = not condition_number(hessian) <= NEARLY_SINGULAR
-    unclear = {fit.parameter_names[k] for k in (free if singular else _undetermined(fit, matrix))}
-    if not answer.seen:
-        unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
-    interval = None
-    if isinstance(laid_out, MeasuredRecords) and "delay" in fit.parameter_names and "delay" not in unclear:
-        interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
+    told = parameters_told(fit, uncertainty, answer.seen, laid_out)
+    free, matrix = free_directions(linear)[0], _of_data(fit, uncertainty).covariance
     judged = None
     if checked is not None and validation is not None:
         judged = validated(options._applied(fit, checked), validation)
@@ -247,9 +238,7 @@ def identify(
         options=replace(options, covariance=covariance, bootstrap_draws=bootstrap_draws),
         fit=fit,
         answer=answer,
-        estimates=_estimates(fit, uncertainty, unclear, interval),
-        delay_interval=interval,
-        derived=_derived(fit, uncertainty, answer.seen and not singular),
+        **told._asdict(),
         tests=tests,
         criteria=criteria_of.information_criteria(squared_error, fit.count, size),
         yic=criteria_of.young_information_criterion(residuals, output, fit.theta[free], matrix[np.ix_(free, free)]),
@@ -258,6 +247,38 @@ def identify(
         validation=judged,
         records=tuple(records),
     )
+
+
+class Told(NamedTuple):
+    """What is told of parameters."""
+
+    estimates: tuple[UncertainValue, ...]
+    delay_interval: DelayInterval | None
+    derived: tuple[UncertainValue, ...]
+
+
+def parameters_told(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid_out: Any) -> Told:
+    """Return parameters and derived quantities with their uncertainty, where a response is seen and they have one."""
+    biased, linear = uncertainty.kind == "biased", fit.linear
+    free, hessian = free_directions(linear)
+    singular = not condition_number(hessian) <= NEARLY_SINGULAR
+    unclear = {
+        fit.parameter_names[k]
+        for k in (free if singular else _undetermined(fit, _of_data(fit, uncertainty).covariance))
+    }
+    if not seen:
+        unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
+    interval = None
+    if isinstance(laid_out, MeasuredRecords) and "delay" in fit.parameter_names and "delay" not in unclear:
+        interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
+    return Told(
+        _estimates(fit, uncertainty, unclear, interval), interval, _derived(fit, uncertainty, seen and not singular)
+    )
+
+
+def _of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertainty:
+    """What the data determine, which can be told even where no standard error can be given."""
+    return fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
 
 
 # --- residuals and uncertainty ----------------------------------------------------------------------

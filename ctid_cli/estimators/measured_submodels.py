@@ -15,6 +15,7 @@ from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
+from ctid_cli.estimators.frequency_domain import FrequencyDomain
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
 from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.estimators.two_stage import without_feedback
@@ -319,5 +320,5 @@ def _padded(b: Array, size: int) -> Array:
 
 
 #: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | Rivc | MeasuredSubmodels | LoopOutputError
+Options = DelayProfile | Rivc | MeasuredSubmodels | LoopOutputError | FrequencyDomain
 LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop

@@ -46,6 +46,11 @@ class FilterData(NamedTuple):
         return int(self.use.sum())
 
     @property
+    def length(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    @property
     def y_used(self) -> Array:
         """Outputs that enter sums, shape (count,)."""
         return self.y[self.use]

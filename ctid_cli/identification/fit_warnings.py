@@ -13,6 +13,7 @@ from ctid_cli.inference.covariance import condition_number, describe_conditionin
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
 from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
+from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed
 
@@ -79,7 +80,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         others += [
             *_of_noise(fit),
             *_of_fit(fit, tried),
-            *_of_search(fit, time_unit),
+            *of_search(fit, time_unit),
             *_of_uncertainty(found, time_unit),
         ]
     failed = list(_of_validation(found))
@@ -208,7 +209,7 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
         yield f"{what} {found}: the model of the plant or of the noise is too small"
 
 
-def _of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
+def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
     """How the search ended, where it did not end well."""
     if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not fit.held_poles:
         yield fit.status.value.removesuffix(".")
@@ -225,12 +226,8 @@ def _of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
         yield f"{lost} to infinity: more than {fit.model.order} lower the cost no further"
 
 
-def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
-    """What the record does not determine, and intervals that cannot be trusted."""
-    if slow := _slow_pole(found, time_unit):
-        yield slow
-    fit, uncertainty = found.fit, found.uncertainty
-    known = fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
+def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:
+    """What the data do not determine."""
     _, hessian = free_directions(fit.linear)
     names: list[str] = []
     values: list[float] = []
@@ -242,6 +239,14 @@ def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
         values.append(np.inf if any_value else fit.theta[place])
     told = describe_conditioning(known.free_covariance, np.array(values), names, condition_number(hessian), hessian)
     yield from (each.removesuffix(".") for each in told)
+
+
+def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
+    """What the record does not determine, and intervals that cannot be trusted."""
+    if slow := _slow_pole(found, time_unit):
+        yield slow
+    fit, uncertainty = found.fit, found.uncertainty
+    yield from of_conditioning(fit, fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty)
     if uncertainty.short:
         worth = f"its {fit.count} samples are worth {uncertainty.effective_count:.2g} independent ones"
         size = len(uncertainty.free_covariance)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -15,13 +15,13 @@ from ctid_cli.inference.spectral_methods import (
     ResponseLines,
     find_period,
     from_periods,
-    hold_factor,
     images,
     local_polynomial,
     welch,
 )
 from ctid_cli.signals.checks import require_choice, require_integer
-from ctid_cli.signals.held import REGULARITY, Hold
+from ctid_cli.signals.frequency_data import FrequencyData, held_data
+from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import ResponseMethod
 
@@ -73,6 +73,9 @@ class FrequencyResponse:
         What was chosen, and what to know before believing the numbers; where there is no interval, why.
     told : ndarray of bool, shape (K,)
         Whether an interval is given.
+    interval : float, default 0.0
+        Sampling interval of the values of samples that the response of a zero-order hold was divided out of [s]; 0
+        where none was.
     """
 
     frequencies: Array
@@ -86,10 +89,20 @@ class FrequencyResponse:
     hold: Hold
     notes: tuple[str, ...]
     told: BoolArray
+    interval: float = 0.0
 
     def __repr__(self) -> str:
         low, high = self.frequencies[[0, -1]]
         return f"FrequencyResponse({self.frequencies.size} frequencies from {low:g} to {high:g} rad/s, {self.method})"
+
+    @property
+    def data(self) -> FrequencyData:
+        """The response as data for a model: of a clock with a zero-order hold the values of samples."""
+        values = self.frequencies, self.response, self.standard_error
+        others: Any = {"correlated": self.method != "periodic", "freedom": float(np.median(self.freedom))}
+        if self.interval:
+            return held_data(*values, self.interval, **others)
+        return FrequencyData(*values, **others)
 
     @property
     def standard_error(self) -> Array:
@@ -363,7 +376,7 @@ def _finished(lines: ResponseLines, method: Estimate, record: Record, time_unit:
     held = lines._replace(response=lines.response / factor, variance=lines.variance / power, distortion=distortion)
     bias = images(hold, held.frequencies, held.response, held.variance, interval)
     note = _of_hold(hold, held.frequencies, bias, np.abs(held.response), time_unit)
-    return _response(held, method, record, bias, note)
+    return replace(_response(held, method, record, bias, note), interval=interval if hold == "zoh" else 0.0)
 
 
 def _response(lines: ResponseLines, method: Estimate, record: Record, bias: Array, note: str) -> FrequencyResponse:

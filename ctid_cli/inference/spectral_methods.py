@@ -44,14 +44,6 @@ class ResponseLines(NamedTuple):
     told: BoolArray
 
 
-def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:
-    """Spectrum of a held input over that of its samples."""
-    across = np.sinc(frequencies * interval / (2 * np.pi))
-    if hold == "zoh":
-        return np.asarray(across * np.exp(-0.5j * frequencies * interval))
-    return np.asarray(across**2 if hold == "foh" else np.ones(frequencies.size), dtype=np.complex128)
-
-
 def images(hold: Hold, frequencies: Array, response: ComplexArray, variance: Array, interval: float) -> Array:
     """What the images may add to a response [its unit], if its gain falls like 1/w or faster from where it was seen."""
     order = {"zoh": 1, "foh": 2}.get(hold, 0)

@@ -39,11 +39,14 @@ DERIVED_KEYS = (*(column.key for column in DERIVED), "reason")
 TEST_KEYS = ("white", "whiteness_p_value", "uncorrelated", "cross_p_value", "level", "lags", "sentence")
 
 
-def fit_content(fitted: Identification, records: Records, predicted: Sequence[int] = ()) -> dict[str, Any]:
+def fit_content(
+    fitted: Identification, records: Records, predicted: Sequence[int] = (), units: Units | None = None
+) -> dict[str, Any]:
     """Return the fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
     profile, validation, additive = fit.profile, fitted.validation, additive_of(fit)
-    measurements, units = records.measurements, records.units
+    measurements, units = records.measurements, units or records.units
+    hold = measurements[0].record.input.hold if measurements else None
     numerator = [item.estimate for item in fitted.estimates if item.name.startswith("b")]
     content = {
         "model": {
@@ -84,9 +87,9 @@ def fit_content(fitted: Identification, records: Records, predicted: Sequence[in
         "residual_tests": [picked(test, TEST_KEYS) for test in fitted.tests],
         "profile": profile and picked(profile, ("delays", "costs", "cutoff", "samples")),
         "validation": validation and _validation_object(validation, records.validation, fit.noise, predicted),
-        "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=True)],
+        "records": [_record_object(item, use) for item, use in zip(measurements, fit.used, strict=False)],
         "units": asdict(units),
-        "settings": asdict(options) | {"kind": options.kind, "hold": measurements[0].record.input.hold},
+        "settings": asdict(options) | {"kind": options.kind, "hold": hold},
     }
     return dict(plain(content))
 

@@ -124,13 +124,17 @@ class FitResult(PagedResult):
 
     def chapters(self) -> Iterator[Chapter]:
         """Return data, model and figures."""
+        yield from self.chapters_of_numbers()
+        yield from figure_chapters(self.figures, self.records.validation)
+
+    def chapters_of_numbers(self) -> Iterator[Chapter]:
+        """Return data and model."""
         model = self.fitted.fit.model
         terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
         equation = Section(sentences=[formula(terms, delayed=model.delay > 0, digits=DIGITS)])
         quality = Section("How good it is", frame=pairs(self.quality()))
         yield Chapter("Data", [self.data(), Section(frame=pairs(self.settings()))])
         yield Chapter("Model", [equation, self.parameters(), self.derived(), quality])
-        yield from figure_chapters(self.figures, self.records.validation)
 
     def cited(self) -> list[str]:
         """Return the articles whose methods the fit used, and the frequency response that stands beside it."""
@@ -206,6 +210,13 @@ class FitResult(PagedResult):
         yield "condition number", number(fit.condition_number, 3)
         if isinstance(fit, SubmodelsFit):
             yield from fit.conditions
+        yield from self.search()
+        for k, test in enumerate(self.fitted.tests, start=1):
+            yield fit.left_over if len(fit.residuals) == 1 else f"{fit.left_over} {k}", _tested(test)
+
+    def search(self) -> Iterator[tuple[str, str]]:
+        """Return how the search went, and the bounds of the admissible models where it ended at them."""
+        fit, units = self.fitted.fit, self.units
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
@@ -213,8 +224,6 @@ class FitResult(PagedResult):
             for name, limit, value in fit.box.limits_met(fit.held_poles):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"
                 yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
-        for k, test in enumerate(self.fitted.tests, start=1):
-            yield fit.left_over if len(fit.residuals) == 1 else f"{fit.left_over} {k}", _tested(test)
 
     @property
     def predicted(self) -> list[int]:
@@ -351,7 +360,7 @@ def save_fit(result: Identification, path: str | os.PathLike[str]) -> None:
     StorageError
         If the file cannot be written.
     """
-    text = FitResult.of(result).file_text(Path(path).parent)
+    text = result._result().file_text(Path(path).parent)
     try:
         write_file(Path(path), text.encode() + b"\n")
     except OSError as error:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.inference.units import Units
@@ -26,6 +27,8 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
         "step.csv": response_frame(fitted.step_response(), units),
         "bode.csv": frequency_frame(fitted.frequency_response(), units),
     }
+    if isinstance(fitted.fit, FrequencyDomainFit):
+        return tables | {"lines.csv": line_frame(fitted.fit, units)}
     several = len(result.records.data) > 1
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"
@@ -37,6 +40,18 @@ def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
         left = {t: record.t[used], units.label("residual", units.output): residuals}
         tables[f"residuals{number}.csv"] = pd.DataFrame(left)
     return tables
+
+
+def line_frame(fit: FrequencyDomainFit, units: Units) -> pd.DataFrame:
+    """Return values, model and residuals at each line of a frequency response."""
+    data, model = fit.data, fit.answers(fit.data.frequencies)
+    columns = {f"frequency [rad/{units.time}]": data.frequencies}
+    for name, values in (("", data.response), ("model_", model), ("residual_", data.response - model)):
+        columns[units.label(f"{name}real", units.gain)] = values.real
+        columns[units.label(f"{name}imaginary", units.gain)] = values.imag
+    if data.standard_error is not None:
+        columns[units.label("standard_error", units.gain)] = data.standard_error
+    return pd.DataFrame(columns)
 
 
 def response_frame(band: ResponseBand, units: Units) -> pd.DataFrame:

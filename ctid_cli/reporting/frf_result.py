@@ -78,8 +78,14 @@ class FrequencyResponseResult(Result):
 
     def to_frame(self) -> pd.DataFrame:
         """Return all frequencies; intervals hold with 95 %."""
-        names = {column.key: column.name for column in quantities(self.records.units)}
-        return pd.DataFrame({names[key]: values for key, values in self._values().items()})
+        names, found = {column.key: column.name for column in quantities(self.records.units)}, self.found
+        # What a fit to the table needs to know of its values.
+        told = {
+            "freedom": found.freedom,
+            "hold_interval": np.full(found.frequencies.size, found.interval or np.nan),
+            "correlated": np.full(found.frequencies.size, found.method != "periodic"),
+        }
+        return pd.DataFrame({names[key]: values for key, values in (self._values() | told).items()})
 
     def content(self) -> dict[str, Any]:
         """Return the response for JSON."""
@@ -105,4 +111,7 @@ def quantities(units: Units) -> tuple[Column, ...]:
         Column("coherence", "coherence", ".3f", "-"),
         Column("hold_bias", unit=gain),
         Column("distortion", "distortion", ".2g", gain),
+        Column("freedom", unit="-"),
+        Column("hold_interval", unit=units.time),
+        Column("correlated", unit="-"),
     )

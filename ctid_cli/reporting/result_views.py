@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.frequency.base import FrequencyTrack
 from ctid_cli.frequency.flags import flag_names
@@ -17,6 +18,7 @@ from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.frequency_fit import FrequencyFitResult
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.measures import parameter_unit
 from ctid_cli.reporting.track_result import TURN, TrackResult
@@ -26,7 +28,8 @@ from ctid_cli.tones.track import Track
 def result_of(shown: Any) -> Result:
     """Return the result that shows a fit, an identification or a track."""
     if isinstance(shown, Identification):
-        return FitResult.of(shown)
+        kind = FrequencyFitResult if isinstance(shown.fit, FrequencyDomainFit) else FitResult
+        return kind.of(shown)
     if isinstance(shown, Track):
         return TrackResult(shown)
     return OnlineTrackResult.of(shown) if isinstance(shown, FrequencyTrack) else SingleFit(shown)

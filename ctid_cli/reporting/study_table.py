@@ -209,10 +209,12 @@ def _lines_by_delay(frame: pd.DataFrame) -> pd.DataFrame:
     under = [
         titles if none else [delay_label(delay)] for delay, none in zip(frame["initial_delay"], startless, strict=True)
     ]
-    cells = labels.assign(n=place.map(frame["n"].groupby(place).agg(_sizes)), under=under, **texts)
+    sizes = place.map(frame["n"].groupby(place).agg(_sizes))
+    cells = labels.assign(n=sizes, under=pd.Series(under, labels.index), **texts)
     keys = [*labels, "n"]
     one_line_each = cells.explode("under").set_index([*keys, "under"])[[*LINES]].stack()
-    long = one_line_each.rename_axis([*keys, "under", "line"]).reset_index(name="text")
+    assert isinstance(one_line_each, pd.Series)
+    long = one_line_each.rename_axis([*keys, "under", "line"]).rename("text").reset_index()
     lines = pivot(long, [*keys, "line"], "under", ["text"])[[*keys, "line", *titles]]
     lines = lines[(lines[titles] != "").any(axis=1)].reset_index(drop=True)
     # A label that the line above has already said is left out, as in a printed table.

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.band_limited import finer_times, finer_values, values_between
 from ctid_cli.signals.checks import freeze, require_increasing
@@ -145,3 +145,11 @@ class HeldSignal:
             Signal with every break moved by ``delay``.
         """
         return HeldSignal(self.t + delay, self.values, self.hold)
+
+
+def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:
+    """Spectrum of a held input over that of its samples."""
+    across = np.sinc(frequencies * interval / (2 * np.pi))
+    if hold == "zoh":
+        return np.asarray(across * np.exp(-0.5j * frequencies * interval))
+    return np.asarray(across**2 if hold == "foh" else np.ones(frequencies.size), dtype=np.complex128)

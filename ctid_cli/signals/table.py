@@ -147,6 +147,8 @@ class Table:
     #: Whether the columns have an order, and each line of the file a number.
     is_text: bool = False
     notes: tuple[str, ...] = ()
+    #: Comments before the data with their lines.
+    comments: tuple[tuple[int, str], ...] = ()
 
     def select(
         self, asked: Mapping[str, str | None], *, without_times: bool = False, in_seconds: bool = False

@@ -56,6 +56,7 @@ class Layout:
     header: int
     first: int
     notes: tuple[str, ...]
+    comments: tuple[tuple[int, str], ...]
 
     def opened(self) -> io.TextIOBase:
         """Open the file at its first sample."""
@@ -71,7 +72,8 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
     layout = _layout(path, require_file(path, EMPTY))
     names = tuple(filter(None, layout.columns))
     head = f"{layout.file}:{layout.header}"
-    return Table(layout.file, names, partial(_read_columns, layout), head=head, is_text=True, notes=layout.notes)
+    read, notes = partial(_read_columns, layout), layout.notes
+    return Table(layout.file, names, read, head=head, is_text=True, notes=notes, comments=layout.comments)
 
 
 # --- the first lines ------------------------------------------------------------------------------
@@ -115,7 +117,8 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     decimal = _decimal(itertools.chain.from_iterable(fields for _, fields in rows[1:]))
     if decimal == ",":
         notes.append("Numbers were read with decimal commas.")
-    return Layout(path, file, encoding, separator, decimal, tuple(names), header, rows[1][0], tuple(notes))
+    first = rows[1][0]
+    return Layout(path, file, encoding, separator, decimal, tuple(names), header, first, tuple(notes), tuple(comments))
 
 
 def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:

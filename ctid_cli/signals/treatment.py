@@ -20,5 +20,8 @@ Offset = Literal["none", "remove", "estimate", "drift"]
 #: The constant input before the first sample of a record that begins at rest [input unit]: a value, the first one of
 #: the record, or None for zero.
 InputBefore = float | Literal["first"] | None
+#: What multiplies the errors of a frequency response without standard errors: the reciprocal of the measured gain, of
+#: its square root, or one.
+Weight = Literal["inverse", "inverse-sqrt", "none"]
 #: What output errors count: their squares, or less where they are large.
 LossKind = Literal["squares", "huber", "tukey"]

@@ -5,7 +5,8 @@ import pytest
 
 from ctid_cli import DataError, HeldSignal, Record, TransferFunction, simulate
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
-from ctid_cli.inference.spectral_methods import find_period, hold_factor
+from ctid_cli.inference.spectral_methods import find_period
+from ctid_cli.signals.held import hold_factor
 
 INTERVAL, PERIOD = 0.1, 256
 MODEL = TransferFunction([2.0, 1.0], [1.0, 1.0, 3.0], delay=0.37)

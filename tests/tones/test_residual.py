@@ -8,6 +8,7 @@ import pytest
 from ctid_cli.tones.condition import find_spikes
 from ctid_cli.tones.constants import SPIKE_AROUND, SPIKE_TIMES, SPIKE_WIDTH
 from ctid_cli.tones.residual import left_over, without_spikes
+from ctid_cli.tones.track import Track
 from ctid_cli.tones.track import track as follow
 
 INTERVAL = 0.002

@@ -234,10 +234,10 @@ def part_of(problem: Problem, latest: float) -> Problem | None:
 
     The input of a part is known for delays up to ``latest`` [s].
     """
-    parts = most_active_parts(problem.records, latest)
+    parts = most_active_parts(problem.sampled, latest)
     if parts is None or any(problem.periods):
         return None
-    records = tuple(_cut(data, part, latest) for data, part in zip(problem.records, parts, strict=True))
+    records = tuple(_cut(data, part, latest) for data, part in zip(problem.sampled, parts, strict=True))
     return problem._replace(records=records, free_response=True, periods=(0.0,) * len(records))
 
 

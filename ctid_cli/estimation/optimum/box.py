@@ -21,6 +21,7 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.estimation.optimum.chain import order_of, poles_of, polynomial, polynomial_slopes
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Delay
+from ctid_cli.filtering.frequency_lines import FrequencyLines
 
 
 class Limit(NamedTuple):
@@ -110,9 +111,11 @@ class Box:
     #: Least delay [s] at which derivatives are taken on an irregular clock. Without a delay all samples may coincide
     #: with edges of the input, where only what comes later counts.
     beyond_edges: float = 0.0
-    #: Slowest pole [rad/s] and least damping [-] between which starts are spread, whatever the set admits beyond.
+    #: Slowest pole [rad/s] and least damping [-] between which starts are spread, whatever the set admits beyond, and
+    #: the greatest frequency that the data show [rad/s].
     slowest_spread: float = 0.0
     least_damping_spread: float = 0.0
+    highest: float = np.inf
 
     @property
     def delay_free(self) -> bool:
@@ -227,9 +230,11 @@ class Point:
 
 
 def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
-    """Return the set that records admit."""
+    """Return the set that records, or a frequency response, admit."""
+    if problem.lines is not None:
+        return _box_of_lines(problem.lines, delays)
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
-    for data in problem.records:
+    for data in problem.sampled:
         used, steps = data.t[data.use], np.diff(data.t)
         # Of a record on the finer clock of its input the samples are some of the points.
         points = max(1, round(float(np.diff(used).min()) / data.interval)) if data.interval > 0 and used.size > 1 else 1
@@ -245,7 +250,7 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
     greatest = bounds["imaginary"] * np.pi / interval if min(cells) > 0 else np.inf
     # Clocks of different intervals have their kinks all over the place.
     cell = cells.pop() if len(cells) == 1 else 0.0
-    beyond = 0.0 if cell else JUST_BEYOND * min(float(np.diff(data.t).min()) for data in problem.records)
+    beyond = 0.0 if cell else JUST_BEYOND * min(float(np.diff(data.t).min()) for data in problem.sampled)
     return Box(
         bounds["slowest"] / length,
         bounds["fastest"] / interval,
@@ -257,6 +262,34 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
         beyond,
         LIMITS["slowest"].estimated / length,
         LIMITS["least_damping"].estimated,
+    )
+
+
+#: Slowest and fastest pole for a frequency response, over its least and its greatest frequency: at 80 dB the phase at
+#: the nearest line tells such a pole from none.
+SLOWEST_OF_LINES, FASTEST_OF_LINES = 1e-4, 1e2
+
+
+def _box_of_lines(lines: FrequencyLines, delays: tuple[float, float]) -> Box:
+    """Return the set that a frequency response admits: that of a record at rest, by its least and greatest lines."""
+    power = np.abs(lines.weights * lines.response) ** 2
+    rate = float(np.sqrt(np.sum(power * lines.frequencies**2) / max(float(power.sum()), 1e-300)))
+    interval, fastest, greatest = lines.interval, FASTEST_OF_LINES * lines.highest, np.inf
+    if interval:
+        fastest = LIMITS["fastest"].rest / interval
+        greatest = LIMITS["imaginary"].rest * np.pi / interval
+    quarter = min(0.5 * np.pi / max(rate, lines.lowest), delays[1] - delays[0])
+    return Box(
+        SLOWEST_OF_LINES * lines.lowest,
+        fastest,
+        greatest,
+        delays,
+        interval,
+        max(quarter, interval or 1e-3 / lines.highest),
+        LIMITS["least_damping"].rest,
+        slowest_spread=1.0 / lines.length,
+        least_damping_spread=LIMITS["least_damping"].estimated,
+        highest=lines.highest,
     )
 
 

@@ -23,6 +23,7 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass, to_steady_state
 from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
 
 #: Samples that are filtered at a time, which bounds the memory of a long record.
@@ -169,6 +170,22 @@ class Fractions:
         for data, delay in pieces(record.data, record.delay):
             yield modal_pass(data, modes, delay, rows=True, double=second, filter_output=False, states=states)
 
+    def at_lines(self, lines: FrequencyLines, delay: Place, second: bool) -> ComplexArray:
+        """Return ``[z, w, u]`` at the lines of a frequency response."""
+        poles = self.modes.poles
+        pairs = poles.imag > 0.0
+        both = lines.of_modes(np.concatenate((poles, poles[pairs].conj())), delay)
+        columns = []
+        for values in both if second else both[:1]:
+            upper, lower = values[:, : poles.size], values[:, : poles.size].copy()
+            lower[:, pairs] = values[:, poles.size :]
+            # Real and imaginary part in time: half the sum and half the difference of a mode and its conjugate.
+            of_z = np.stack((0.5 * (upper + lower), -0.5j * (upper - lower)), axis=2)
+            columns.append(
+                of_z.reshape(len(values), -1)[:, np.column_stack((np.full(poles.size, True), pairs)).ravel()]
+            )
+        return np.column_stack((*columns, lines.delayed(delay)))
+
     def free(self, elapsed: Array, second: bool) -> Array:
         """Return rows ``[z, w]`` after an impulse, transposed."""
         rows = np.empty((2 if second else 1, self.modes.width, elapsed.size))
@@ -297,6 +314,10 @@ class Chain:
         data = record.data
         states = chain_states(self.dynamics, self.gain, 1.0, data, record.delay, initial)
         yield np.column_stack((states, data.y))[data.use]
+
+    def at_lines(self, lines: FrequencyLines, delay: Place, second: bool) -> ComplexArray:
+        """Return ``[z, w, u]`` at the lines of a frequency response."""
+        return np.column_stack((lines.of_states(self.dynamics, self.gain, delay), lines.delayed(delay)))
 
     def free(self, elapsed: Array, second: bool) -> Array:
         """Return rows ``[z, w]`` after an impulse, transposed."""

@@ -22,6 +22,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, order_of, polynomial
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.innovations import SampledNoise
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
@@ -31,9 +32,9 @@ TOGETHER = 12_000
 
 
 class Problem(NamedTuple):
-    """Records, and what is eliminated with them."""
+    """Records, or a frequency response in their place, and what is eliminated with them."""
 
-    records: tuple[FilterData, ...]
+    records: tuple[FilterData | FrequencyLines, ...]
     #: Degree of the numerator.
     zeros: int
     free_response: bool
@@ -49,14 +50,24 @@ class Problem(NamedTuple):
     noises: tuple[SampledNoise, ...] = ()
 
     @property
-    def laid_out(self) -> Iterator[tuple[FilterData, float, SampledNoise | None]]:
+    def laid_out(self) -> Iterator[tuple[FilterData | FrequencyLines, float, SampledNoise | None]]:
         """Each record, its period and its noise."""
         return zip(self.records, self.periods, self.noises or (None,) * len(self.records), strict=True)
 
     @property
     def length(self) -> float:
         """Length of the longest record [s]."""
-        return float(max(data.t[-1] - data.t[0] for data in self.records))
+        return max(data.length for data in self.records)
+
+    @property
+    def sampled(self) -> tuple[FilterData, ...]:
+        """The records in time."""
+        return tuple(data for data in self.records if isinstance(data, FilterData))
+
+    @property
+    def lines(self) -> FrequencyLines | None:
+        """The frequency response, if there is one in their place."""
+        return next((data for data in self.records if isinstance(data, FrequencyLines)), None)
 
     def sections(self, speed: Array, damping: Array) -> tuple[Array, Array]:
         """Return the sections with the integrators behind them."""
@@ -210,7 +221,7 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
         modal = []
     for k in set(range(len(forms))) - set(modal):
         errors[k] = project(problem, *sections[k], delay).squared_error
-    at_once = max(TOGETHER // sum(data.t.size for data in problem.records), 1)
+    at_once = max(TOGETHER // sum(data.count for data in problem.records), 1)
     for first in range(0, len(modal), at_once):
         own = modal[first : first + at_once]
         group = [form for k in own if isinstance(form := forms[k], Modal)]

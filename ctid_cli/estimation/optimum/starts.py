@@ -206,7 +206,10 @@ class StructureSearch:
         """
         samples = sum(data.count for data in self.problem.records)
         # Half of what separates two frequencies.
-        resolution, highest = 0.5 * np.pi * self.box.spread[0], min(self.box.imaginary, self.box.fastest)
+        resolution, highest = (
+            0.5 * np.pi * self.box.spread[0],
+            min(self.box.imaginary, self.box.fastest, self.box.highest),
+        )
         count = min(int(highest / resolution), RESOLVED // samples)
         if poles < 2 or count < self.effort.pairs:
             return []
@@ -249,7 +252,7 @@ class StructureSearch:
 
         On an irregular clock the cost has a kink wherever a sample meets an edge of the input, and minima between them.
         """
-        if self.box.cell > 0 or not self.box.delay_free:
+        if not self.box.beyond_edges or not self.box.delay_free:
             return []
         best = self.best(poles, zeros)
         interval = LIMITS["fastest"].rest / self.box.fastest

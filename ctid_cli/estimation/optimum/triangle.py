@@ -12,7 +12,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
+from ctid_cli.filtering.bank import Place
 from ctid_cli.filtering.filter_data import FilterData, split_delay
+from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.innovations import SampledNoise, Whitener
 
 
@@ -22,11 +24,13 @@ class Delay(NamedTuple):
     seconds: float
     cell: int
 
-    def place(self, interval: float) -> tuple[int, float]:
+    def place(self, interval: float) -> Place:
         """Return the breaks by which the read-out lags, and the fraction, 0 to 1, of an interval read beyond that.
 
-        At a sample a cell is closed on both sides: each has its own slope there.
+        At a sample a cell is closed on both sides: each has its own slope there. Without an interval, the delay.
         """
+        if not interval:
+            return self.seconds
         if self.cell < 0:
             return split_delay(self.seconds, interval)
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
@@ -77,11 +81,15 @@ def rows_of(
     form: Fractions | Chain,
     columns: Columns,
     delay: Delay,
-    data: FilterData,
+    data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
 ) -> Iterator[Array]:
     """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given."""
+    if isinstance(data, FrequencyLines):
+        answers = form.at_lines(data, delay.place(data.interval), columns.second > 0)
+        yield data.parts(np.column_stack((answers, data.response)))
+        return
     whitener = None if noise is None else Whitener(noise.noise, columns.size)
     second, done, record = columns.second > 0, 0, _record(delay, data, period)
     elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
@@ -114,7 +122,12 @@ def _reduced(triangle: Array | None, rows: Array) -> Array:
 
 
 def triangle_of(
-    form: Form, columns: Columns, delay: Delay, data: FilterData, period: float, noise: SampledNoise | None = None
+    form: Form,
+    columns: Columns,
+    delay: Delay,
+    data: FilterData | FrequencyLines,
+    period: float,
+    noise: SampledNoise | None = None,
 ) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     # Memory is that of one piece, however long the record.
@@ -129,7 +142,7 @@ def triangles_of(
     forms: list[Modal],
     columns: Columns,
     delay: Delay,
-    data: FilterData,
+    data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
 ) -> Array:
@@ -155,9 +168,10 @@ def triangles_of(
 def _record(delay: Delay, data: FilterData, period: float) -> Record:
     """Return a record as it is filtered; one whose input repeats itself begins with the period before its samples."""
     if not period:
-        return Record(data, delay.place(data.interval) if data.interval > 0.0 else delay.seconds)
-    if data.interval > 0.0:
-        shift, fraction = delay.place(data.interval)
+        return Record(data, delay.place(data.interval))
+    place = delay.place(data.interval)
+    if isinstance(place, tuple):
+        shift, fraction = place
         # The last interval leads back to the first break, where the next slope begins.
         count, u = data.u.size, np.roll(data.u, shift)
         u = np.append(u, u[0])

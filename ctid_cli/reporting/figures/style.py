@@ -176,7 +176,7 @@ def legend_of(figure: Figure, looks: Mapping[str, Mapping[str, Any]], columns: i
     from matplotlib.lines import Line2D
 
     style = {"markersize": 4, "linewidth": 0.9}
-    handles = [Line2D([], [], **style | look, label=label) for label, look in looks.items()]
+    handles = [Line2D([], [], **{**style, **look}, label=label) for label, look in looks.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, **others)
 
 

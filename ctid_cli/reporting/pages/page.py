@@ -139,7 +139,7 @@ def bibtex(*keys: str) -> str:
 
 def _provenance(stored: Mapping[str, Any]) -> list[Section]:
     """Return what a result was made from, and the command that makes it again."""
-    sources = [("record", each) for each in stored.get("records") or [stored["record"]]]
+    sources = [("record", each) for each in stored.get("records", [stored.get("record")])]
     sources += [("validation record", stored["validation"])] if stored.get("validation") else []
     rows = [("ctid", str(stored["ctid"]))]
     for label, each in sources:

@@ -1,0 +1,225 @@
+"""One transfer function by least squares from a measured frequency response."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.estimation.common import Prepared, Start, places_of
+from ctid_cli.estimation.measured_lines import MeasuredLines
+from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, fitted, samples_at
+from ctid_cli.inference.covariance import robust_covariance, sandwich, unit_inverse
+from ctid_cli.inference.residual_tests import all_white, chi_square_tail, normal_tail
+from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
+from ctid_cli.signals.frequency_data import FrequencyData
+
+#: Residuals that exceed the given standard errors by chance less often than this count as larger.
+MISFIT = 0.01
+#: Share of the weighted values' squares below which residuals are rounding.
+ROUNDING = 1e-14
+#: Options of a record in time.
+OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrequencyDomainFit(MeasuredFit):
+    """A fit to a measured frequency response.
+
+    Parameters
+    ----------
+    model, parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; a sample is a weighted real or imaginary part,
+        and means are not subtracted in ``fit_percent`` and ``r2``.
+    history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` has the real parts of all lines, then
+        the imaginary ones.
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
+    data : FrequencyData
+        The frequency response.
+    """
+
+    data: FrequencyData = field(kw_only=True)
+
+    def uncertainty(
+        self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
+    ) -> Uncertainty:
+        """Standard errors and intervals.
+
+        Parameters
+        ----------
+        kind : {"auto", "white", "robust"}, default "auto"
+            ``white`` takes the errors of lines as independent: by the standard errors of the data, or by the residuals
+            of each line where these are larger or the standard errors estimates themselves; ``robust`` takes those of
+            neighbouring lines as correlated, which ``auto`` does where the data say so or the residuals are.
+        draws, progress
+            Not used: there is no bootstrap.
+
+        Returns
+        -------
+        Uncertainty
+            Covariance, and how many standard errors intervals reach.
+        """
+        psi, e = self.sensitivities[0] @ self.tangent, self.residuals[0]
+        if kind == "robust" or (kind == "auto" and self.correlated):
+            lines = self.data.frequencies.size
+            found, noise = robust_covariance(np.split(psi, [lines]), np.split(e, [lines]), regular=True)
+            return Uncertainty("robust", self.tangent, found, noise.effective_count(e.size))
+        inverse = unit_inverse(psi.T @ psi) if e.size > psi.shape[1] else None
+        if inverse is None:
+            return Uncertainty("white", self.tangent, np.full((psi.shape[1],) * 2, np.nan), e.size)
+        if self.errors_known:
+            return Uncertainty("white", self.tangent, inverse[0] * np.outer(inverse[1], inverse[1]), np.inf)
+        # With the squared residual of each part over its expectation any variance over frequency is allowed (HC2 of
+        # MacKinnon and White, 1985).
+        scaled = psi * inverse[1]
+        leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
+        weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
+        return Uncertainty("white", self.tangent, sandwich(*inverse, weighed.T @ weighed), e.size)
+
+    @property
+    def correlated(self) -> bool:
+        """Whether errors of neighbouring lines are correlated, by what the data say or by the residuals."""
+        return self.data.correlated or not self.white
+
+    @property
+    def white(self) -> bool:
+        """Whether residuals over frequency pass as uncorrelated; of exact values they are rounding."""
+        return self.r2 > 1.0 - ROUNDING or all_white(np.split(self.residuals[0], [self.data.frequencies.size]))
+
+    @property
+    def errors_known(self) -> bool:
+        """Whether the data have standard errors that the residuals agree with and that are no estimates."""
+        return self.misfit_p_value >= MISFIT and self.data.freedom == np.inf
+
+    @property
+    def excess(self) -> float:
+        """Variance of the residuals over that of the data's standard errors [-]."""
+        return float(self.cost * self.count / max(self.count - self.tangent.shape[1], 1))
+
+    @property
+    def misfit_p_value(self) -> float:
+        """Probability of residuals as large as these by the data's standard errors; NaN where it is not known [-].
+
+        Over an estimated variance of d degrees of freedom the squared error of a line has the F-distribution of 2 and
+        2 d of them.
+        """
+        spare, d = max(self.count - self.tangent.shape[1], 1), self.data.freedom
+        if self.data.standard_error is None or d <= 2.0:
+            return float("nan")
+        if d == np.inf:
+            return chi_square_tail(spare, self.cost * self.count)
+        variance = d**3 / ((d - 1.0) ** 2 * (d - 2.0)) / (0.5 * spare)
+        return float(normal_tail((self.excess - d / (d - 1.0)) / np.sqrt(variance)))
+
+    def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
+        """Forget what belongs to single lines; it is computed from the data, which are kept."""
+        measured = _laid_out(self, self.data)
+        super().leave_out(lambda: samples_at(measured, self.model, self.theta, None)._asdict())
+
+    def answers(self, frequencies: Array) -> ComplexArray:
+        """Values of the model as those of the data are: ``G(jw)``, or of samples.
+
+        Parameters
+        ----------
+        frequencies : ndarray, shape (N,)
+            Frequencies [rad/s].
+
+        Returns
+        -------
+        ndarray of complex, shape (N,)
+            Values [output unit/input unit].
+        """
+        if not self.data.interval:
+            return self.model.frequency_response(frequencies)
+        count = frequencies.size
+        ones = FrequencyData(frequencies, np.ones(count, dtype=complex), interval=self.data.interval)
+        measured, parts = _laid_out(self, ones), np.zeros(2 * count)
+        parts[measured.lines.use] = measured.outputs[0] - measured.errors_of(self.model).residuals[0]
+        return np.asarray(parts[:count] + 1j * parts[count:])
+
+
+def _laid_out(fit: FrequencyDomainFit, data: FrequencyData) -> MeasuredLines:
+    """Lay lines out for the structure of a fit."""
+    integrators = int(np.count_nonzero(np.cumsum(fit.model.denominator[::-1]) == 0.0))
+    zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
+    structure = Structure(fit.model.order, zeros, "delay" in fit.parameter_names)
+    return MeasuredLines(data, structure, (fit.model.delay,) * 2, integrators)
+
+
+@dataclass(frozen=True)
+class FrequencyDomain(DelayProfile):
+    r"""Least squares over frequency, by the search of :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
+
+    Parameters
+    ----------
+    poles, zeros, fixed, integrators
+        As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
+    delay_bounds : tuple of float, default (0.0, 0.0)
+        Least and greatest delay [s]; two equal numbers are a known delay.
+    initial_state, offset, loss, input_before, noise_model
+        Of records in time: for a frequency response they keep their defaults.
+    svf_cutoff, nested, hold_output, covariance, bootstrap_draws
+        Not used: smaller models are always fitted too, and standard errors are those of the lines.
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Notes
+    -----
+    Minimised is ``sum |W_k (G_k - B/A exp(-j w_k tau))|^2``, W the reciprocal of the standard error or the weight of
+    the data, with the sampled response of the model in the place of ``B/A`` for values of samples. Poles are searched
+    from 1e-4 of the least to 1e2 times the greatest frequency; of samples no faster than ten over the interval.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import FrequencyData
+    >>> w = np.geomspace(0.1, 10.0, 50)
+    >>> fit = FrequencyDomain(1, 0, (0.0, 1.0)).fit(FrequencyData(w, 2.0 / (1j * w + 1.0) * np.exp(-0.3j * w)))
+    >>> {name: round(value, 6) for name, value in fit.parameters.items()}
+    {'a1': 1.0, 'b0': 2.0, 'delay': 0.3}
+    """
+
+    delay_bounds: tuple[float, float] = (0.0, 0.0)
+
+    def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
+        """Check a frequency response and lay it out; a DataError says why nothing can be estimated.
+
+        A record is laid out for the model to be applied to it.
+        """
+        if not isinstance(record, FrequencyData):
+            return super().prepare(record)
+        for name in OF_RECORDS:
+            if getattr(self, name) != next(each.default for each in fields(self) if each.name == name):
+                raise OptionError(name, f"{name} is for records in time, not for a frequency response; leave it out")
+        low, high = self.delay_bounds
+        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
+        coefficients = KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING
+        structure = Structure(self.order, self.zeros, delay=low < high)
+        measured = MeasuredLines(record, structure, self.delay_bounds, self.integrators, coefficients)
+        measured.check()
+        return Prepared(self, measured)
+
+    def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        if not isinstance(measured, MeasuredLines):
+            raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
+        return fit_of(measured, measured.best([], True))
+
+
+def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
+    """Return the fit that an optimum is, with its standard errors."""
+    found = fitted(measured, optimum, None, None)
+    values = {each.name: getattr(found, each.name) for each in fields(found)}
+    return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)

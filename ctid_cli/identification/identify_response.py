@@ -1,0 +1,105 @@
+"""From a measured frequency response to a model with everything that tells whether to believe it."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit
+from ctid_cli.estimators.identification import Identification, free_directions, parameters_told
+from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_search
+from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
+from ctid_cli.inference.fit import Status
+from ctid_cli.inference.response_test import LEVEL, AnswerTest
+from ctid_cli.signals.frequency_data import FrequencyData
+from ctid_cli.text import count
+
+
+def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -> Identification:
+    """Fit a model to a frequency response and judge it.
+
+    Parameters
+    ----------
+    data : FrequencyData
+        The frequency response.
+    options : FrequencyDomain
+        Structure of the model, and the weights of lines without standard errors.
+
+    Returns
+    -------
+    Identification
+        The model, and everything that tells whether to believe it; it has no records and no tests of residuals over
+        time.
+
+    Raises
+    ------
+    DataError
+        If the data cannot be used.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ctid_cli import FrequencyData, FrequencyDomain
+    >>> w, rng = np.geomspace(0.1, 10.0, 100), np.random.default_rng(0)
+    >>> noise = 0.02 * (rng.standard_normal(100) + 1j * rng.standard_normal(100))
+    >>> data = FrequencyData(w, 2.0 / (1j * w + 1.0) + noise, np.full(100, 0.02 * np.sqrt(2.0)))
+    >>> found = identify_frequency_response(data, FrequencyDomain(1, 0))
+    >>> {item.name: round(item.estimate, 2) for item in found.estimates if item.status == "free"}
+    {'b0': 1.99, 'a1': 0.99}
+    """
+    prepared = options.prepare(data)
+    fit = prepared.fit()
+    assert isinstance(fit, FrequencyDomainFit)
+    assert fit.law is not None
+    (residuals,), (values,) = fit.residuals, prepared.laid_out.outputs
+    answer, free = _answer(fit), free_directions(fit)[0]
+    return Identification(
+        options=options,
+        fit=fit,
+        answer=answer,
+        **parameters_told(fit, fit.law, answer.seen, prepared.laid_out)._asdict(),
+        tests=(),
+        criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
+        yic=young_information_criterion(residuals, values, fit.theta[free], fit.law.covariance[np.ix_(free, free)]),
+        r_t_squared=r_t_squared(residuals, values),
+        warnings=tuple(f"{text}." for text in list(_warnings(fit, answer))[:MOST]),
+    )
+
+
+def _answer(fit: FrequencyDomainFit) -> AnswerTest:
+    """Test the model against no response by the F-distribution, each line being a place where noise may have a peak."""
+    from scipy.stats import f as f_distribution
+
+    size, spare = fit.tangent.shape[1], fit.count - fit.tangent.shape[1]
+    ratio = fit.r2 / size / max((1.0 - fit.r2) / spare, 1e-300)
+    chances = 0.5 * fit.count
+    p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
+    least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
+    return AnswerTest(fit.r2, least / (1.0 + least), p_value)
+
+
+def _warnings(fit: FrequencyDomainFit, answer: AnswerTest) -> Iterator[str]:
+    """Yield what to know before the model is used, the costliest first."""
+    if not answer.seen:
+        yield f"No model: the values are not seen to be anything but noise (p = {answer.p_value:.2g})"
+        return
+    if fit.misfit_p_value < MISFIT:
+        what = (
+            f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say (p = "
+        )
+        hold = ", or the input is not constant between the samples (ctid frf --hold)" * (fit.data.interval > 0.0)
+        missed = f"the model misses a part of the response{hold}, or the errors are too small"
+        yield f"{what}{fit.misfit_p_value:.2g}): {missed}"
+    if not fit.white and not fit.data.correlated:
+        yield (
+            "The residuals of neighbouring lines are correlated: the model misses a part of the response, or the lines "
+            "share samples"
+        )
+    if fit.fit_percent < LOW_FIT and fit.data.standard_error is None:
+        yield f"The fit is {fit.fit_percent:.1f} % of the weighted values"
+    yield from of_search(fit, fit.data.units[0])
+    if fit.status in (Status.CONVERGED, Status.AT_BOUND, Status.DELAY_AT_BOUND):
+        assert fit.law is not None
+        yield from of_conditioning(fit, fit.law)
+    if fit.law is not None and fit.law.short:
+        worth = f"{count(fit.count, 'value')} are worth {fit.law.effective_count:.2g} independent ones"
+        yield f"The errors of the lines are so correlated that {worth}: standard errors are rough"

@@ -1,0 +1,188 @@
+"""The result of ``ctid fit`` on a frequency response, and its figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctid_cli.canonical import plain
+from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
+from ctid_cli.estimators.identification import Identification
+from ctid_cli.identification.sentences import spelled
+from ctid_cli.inference.units import Units
+from ctid_cli.reporting.document import Section
+from ctid_cli.reporting.estimate import PARAMETER
+from ctid_cli.reporting.figures.style import BAND, DARK, MIDDLE, Drawing, name_axes
+from ctid_cli.reporting.figures.style import plain as plain_text
+from ctid_cli.reporting.fit_content import fit_content, parameters_of
+from ctid_cli.reporting.fit_result import FitResult
+from ctid_cli.reporting.frf_plot import decibels, name_response
+from ctid_cli.reporting.layout import number
+from ctid_cli.reporting.model_plot import bode_drawing, poles_drawing, step_drawing
+from ctid_cli.reporting.pages.page import Chapter
+from ctid_cli.reporting.records import Records
+from ctid_cli.text import count
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: What lines weigh by where they have no standard errors.
+WEIGHTS = {
+    "inverse": "reciprocal of the gain, for relative errors",
+    "inverse-sqrt": "reciprocal of the square root of the gain",
+    "none": "the same for all lines",
+}
+FIT_DEFINITION = "100 (1 - ||W (G - M)|| / ||W G||)"
+
+
+@dataclass(frozen=True, eq=False)
+class FrequencyFitResult(FitResult):
+    """A fit to a frequency response."""
+
+    fine = "The search ended well, and the residuals agree with what is known of the data."
+
+    @classmethod
+    def of(cls, fitted: Identification) -> FrequencyFitResult:
+        """Return the result of a fit."""
+        return cls(fitted, Records([]))
+
+    @property
+    def fit(self) -> FrequencyDomainFit:
+        """The estimate."""
+        assert isinstance(self.fitted.fit, FrequencyDomainFit)
+        return self.fitted.fit
+
+    @property
+    def units(self) -> Units:
+        """Units of the data."""
+        time, output, input_ = self.fit.data.units
+        return Units(time, input_, output)
+
+    def data(self) -> Section:
+        """Return the data, and what reading them has shown."""
+        data, time = self.fit.data, self.units.time
+        low, high = data.frequencies[[0, -1]]
+        line = (
+            f"{data.name or 'frequency response'}: {count(data.frequencies.size, 'line')} from {low:.6g} to {high:.6g}"
+        )
+        return Section(sentences=[f"{line} rad/{time}", *data.notes])
+
+    def settings(self) -> Iterator[tuple[str, str]]:
+        """Return what was estimated, and how the data were taken."""
+        options, data, time = self.fitted.options, self.fit.data, self.units.time
+        low, high = options.delay_bounds
+        searched = f"searched from {low:g} to {high:g} {time}" if low < high else f"known, {low:g} {time}"
+        yield "model", f"{spelled(options)}; delay {searched}"
+        if options.fixed:
+            yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
+        sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
+        yield "values", sampled if data.interval else "G(jw)"
+        if data.standard_error is None:
+            yield "weights", f"{WEIGHTS[data.weight]} (--weight {data.weight})"
+        else:
+            yield "weights", "reciprocal of standard_error"
+
+    def parameters(self) -> Section:
+        """Return the parameters with their uncertainty."""
+        notes = [f"{self._errors()} Monic denominator, descending powers."]
+        return Section.table(parameters_of(self.fitted, self.units), PARAMETER, notes=notes)
+
+    def _errors(self) -> str:
+        """What the standard errors hold for."""
+        fit, law = self.fit, self.fitted.uncertainty
+        if not self.fitted.answer.seen:
+            return "There are no standard errors, as the values are not seen to be anything but noise."
+        if not np.isfinite(np.diag(law.covariance)).any():
+            return "There are no standard errors."
+        if law.kind == "robust":
+            why = "the lines share samples" if fit.data.correlated else "the residuals of neighbouring lines are"
+            text = f"Standard errors are rough, those for correlated errors of neighbouring lines, as {why}"
+        elif fit.errors_known:
+            text = "Standard errors are from those of the data, which the residuals agree with"
+        else:
+            text = "Standard errors are from the residuals of the lines, taken as independent"
+        return f"{text}; intervals are estimate -+ {law.quantile(np.zeros(1)):.3g} of them."
+
+    def quality(self) -> Iterator[tuple[str, str]]:
+        """Return what tells how good the fit is."""
+        fit, criteria = self.fit, self.fitted.criteria
+        yield "fit", f"{number(fit.fit_percent, 5)} % = {FIT_DEFINITION}"
+        yield "", "G values, M model, W weights"
+        yield "cost", f"{number(fit.cost)}, mean square of a weighted real or imaginary part"
+        if fit.data.standard_error is not None:
+            size = f"{number(np.sqrt(fit.excess), 4)} times the standard errors of the data"
+            yield "residuals", f"{size} (p = {number(fit.misfit_p_value, 2)})"
+        sizes = f"N = {criteria.count} real equations and p = {criteria.parameters} parameters"
+        yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)} with {sizes}"
+        yield "condition number", number(fit.condition_number, 3)
+        yield from self.search()
+        yield (
+            "lines",
+            "errors of neighbours pass as uncorrelated" if fit.white else "errors of neighbours are correlated",
+        )
+
+    def drawing(self) -> Drawing:
+        """Return the figure of gain, phase and residuals."""
+        return frequency_fit_drawing(self.fit, self.units)
+
+    def page_head(self) -> tuple[str, str]:
+        """Return the title of the page, and how well the model fits."""
+        fit = self.fit
+        lines = count(fit.data.frequencies.size, "weighted line")
+        lead = f"{spelled(self.fitted.options)}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
+        return f"Fit of {fit.data.name or 'a frequency response'}", lead
+
+    def chapters(self) -> Iterator[Chapter]:
+        """Return data, model and figures."""
+        found, units = self.fitted, self.units
+        bode = bode_drawing(found.frequency_response(), None, units)
+        bands = "of the model, with pointwise 95 % bands."
+        poles = poles_drawing(found.poles(), self.fit.model.zeros, units)
+        yield from self.chapters_of_numbers()
+        yield Chapter("Values and model", [Section(drawing=self.drawing(), caption="Values, model and residuals.")])
+        step = Section(drawing=step_drawing(found.step_response(), units), caption=f"Response to a unit step {bands}")
+        yield Chapter("Responses", [Section(drawing=bode, caption=f"Frequency response {bands}"), step])
+        yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
+
+    def content(self) -> dict[str, Any]:
+        """Return the fit for ``fit.json`` and ``ctid fit --json``."""
+        fit, data = self.fit, self.fit.data
+        response = {
+            "file": data.name,
+            "lines": data.frequencies.size,
+            "interval": data.interval or None,
+            "weights": data.weight if data.standard_error is None else "standard_error",
+            "residuals_over_standard_errors": None if data.standard_error is None else np.sqrt(fit.excess),
+            "misfit_p_value": fit.misfit_p_value,
+            "correlated": fit.correlated,
+        }
+        return {**fit_content(self.fitted, self.records, units=self.units), "frequency_response": plain(response)}
+
+
+def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
+    """Gain and phase of values and model, and the residuals beside the standard errors."""
+    data, seen = fit.data, fit.data.frequencies > 0.0
+    w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
+    angle = np.unwrap(np.angle(model))
+    near = angle + np.angle(values * np.exp(-1j * angle))
+    panels = ((decibels(np.abs(values)), decibels(np.abs(model))), (np.rad2deg(near), np.rad2deg(angle)))
+
+    def draw(figure: Figure) -> None:
+        gain, phase, error = figure.subplots(3, 1, sharex=True, height_ratios=[1.5, 1.0, 1.0])
+        for axes, (measured, fitted) in zip((gain, phase), panels, strict=True):
+            axes.semilogx(w, measured, ".", color=MIDDLE, markersize=3, label="values")
+            axes.semilogx(w, fitted, color=DARK, linewidth=1.2, label="model")
+        if data.standard_error is not None:
+            level = decibels(data.standard_error[seen])
+            lowest = float(np.min(level)) - 20.0
+            error.fill_between(w, lowest, level, color=BAND, linewidth=0.0, label="standard error")
+            error.set_ylim(bottom=lowest)
+        error.semilogx(w, decibels(np.abs(values - model)), ".", color=DARK, markersize=3, label="residual")
+        name_response(gain, phase, error, units)
+        name_axes(error, y=f"residual [{units.amount('dB re 1', units.gain)}]", legend="best")
+        gain.set_title(plain_text(data.name), loc="left")
+
+    return Drawing(8.0, 7.0, draw)

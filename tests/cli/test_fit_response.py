@@ -1,0 +1,72 @@
+"""``ctid fit`` on a frequency response."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ctid_cli import HeldSignal, TransferFunction, simulate
+from tests.cli.records import write
+
+RESPONSE = np.geomspace(0.1, 20.0, 60)
+
+
+def response_file(folder):
+    """Values of 2 / (p + 1) exp(-p/2) with standard errors."""
+    rng = np.random.default_rng(0)
+    values = 2.0 * np.exp(-0.5j * RESPONSE) / (1j * RESPONSE + 1.0)
+    values = values + 0.02 * (rng.standard_normal(60) + 1j * rng.standard_normal(60)) / np.sqrt(2.0)
+    columns = RESPONSE, values.real, values.imag, np.full(60, 0.02)
+    header = "frequency [rad/s],real [mm/V],imaginary [mm/V],standard_error [mm/V]"
+    return write(folder / "frf.csv", columns, header)
+
+
+def test_a_frequency_response_is_fitted_drawn_and_reported(ctid, tmp_path, snapshot, monkeypatch):
+    response_file(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = ctid("fit frf.csv --poles 1 --delay 0:2 --report --csv tables --export matlab --out new")
+    assert done.stdout == snapshot
+    content = json.loads((tmp_path / "new" / "fit.json").read_text())
+    assert content["frequency_response"]["lines"] == 60
+    assert content["units"] == {"time": "s", "input": "V", "output": "mm"}
+    lines = pd.read_csv(tmp_path / "tables" / "lines.csv")
+    assert len(lines) == 60
+    ctid("report new/fit.json --file again.html")
+    pages = [(tmp_path / name).read_text() for name in ("new/fit.html", "again.html")]
+    assert pages[0] == pages[1]
+
+
+def test_what_frf_writes_is_fitted_with_the_hold_that_it_took_out(ctid, tmp_path):
+    u = np.tile(np.random.default_rng(0).standard_normal(100), 20)
+    t = 0.5 * np.arange(u.size)
+    y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
+    write(tmp_path / "record.csv", (t, u, y + 1e-5 * np.random.default_rng(1).standard_normal(t.size)), "t,u,y")
+    ctid("frf --out", tmp_path, tmp_path / "record.csv")
+    content = json.loads(ctid("fit --poles 1 --json --out", tmp_path, tmp_path / "frf.csv").stdout)
+    assert content["frequency_response"]["interval"] == 0.5
+    assert [item["estimate"] for item in content["parameters"][:2]] == pytest.approx([2.0, 1.0], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("", "--poles is missing"),
+        ("--poles 1 --initial-state rest", "--initial-state is for records in time"),
+        ("--poles 1 --offset estimate", "--offset is for records in time"),
+        ("--poles 1 --noise auto", "--noise is for records in time"),
+        ("--poles 1 --loss huber", "--loss is for records in time"),
+        ("--poles 1 --loop unknown", "--loop is for records in time"),
+        ("--poles 1 --hold foh", "the file says it, in a comment"),
+        ("--poles 1 --bootstrap 100", "--bootstrap is for records in time"),
+        ("--poles 1 --input u", "several inputs are fitted from records"),
+        ("--poles 1 --weight inverse", "drop --weight"),
+        ("--model additive --terms 1/0", "--model additive is not available"),
+        ("--poles 1 frf.csv", "give one file"),
+    ],
+)
+def test_what_is_not_for_a_frequency_response(ctid, tmp_path, monkeypatch, options, message):
+    response_file(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert message in ctid(f"fit frf.csv {options} --out new", code=2).stderr
+    assert not (tmp_path / "new").exists()
