@@ -21,7 +21,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
-from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
+from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, chains_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
@@ -30,7 +30,7 @@ from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.sensitivities import Model, Structure, SumStructure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -48,7 +48,7 @@ RANDOM_STARTS = 2
 class Layout:
     """Which numbers stand where in the parameter vector: coefficients, delay, then each experiment's own."""
 
-    structure: Structure
+    structure: Structure | SumStructure
     experiments: int = 1
     initial_state: bool = False
     #: Powers of time.
@@ -76,15 +76,9 @@ class Layout:
             names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
         return tuple(names)
 
-    def theta(self, model: TransferFunction) -> Array:
+    def theta(self, model: Model) -> Array:
         """The parameters of a model of this structure, and zeros for what belongs to the experiments."""
-        theta, n = np.zeros(self.size), self.structure.poles
-        theta[:n] = model.denominator[1:]
-        last = n + self.structure.zeros + 1
-        theta[last - model.numerator.size : last] = model.numerator
-        if self.structure.delay:
-            theta[last] = model.delay
-        return theta
+        return np.concatenate((self.structure.theta_of(model), np.zeros(self.experiments * self.own)))
 
     def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
         """Initial state and offset of one experiment."""
@@ -104,43 +98,57 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
     problem has integrators.
     """
-    structure, n, m = layout.structure, layout.structure.poles, layout.structure.zeros
-    a, b = np.concatenate(([1.0], theta[:n])), theta[n : n + m + 1]
-    stable = np.roots(a[: n + 1 - problem.integrators]).astype(complex)
-    point = point_of(stable, theta[n + m + 1] if structure.delay else delay, ANYWHERE)
-    sections = problem.sections(point.speed, point.damping)
-    F, g = chain_dynamics(*sections)
-    # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-    powers = np.linalg.inv(numerators(*sections))
-    direct = b[0] if m == n else 0.0
-    output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
+    structure, n = layout.structure, layout.structure.poles
+    fractions, chain_rule = structure.fractions_of(theta)
+    shared = len(chain_rule)
+    delay = theta[structure.size - 1] if structure.delay else delay
+    terms, rows, powers, outputs, direct = problem.submodels(n).terms, [], [], [], np.zeros(len(fractions))
+    for k, ((b, a), term) in enumerate(zip(fractions, terms, strict=True)):
+        stable = np.roots(a[: term.poles + 1]).astype(complex)
+        point = point_of(stable, delay, ANYWHERE)
+        (sections,) = problem._replace(terms=(), integrators=term.integrators).rows(point.speed, point.damping)
+        rows.append(sections)
+        # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
+        powers.append(np.linalg.inv(numerators(*sections)))
+        if b.size == a.size:
+            direct[k], b = b[0], (b - b[0] * a)[1:]
+        outputs.append(np.concatenate((np.zeros(a.size - 1 - b.size), b)) @ powers[-1])
+    (F, g), output, free_powers = chains_dynamics(rows), np.concatenate(outputs), block_diagonal(powers)
     columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.trend)
+    # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there: first
+    # the derivatives to the coefficients of all monic fractions.
+    monic, by_a, first, column = np.zeros((columns.size, shared)), np.zeros((n, shared)), 0, 0
+    for k, ((b, a), own) in enumerate(zip(fractions, powers, strict=True)):
+        order, m = a.size - 1, b.size - 1
+        states = slice(first, first + order)
+        by_a[states, column : column + order] = -own.T
+        coefficients = np.column_stack((-own.T @ a[1:], own.T))[:, order - m :]
+        monic[states, column + order : column + order + m + 1] = coefficients
+        if m == order:
+            monic[columns.u, column + order] = 1.0
+        first, column = first + order, column + order + m + 1
+    monic[n : 2 * n] = by_a
+    count = chain_rule.shape[1]
+    common = np.zeros((columns.size, layout.size + 1))
+    common[:, :count] = monic @ chain_rule
+    if structure.delay:
+        common[:n, count], common[columns.u, count] = -(output @ F), -(output @ g)
+    common[:n, -1], common[columns.u, -1], common[columns.u + 1, -1] = -output, -direct.sum(), 1.0
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
         own = theta[first : first + layout.own]
         state = own[:n] if layout.initial_state else np.zeros(n)
-        form = Chain(*sections, F, g, F, g).driving(output, direct, state @ powers)
-        # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
-        wanted = np.zeros((columns.size, layout.size + 1))
-        states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]
-        driven[:, :n] = -powers.T
-        filtered = powers.T
-        coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
-        states[:, n : n + m + 1] = coefficients
-        if m == n:
-            now[n] = 1.0
-        if structure.delay:
-            states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
+        form = Chain(rows, F, g, F, g).driving(output, direct, state @ free_powers)
+        wanted = common.copy()
         if layout.initial_state:
             alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
-            driven_alone[:, :n] = -powers.T
-            alone[:, first : first + n] = powers.T
+            driven_alone[:, :count] = by_a @ chain_rule
+            alone[:, first : first + n] = free_powers.T
         wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
-        states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
-        result.append((rows[:, :-1], rows[:, -1].copy()))
+        found = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
+        result.append((found[:, :-1], found[:, -1].copy()))
     return result
 
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import Box, Point, box_of, point_of, widened
-from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.chain import all_numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Local
@@ -191,7 +191,7 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
     assert best.ending is not None
     point, projected = best.point, best.projected
     a, known, n = point.denominator, search.known, point.poles.size
-    over = numerators(*search.problem.sections(point.speed, point.damping))
+    over = all_numerators(search.problem.rows(point.speed, point.damping))
     held = best.held[:n]
     b = projected.output @ over
     if projected.direct:

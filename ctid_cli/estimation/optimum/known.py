@@ -66,8 +66,8 @@ class KnownCoefficients:
         if self.all_poles:
             slopes[:, :n] = np.eye(n)
         elif self.places.size:
-            a = point.denominator[1:][self.places]
-            slopes[:, :n] = point.denominator_slopes()[self.places] / a[:, None]
+            a = point.coefficients[self.places]
+            slopes[:, :n] = point.coefficient_slopes()[self.places] / a[:, None]
         return slopes
 
     def met(self, point: Point, box: Box) -> Point | None:
@@ -76,7 +76,7 @@ class KnownCoefficients:
             return point
         values, last = np.log(self.denominator[self.places]), np.inf
         for _ in range(MOST_STEPS):
-            error = np.log(point.denominator[1:][self.places]) - values
+            error = np.log(point.coefficients[self.places]) - values
             size = float(np.abs(error).max())
             if size <= MET or ROUNDED >= size >= last:
                 return point
