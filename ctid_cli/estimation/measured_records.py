@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, liveliest_parts
+from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, best_sum, liveliest_parts, poles_of_submodels
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, chains_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
@@ -32,7 +32,7 @@ from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Model, Structure, SumStructure
 from ctid_cli.inference.signal_features import outliers
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
@@ -118,7 +118,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there: first
     # the derivatives to the coefficients of all monic fractions.
     monic, by_a, first, column = np.zeros((columns.size, shared)), np.zeros((n, shared)), 0, 0
-    for k, ((b, a), own) in enumerate(zip(fractions, powers, strict=True)):
+    for (b, a), own in zip(fractions, powers, strict=True):
         order, m = a.size - 1, b.size - 1
         states = slice(first, first + order)
         by_a[states, column : column + order] = -own.T
@@ -188,7 +188,7 @@ class MeasuredRecords:
     def __init__(
         self,
         records: Sequence[Record],
-        structure: Structure,
+        structure: Structure | SumStructure,
         treatment: Treatment,
         known: KnownCoefficients = NOTHING,
     ) -> None:
@@ -235,6 +235,8 @@ class MeasuredRecords:
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
         treatment = self.treatment
+        if isinstance(self.structure, SumStructure):
+            return False
         from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not treatment.integrators
         return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
 
@@ -269,7 +271,9 @@ class MeasuredRecords:
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
         layout, integrators = self.layout, self.treatment.integrators
-        return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
+        terms = self.structure.terms if isinstance(self.structure, SumStructure) else ()
+        free, trend = layout.initial_state, layout.trend
+        return Problem(data, self.structure.zeros, free, trend, periods, integrators=integrators, terms=terms)
 
     def part(self) -> "MeasuredRecords | None":
         """The liveliest parts of long records, each from a state of its own; None where they tell too little."""
@@ -328,8 +332,10 @@ class MeasuredRecords:
     def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-        A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
+        Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
+        if self.problem.terms:
+            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=nested, known=self.known)
         return best_output_error(
             self.problem,
             self.structure.poles - self.problem.integrators,
@@ -343,13 +349,15 @@ class MeasuredRecords:
 
     def local(self, *starts: tuple[Array, float]) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
+        if self.problem.terms:
+            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)
         poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
         return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
         """Which numbers an optimum has, and what they are."""
         layout = self.layout_of(found.model.order, self.structure.delay)
-        theta = layout.theta(found.model)
+        theta = layout.theta(found.additive or found.model)
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
             theta[first : first + layout.own] = [*state, *found.trends[k]]
@@ -360,13 +368,13 @@ class MeasuredRecords:
         parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
-    def squared_error_at(self, model: TransferFunction, delay: float) -> float:
+    def squared_error_at(self, model: Model, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""
         return local_minimum(
             self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
         ).squared_error
 
-    def errors_of(self, model: TransferFunction) -> AppliedModel:
+    def errors_of(self, model: Model) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
         layout = self.layout_of(model.order, delay=True)
         theta, residuals = layout.theta(model), []
@@ -381,13 +389,21 @@ class MeasuredRecords:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
-    def free_poles(self, model: TransferFunction) -> ComplexArray:
+    def free_poles(self, model: Model) -> ComplexArray:
         """The poles of a model but its integrators."""
+        if isinstance(model, AdditiveModel):
+            return poles_of_submodels(model)
         return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
 
     @property
     def given(self) -> BoolArray:
         """Which of the coefficients of the structure are known, those that integrators make zero among them."""
+        if isinstance(self.structure, SumStructure):
+            found = np.zeros(self.structure.size - int(self.structure.delay), dtype=bool)
+            if self.known is not NOTHING:
+                found[self.structure.denominators] = np.isfinite(self.known.denominator)
+                found[self.structure.numerators] = np.isfinite(self.known.numerator)
+            return found
         zeros = self.structure.zeros + 1
         if self.known is NOTHING:
             free = self.structure.poles - self.problem.integrators
@@ -397,7 +413,9 @@ class MeasuredRecords:
         return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
 
     def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Layout of the parameters for a number of poles, integrators among them."""
+        """Layout of the parameters for a number of poles, integrators among them; a sum has its own."""
+        if isinstance(self.structure, SumStructure):
+            return replace(self.layout, structure=replace(self.structure, delay=delay))
         return replace(self.layout, structure=Structure(poles, self.structure.zeros, delay))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:

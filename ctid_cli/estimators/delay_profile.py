@@ -419,7 +419,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
         weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
-        found: AppliedModel = weighed.errors_of(fit.model)
+        found: AppliedModel = weighed.errors_of(fit.parametrised)
         return found
 
 
@@ -529,13 +529,16 @@ def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
 
 def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
     """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
-    n, delay, fixed = layout.structure.poles, layout.structure.size - 1, fixed.copy()
+    delay, fixed = layout.structure.size - 1, fixed.copy()
     if found.delay_at_bound:
         fixed[delay] = True
     if not found.held_poles.size:
         return np.eye(layout.size)[:, ~fixed]
-    moving = np.pad(found.pole_slopes, ((0, layout.size - len(found.pole_slopes)), (0, 0)))
-    return np.column_stack((moving, np.eye(layout.size)[:, n:][:, ~fixed[n:]]))
+    places = layout.structure.denominators
+    moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
+    moving[places[: len(found.pole_slopes)]] = found.pole_slopes
+    fixed[places] = True
+    return np.column_stack((moving, np.eye(layout.size)[:, ~fixed]))
 
 
 def _check_clocks(records: Sequence[Record]) -> None:

@@ -295,7 +295,7 @@ def _cost_of_delay(
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
     profile = CostOfDelay(
-        cache(lambda trial: measured.squared_error_at(fit.model, trial)),
+        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial)),
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,

@@ -137,6 +137,13 @@ class SumStructure:
         """Places of the coefficients of the denominators."""
         return np.array([k for k, name in enumerate(self.names) if "_a" in name], dtype=np.intp)
 
+    @property
+    def numerators(self) -> IndexArray:
+        """Places of the coefficients of each numerator, in descending powers."""
+        last = np.cumsum([term.size for term in self.terms]).tolist()
+        places = [np.arange(end - 1, end - term.zeros - 2, -1) for end, term in zip(last, self.terms, strict=True)]
+        return np.concatenate(places).astype(np.intp)
+
     def theta_of(self, model: Model) -> Array:
         """Parameters of a model of this structure."""
         assert isinstance(model, AdditiveModel)
