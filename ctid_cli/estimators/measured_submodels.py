@@ -221,7 +221,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             loop_radius=problem.loop_radius(ordered),
             in_loop=self.closed,
             consistency=problem.consistency_margin(found.theta),
-            sampling=_sampling_margin(ordered, problem.data.interval),
+            sampling=sampling_margin(ordered, problem.data.interval),
             **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples(fit, laid_out)
@@ -285,7 +285,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
 
 
-def _sampling_margin(model: AdditiveModel, interval: float) -> float:
+def sampling_margin(model: AdditiveModel, interval: float) -> float:
     """Return the sampling frequency over twice the greatest imaginary part of a pole; NaN on an irregular clock."""
     fastest = float(np.abs(model.poles.imag).max(initial=0.0))
     if not interval > 0.0:
