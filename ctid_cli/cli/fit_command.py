@@ -18,6 +18,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Tool
 
 if TYPE_CHECKING:
+    from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.identification import Identification
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
@@ -93,7 +94,7 @@ def fit(
     asked = Asked(model, treatment, loop.use)
     options = options_of(asked)
     if asked.single and len(files) > 1:
-        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+        raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
     records = _records(files, validate, loop, columns, treatment)
     found = _identified(options, records, bootstrap)
     other = None if found.validation is None else found.validation.record
@@ -136,7 +137,7 @@ def _records(
 
 
 def _identified(
-    options: MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None
+    options: AdditiveOutputError | MeasuredSubmodels | LoopOutputError | Given, records: Records, bootstrap: int | None
 ) -> Identification:
     """Fit, with a bar of progress where it takes long."""
     from ctid_cli.identification.identify import identify

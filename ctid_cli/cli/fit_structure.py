@@ -18,6 +18,7 @@ from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, Los
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
     from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
@@ -186,8 +187,8 @@ class Asked:
 
     @property
     def iterated(self) -> bool:
-        """Whether the estimator is that of submodels, which knows the delay."""
-        return self.model.model == "additive" or self.loop == "reference"
+        """Whether the estimator is that with instruments from the loop, which knows the delay."""
+        return self.loop == "reference" or (self.model.model == "additive" and self.loop == "controller")
 
     @property
     def single(self) -> bool:
@@ -214,11 +215,14 @@ def as_usage_errors() -> Iterator[None]:
         raise UsageError(re.sub(r"^fixed\b", "--fix", re.sub(r"^noise_model\b", "--noise", str(error)))) from None
 
 
-def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
+def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOutputError | Given:
     """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
     _refuse_other_form(asked)
     if asked.simulated:
         return _in_loop(asked)
+    if asked.model.model == "additive" and not asked.iterated:
+        with as_usage_errors():
+            return _sum(asked)
     if not asked.iterated:
         return _given(asked)
     _refuse_unable(asked)
@@ -269,6 +273,22 @@ def _in_loop(asked: Asked) -> LoopOutputError:
     with as_usage_errors():
         degrees = asked.model.poles, asked.model.zeros or 0
         return LoopOutputError(*degrees, asked.delay, state, offset, asked.integrators)
+
+
+def _sum(asked: Asked) -> AdditiveOutputError:
+    from ctid_cli.estimators.additive_output_error import AdditiveOutputError
+
+    treatment = asked.treatment
+    return AdditiveOutputError(
+        tuple(_terms(asked.model.terms or "", asked.integrators)),
+        asked.delay,
+        treatment.initial_state or "rest",
+        treatment.offset or "none",
+        treatment.loss,
+        fixed=_fixed(asked.model.fix),
+        input_before=treatment.level,
+        noise_model=treatment.noise,
+    )
 
 
 def _submodels(asked: Asked) -> MeasuredSubmodels:

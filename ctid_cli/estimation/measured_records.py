@@ -19,7 +19,13 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, best_sum, liveliest_parts, poles_of_submodels
+from ctid_cli.estimation.optimum.best_model import (
+    Optimum,
+    best_output_error,
+    best_sum,
+    liveliest_parts,
+    poles_of_submodels,
+)
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
 from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, chains_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
@@ -332,7 +338,8 @@ class MeasuredRecords:
     def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-        Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
+        Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an
+        unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
         if self.problem.terms:
             return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=nested, known=self.known)

@@ -549,9 +549,7 @@ def check_treatment(options: RecordsEstimator) -> None:
         )
     if options.input_before is not None and (options.initial_state != "rest" or options.offset == "remove"):
         given = f"got initial_state {options.initial_state} and offset {options.offset}"
-        raise OptionError(
-            "input_before", f"input_before goes with initial_state rest and no removed means; {given}"
-        )
+        raise OptionError("input_before", f"input_before goes with initial_state rest and no removed means; {given}")
     if options.integrators and options.initial_state == "periodic":
         raise OptionError(
             "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"

@@ -11,9 +11,11 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.estimators.loop_output_error import LoopFit
-from ctid_cli.estimators.measured_submodels import LaidOut, Options, SubmodelsFit
+from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
+from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
+from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
@@ -31,6 +33,9 @@ from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 from ctid_cli.text import Shown
 
+#: Estimators of measured records, and records as each of them lays them out.
+Options = DelayProfile | Rivc | AdditiveOutputError | MeasuredSubmodels | LoopOutputError
+LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
 #: Delays about the estimate at which its cost is computed to be drawn, and how far: in half-widths of the interval.
@@ -61,7 +66,7 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     Parameters
     ----------
-    options : DelayProfile, MeasuredSubmodels or LoopOutputError
+    options : DelayProfile, AdditiveOutputError, MeasuredSubmodels or LoopOutputError
         What was asked for.
     fit : MeasuredFit, SubmodelsFit or LoopFit
         The estimate.

@@ -12,11 +12,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_problem import Instruments
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
-from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
+from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
-from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
-from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
-from ctid_cli.estimators.rivc import Rivc
+from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
 from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
@@ -296,8 +294,3 @@ def sampling_margin(model: AdditiveModel, interval: float) -> float:
 def _padded(b: Array, size: int) -> Array:
     """Numerator with its declared length."""
     return np.concatenate((np.zeros(size - b.size), b))
-
-
-#: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | Rivc | MeasuredSubmodels | LoopOutputError
-LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop

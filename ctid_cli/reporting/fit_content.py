@@ -10,6 +10,7 @@ import numpy as np
 
 from ctid_cli.canonical import plain
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.loop_output_error import LoopFit
@@ -83,7 +84,8 @@ def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
     additive = additive_of(result.fit)
     if additive is not None:
-        return [replace(item, unit=_unit_in_sum(item.name, additive, units)) for item in result.estimates]
+        monic = isinstance(result.options, AdditiveOutputError)
+        return [replace(item, unit=_unit_in_sum(item.name, additive, units, monic)) for item in result.estimates]
     poles, zeros = result.fit.model.order, result.options.zeros
     # The states of a loop are those of plant and controller, in different units.
     nameless = "x" if isinstance(result.fit, LoopFit) else "-"
@@ -98,12 +100,16 @@ def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
     return fit.additive if isinstance(fit, SubmodelsFit) else None
 
 
-def _unit_in_sum(name: str, model: AdditiveModel, units: Units) -> str:
-    """Unit of a parameter of a sum, or of a coefficient of its free response."""
+def _unit_in_sum(name: str, model: AdditiveModel, units: Units, monic: bool) -> str:
+    """Unit of a parameter of a sum, or of a coefficient of its free response over monic denominators or others."""
     if name.startswith("g"):
         return units.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
-    if name == "delay":
-        return units.time
+    if not name.startswith("x"):
+        return units.of(name, 0, 0)
+    if monic:
+        # Coefficients go by falling powers.
+        place = [k for part in model.submodels for k in range(1, part.order + 1)][int(name[1:].split("_")[0]) - 1]
+        return units.of(f"x{place}", 0, 0)
     # c_k p^k/(p^l A) on an impulse.
     power = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)][int(name[1:]) - 1]
     times = units.time if power == 1 else f"{units.time}^{power}"

@@ -14,10 +14,11 @@ import pandas as pd
 from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.identification import Identification, Options
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, SubmodelsFit
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.intervals import BIASED
 from ctid_cli.inference.noise_estimate import NoiseEstimate
@@ -238,7 +239,7 @@ def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> s
 
 def _structure(options: Options) -> str:
     """Poles and zeros, of each submodel if there are several."""
-    if not isinstance(options, MeasuredSubmodels) or not options.factored:
+    if not isinstance(options, MeasuredSubmodels | AdditiveOutputError) or not options.factored:
         integrators = getattr(options, "integrators", 0)
         besides = f" and {count(integrators, 'integrator')}" * (integrators > 0)
         return f"{count(options.poles, 'pole')}, {count(options.zeros, 'zero')}{besides}"

@@ -275,9 +275,7 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
     )
 
 
-def _fraction_of(
-    problem: Problem, known: KnownCoefficients, point: Point, projected: Projected
-) -> tuple[Array, Array]:
+def _fraction_of(problem: Problem, known: KnownCoefficients, point: Point, projected: Projected) -> tuple[Array, Array]:
     """Return denominator, without its integrators, and numerator."""
     a = point.denominator
     b = projected.output @ all_numerators(problem.rows(point.speed, point.damping))

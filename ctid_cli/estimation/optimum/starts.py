@@ -179,7 +179,9 @@ class StructureSearch:
                 cells.add(cell)
                 # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
                 border = max(own, cell) * width
-                points += [point_of(point.poles, tau, self.box, cell, point.parts) for tau in ((cell + 0.5) * width, border)]
+                points += [
+                    point_of(point.poles, tau, self.box, cell, point.parts) for tau in ((cell + 0.5) * width, border)
+                ]
         return points
 
     def from_below(self, poles: int, zeros: int) -> list[Point]:
