@@ -20,6 +20,7 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
 from ctid_cli.estimation.optimum.best_model import (
+    Begin,
     Optimum,
     best_output_error,
     best_sum,
@@ -115,7 +116,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
         (sections,) = problem._replace(terms=(), integrators=term.integrators).rows(point.speed, point.damping)
         rows.append(sections)
         # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-        powers.append(np.linalg.inv(numerators(*sections)))
+        powers.append(np.asarray(np.linalg.inv(numerators(*sections)), dtype=float))
         if b.size == a.size:
             direct[k], b = b[0], (b - b[0] * a)[1:]
         outputs.append(np.concatenate((np.zeros(a.size - 1 - b.size), b)) @ powers[-1])
@@ -335,7 +336,7 @@ class MeasuredRecords:
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
         return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
-    def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
+    def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
         Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an
@@ -354,7 +355,7 @@ class MeasuredRecords:
             known=self.known,
         )
 
-    def local(self, *starts: tuple[Array, float]) -> Optimum:
+    def local(self, *starts: Begin) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
         if self.problem.terms:
             return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import LONG, Optimum
+from ctid_cli.estimation.optimum.best_model import LONG, Begin, Optimum
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
 
 #: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
@@ -28,7 +28,7 @@ def joint_optimum(
     measured: MeasuredRecords,
     found: Optimum,
     orders: Orders | None,
-    starts: Sequence[tuple[Array, float]],
+    starts: Sequence[Begin],
     *,
     nested: bool,
 ) -> JointOptimum:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.search import ROUNDING
 from ctid_cli.inference.robust_loss import Loss, RobustKind, scale_of
 
@@ -48,9 +48,7 @@ class RobustFit:
         return [x + loss.weight(r) * r for x, loss, r in each]
 
 
-def robust_fit(
-    measured: MeasuredRecords, kind: RobustKind, starts: Sequence[tuple[Array, float]], nested: bool
-) -> RobustFit:
+def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Begin], nested: bool) -> RobustFit:
     """Search for the least Huber loss, and from there for Tukey's.
 
     The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.

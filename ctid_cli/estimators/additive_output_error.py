@@ -12,7 +12,7 @@ from ctid_cli.errors import OptionError
 from ctid_cli.estimation.additive_problem import AdditiveProblem
 from ctid_cli.estimation.common import Fixed, Start, StartFrom, checked_bounds, places_of
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
-from ctid_cli.estimation.optimum.best_model import poles_of_submodels
+from ctid_cli.estimation.optimum.best_model import Begin, poles_of_submodels
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.robust_fit import robust_fit
 from ctid_cli.estimators.additive_srivc import check_submodels, check_terms
@@ -79,8 +79,6 @@ class AdditiveOutputError(RecordsEstimator):
 
     kind: ClassVar[str] = "additive_output_error"
     start_from: ClassVar[StartFrom | None] = "parameters"
-    #: Under a noise model the plant is searched once more near the output-error estimate only.
-    nested: ClassVar[bool] = False
     factored: ClassVar[bool] = True
 
     terms: tuple[Term, ...]
@@ -155,7 +153,8 @@ class AdditiveOutputError(RecordsEstimator):
         )
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> SubmodelsFit:
-        starts, method = [], GROWN
+        starts: list[Begin] = []
+        method = GROWN
         if start is not None and start.model is not None:
             check_submodels(start.model, self.terms)
             low, high = self.delay_bounds
@@ -165,7 +164,7 @@ class AdditiveOutputError(RecordsEstimator):
             found = measured.best(starts, True)
             fit = fitted(measured, found, None, None)
             if self.noise_model != "white":
-                fit = with_noise(measured, fit, found, self, starts)
+                fit = with_noise(measured, fit, found, self.noise_model, starts)
         else:
             robust = robust_fit(measured, self.loss, starts, True)
             fit = fitted(measured, robust.found, None, robust)

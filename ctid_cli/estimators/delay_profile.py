@@ -12,7 +12,7 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.noise_search import joint_optimum
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.profile_search import Profile, search_delay
@@ -225,7 +225,6 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
     loss: LossKind
     input_before: InputBefore
     noise_model: str
-    nested: bool
     integrators: int
 
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
@@ -391,7 +390,7 @@ class DelayProfile(RecordsEstimator):
                     found = measured.best(starts, self.nested)
                     fit = fitted(measured, found, profile, None)
                     if self.noise_model != "white":
-                        fit = with_noise(measured, fit, found, self, starts)
+                        fit = with_noise(measured, fit, found, self.noise_model, starts, nested=self.nested)
                 else:
                     robust = robust_fit(measured, self.loss, starts, self.nested)
                     fit = fitted(measured, robust.found, profile, robust)
@@ -462,11 +461,13 @@ def with_noise(
     measured: MeasuredRecords,
     beside: MeasuredFit,
     found: Optimum,
-    options: RecordsEstimator,
-    starts: Sequence[tuple[Array, float]],
+    noise_model: str,
+    starts: Sequence[Begin],
+    *,
+    nested: bool = False,
 ) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
-    joint = joint_optimum(measured, found, orders_of(options.noise_model), starts, nested=options.nested)
+    joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
     search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
     fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
     law = beside.uncertainty("robust")
@@ -477,7 +478,7 @@ def with_noise(
         noise=joint.noise.noise,
         covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
         deviance=joint.noise.deviance,
-        chosen=options.noise_model == "auto",
+        chosen=noise_model == "auto",
         output_error=beside.theta,
         output_error_errors=errors,
         output_error_fit=beside.fit_percent,

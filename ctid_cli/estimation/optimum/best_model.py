@@ -29,6 +29,10 @@ AS_GOOD, EXPLAINED = 1.5, 0.05
 LONG, PART = 100_000, 20_000
 
 
+#: Where a search starts: a denominator, or in a sum the poles of one submodel after the other; and a delay.
+Begin = tuple[Any, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
@@ -65,8 +69,8 @@ class Optimum:
     additive: AdditiveModel | None = None
 
     @property
-    def start(self) -> tuple[Any, float]:
-        """Where a search may start: the denominator, or the poles of one submodel after the other, and the delay."""
+    def start(self) -> Begin:
+        """Where a search for this model may start."""
         if self.additive is None:
             return self.denominator, self.delay
         return poles_of_submodels(self.additive), self.delay
@@ -182,7 +186,7 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
 def best_sum(
     problem: Problem,
     delays: tuple[float, float],
-    starts: Sequence[tuple[ComplexArray, float]],
+    starts: Sequence[Begin],
     *,
     grown: bool = True,
     known: KnownCoefficients = NOTHING,

@@ -18,9 +18,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering import kernels
@@ -28,6 +29,7 @@ from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_s
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
 
+Number = TypeVar("Number", np.float64, np.complex128)
 #: Samples that are filtered at a time, which bounds the memory of a long record.
 PIECE = 4096
 
@@ -135,12 +137,12 @@ def split(speed: Array, damping: Array, parts: Sequence[int]) -> Rows:
     return [(speed[begin:end], damping[begin:end]) for begin, end in zip(first, last, strict=True)]
 
 
-def block_diagonal(blocks: Sequence[Array]) -> Array:
+def block_diagonal(blocks: Sequence[NDArray[Number]]) -> NDArray[Number]:
     """Return a matrix with blocks along its diagonal."""
     if len(blocks) == 1:
         return blocks[0]
     rows, columns = (np.cumsum([0, *(block.shape[axis] for block in blocks)]) for axis in (0, 1))
-    whole = np.zeros((rows[-1], columns[-1]), np.result_type(*blocks))
+    whole = np.zeros((rows[-1], columns[-1]), blocks[0].dtype)
     for k, block in enumerate(blocks):
         whole[rows[k] : rows[k + 1], columns[k] : columns[k + 1]] = block
     return whole
