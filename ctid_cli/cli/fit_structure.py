@@ -350,10 +350,8 @@ def check_integrators(integrators: int, offset: Offset, instead: str = "--offset
 
 
 def _refuse_unable(asked: Asked) -> None:
-    """What refined instrumental variables at a known delay cannot do."""
-    in_loop = asked.loop != "none"
-    what = "a record in a loop" if in_loop else "a sum of submodels"
-    what = "the reference as an instrument" if asked.loop == "reference" else what
+    """What refined instrumental variables in a loop, at a known delay, cannot do."""
+    what = "the reference as an instrument" if asked.loop == "reference" else "a sum of submodels in a loop"
     low, high = asked.delay
     if low < high:
         instead = "; with the controller (--loop FILE) it can be searched" * (asked.loop == "reference")
@@ -364,11 +362,11 @@ def _refuse_unable(asked: Asked) -> None:
     _refuse_of_loop(asked, what)
     if asked.treatment.offset in ("estimate", "drift"):
         raise UsageError(f"--offset {asked.treatment.offset} is not available for {what}; use --offset remove")
-    if in_loop and asked.treatment.hold not in ("auto", "zoh"):
+    if asked.treatment.hold not in ("auto", "zoh"):
         raise UsageError(
             f"--hold {asked.treatment.hold} does not go with --reference: a discrete controller holds its input (zoh)"
         )
-    if in_loop and asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
+    if asked.model.fix and asked.model.model == "fraction" and not asked.integrators:
         raise UsageError("--fix in a loop goes by the names of submodels; add --model additive --terms POLES/ZEROS")
 
 
@@ -380,7 +378,7 @@ def _refuse_of_loop(asked: Asked, what: str = "a record in a loop") -> None:
         why = "it is fitted by squares"
         raise UsageError(f"--loss {asked.treatment.loss} is not available for {what}: {why}; drop --loss")
     if asked.treatment.noise != "white":
-        direct = ", or fit to the input with --direct" * (asked.loop != "none")
+        direct = ", or fit to the input with --direct"
         raise UsageError(f"--noise {asked.treatment.noise} is not available for {what}; drop --noise{direct}")
 
 

@@ -137,7 +137,6 @@ def refused(ctid, tmp_path, *arguments):
         (("--poles", 2, "--noise", "auto", "--loss", "tukey"), ["--noise", "loss squares"]),
         (("--poles", 2, "--predict", 5), ["--predict", "add --noise auto"]),
         (("--poles", 2, "--noise", "auto", "--predict", 0), ["--predict", "at least 1"]),
-        (("--model", "additive", "--terms", "2/0", "--noise", "auto"), ["--noise auto", "a sum of submodels"]),
     ],
 )
 def test_a_bad_option_is_one_sentence(arguments, expected, ctid, record, tmp_path):
