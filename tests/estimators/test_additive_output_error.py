@@ -59,7 +59,8 @@ def test_the_delay_is_searched_and_every_parameter_is_near_the_truth():
     assert fit.status is Status.CONVERGED
     for name, value in (*TWO.parameters.items(), ("delay", TWO.delay)):
         assert fit.parameters[name] == pytest.approx(value, abs=4 * fit.standard_errors[name])
-    assert fit.consistency > 1.0 and fit.sampling > 1.0
+    assert fit.consistency > 1.0
+    assert fit.sampling > 1.0
 
 
 def test_records_share_the_model_and_have_their_own_offsets():

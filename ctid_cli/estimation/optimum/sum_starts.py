@@ -55,7 +55,8 @@ class SumGrowth:
         found: list[Local] = []
         bases = [(local.point.poles, local.point.delay.seconds) for local in known]
         # The whole range of the delay for what comes first.
-        bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in search.delays(FIRST_DELAYS)]
+        delays = search.delays(FIRST_DELAYS) or [self.box.delays[0]]
+        bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in delays]
         starts: list[Point] = []
         for roots, delay in bases:
             added = order - roots.size
