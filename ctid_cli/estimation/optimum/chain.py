@@ -141,7 +141,8 @@ def block_diagonal(blocks: Sequence[NDArray[Number]]) -> NDArray[Number]:
     """Return a matrix with blocks along its diagonal."""
     if len(blocks) == 1:
         return blocks[0]
-    rows, columns = (np.cumsum([0, *(block.shape[axis] for block in blocks)]) for axis in (0, 1))
+    rows = np.cumsum([0, *(len(block) for block in blocks)])
+    columns = np.cumsum([0, *(block.shape[1] for block in blocks)])
     whole = np.zeros((rows[-1], columns[-1]), blocks[0].dtype)
     for k, block in enumerate(blocks):
         whole[rows[k] : rows[k + 1], columns[k] : columns[k + 1]] = block
