@@ -33,6 +33,7 @@ from .estimators.srivc import Srivc as Srivc
 from .estimators.td_srivc import TdSrivc as TdSrivc
 from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
 from .estimators.delay_profile import DelayProfile as DelayProfile
+from .estimators.additive_output_error import AdditiveOutputError as AdditiveOutputError
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.loop_output_error import LoopOutputError as LoopOutputError
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels

@@ -41,6 +41,7 @@ KINDS: dict[str, dict[str, str]] = {
         "delay_profile": "ctid_cli.estimators.delay_profile:DelayProfile",
         "rivc": "ctid_cli.estimators.rivc:Rivc",
         "additive_srivc": "ctid_cli.estimators.additive_srivc:AdditiveSrivc",
+        "additive_output_error": "ctid_cli.estimators.additive_output_error:AdditiveOutputError",
         "loop_output_error": "ctid_cli.estimators.loop_output_error:LoopOutputError",
     },
     "frequency_estimator": {

@@ -123,7 +123,7 @@ def _fit_of_records(
     loop.check()
     options = options_of(asked)
     if asked.single and len(files) > 1:
-        raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")
+        raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
     hold = "zoh" if asked.treatment.hold == "auto" else asked.treatment.hold
     records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
     judging.check(asked.treatment.noise, {record.name: record.n_samples for record in records.all})

@@ -18,6 +18,7 @@ from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, Los
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
     from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
@@ -208,8 +209,8 @@ class Asked:
 
     @property
     def iterated(self) -> bool:
-        """Whether the estimator is that of submodels, which knows the delay."""
-        return self.model.model == "additive" or self.loop == "reference"
+        """Whether the estimator is that with instruments from the loop, which knows the delay."""
+        return self.loop == "reference" or (self.model.model == "additive" and self.loop == "controller")
 
     @property
     def single(self) -> bool:
@@ -226,8 +227,9 @@ def as_usage_errors() -> Iterator[None]:
         raise UsageError(re.sub(r"^fixed\b", "--fix", re.sub(r"^noise_model\b", "--noise", str(error)))) from None
 
 
-def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
+def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOutputError | Given:
     """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
+    from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 
@@ -249,20 +251,19 @@ def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
             degrees = model.poles or 0, model.zeros or 0
             return LoopOutputError(*degrees, bounds, state, offset, model.integrators or 0)
         if asked.iterated:
-            instruments: dict[LoopUse, Instruments] = {
-                "none": "open_loop",
-                "reference": "reference",
-                "controller": "closed_loop",
-            }
+            instruments: Instruments = "reference" if asked.loop == "reference" else "closed_loop"
             return MeasuredSubmodels(
                 model.submodels,
                 bounds[0],
-                instruments[asked.loop],
+                instruments,
                 state,
                 offset,
                 factored=model.model == "additive" or bool(model.integrators),
                 fixed=model.fixed,
             )
+        if model.model == "additive":
+            known: Any = {"fixed": model.fixed, "input_before": treatment.level, "noise_model": treatment.noise}
+            return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss, **known)
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if model.fix and model.zeros is None else model.zeros
     given = replace(given_of(model, treatment, treatment.hold), poles=model.poles, zeros=zeros, fixed=model.fixed)
@@ -319,19 +320,19 @@ def _what(asked: Asked) -> str:
     """Return what an estimator of one record is for."""
     if asked.loop == "reference":
         return "the reference as an instrument"
-    return "a sum of submodels" if asked.loop == "none" else "a record in a loop"
+    return "a record in a loop" if asked.simulated else "a sum of submodels in a loop"
 
 
 def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     """Yield what submodels and simulated loops cannot do: whether it is asked for, the option, and a remedy."""
-    model, treatment, loop = asked.model, asked.treatment, asked.loop != "none"
+    model, treatment = asked.model, asked.treatment
     state, offset, hold = treatment.initial_state, treatment.offset, treatment.hold
     low, high = model.bounds or (0.0, 0.0)
     yield treatment.input_before is not None, "--input-before", "use --initial-state estimate"
     yield treatment.loss != "squares", f"--loss {treatment.loss}", "drop --loss"
-    direct = ", or fit to the input with --direct" * loop
-    yield treatment.noise != "white", f"--noise {treatment.noise}", f"drop --noise{direct}"
-    one_fraction = loop and model.model == "fraction" and not (asked.iterated and model.integrators)
+    direct = "drop --noise, or fit to the input with --direct"
+    yield treatment.noise != "white", f"--noise {treatment.noise}", direct
+    one_fraction = model.model == "fraction" and not (asked.iterated and model.integrators)
     names = "its names are those of submodels: add --model additive --terms POLES/ZEROS"
     yield bool(model.fix) and one_fraction, "--fix", names
     if asked.simulated:
@@ -342,4 +343,4 @@ def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     one_value = f"the delay must be known: give one value, --delay VALUE{controller}"
     yield low < high, f"a search of the delay (--delay {model.delay})", one_value
     yield offset in ("estimate", "drift"), f"--offset {offset}", "use --offset remove"
-    yield loop and hold not in ("auto", "zoh"), f"--hold {hold}", "a discrete controller holds its input: use zoh"
+    yield hold not in ("auto", "zoh"), f"--hold {hold}", "a discrete controller holds its input: use zoh"

@@ -19,9 +19,16 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, most_active_parts
+from ctid_cli.estimation.optimum.best_model import (
+    Begin,
+    Optimum,
+    best_output_error,
+    best_sum,
+    most_active_parts,
+    poles_of_submodels,
+)
 from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
-from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
+from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, chains_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
@@ -31,9 +38,9 @@ from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.inference.sensitivities import Model, Structure, SumStructure
 from ctid_cli.inference.signal_features import outliers
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
@@ -49,7 +56,7 @@ RANDOM_STARTS = 2
 class Layout:
     """Which numbers stand where in the parameter vector: coefficients, delay, then each experiment's own."""
 
-    structure: Structure
+    structure: Structure | SumStructure
     experiments: int = 1
     initial_state: bool = False
     #: Powers of time.
@@ -77,15 +84,9 @@ class Layout:
             names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
         return tuple(names)
 
-    def theta(self, model: TransferFunction) -> Array:
+    def theta(self, model: Model) -> Array:
         """The parameters of a model of this structure, and zeros for what belongs to the experiments."""
-        theta, n = np.zeros(self.size), self.structure.poles
-        theta[:n] = model.denominator[1:]
-        last = n + self.structure.zeros + 1
-        theta[last - model.numerator.size : last] = model.numerator
-        if self.structure.delay:
-            theta[last] = model.delay
-        return theta
+        return np.concatenate((self.structure.theta_of(model), np.zeros(self.experiments * self.own)))
 
     def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
         """Initial state and offset of one experiment."""
@@ -105,43 +106,57 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
     The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
     problem has integrators.
     """
-    structure, n, m = layout.structure, layout.structure.poles, layout.structure.zeros
-    a, b = np.concatenate(([1.0], theta[:n])), theta[n : n + m + 1]
-    stable = np.roots(a[: n + 1 - problem.integrators]).astype(complex)
-    point = point_of(stable, theta[n + m + 1] if structure.delay else delay, ANYWHERE)
-    sections = problem.sections(point.speed, point.damping)
-    F, g = chain_dynamics(*sections)
-    # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-    powers = np.linalg.inv(numerators(*sections))
-    direct = b[0] if m == n else 0.0
-    output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
+    structure, n = layout.structure, layout.structure.poles
+    fractions, chain_rule = structure.fractions_of(theta)
+    shared = len(chain_rule)
+    delay = theta[structure.size - 1] if structure.delay else delay
+    terms, rows, powers, outputs, direct = problem.submodels(n).terms, [], [], [], np.zeros(len(fractions))
+    for k, ((b, a), term) in enumerate(zip(fractions, terms, strict=True)):
+        stable = np.roots(a[: term.poles + 1]).astype(complex)
+        point = point_of(stable, delay, ANYWHERE)
+        (sections,) = problem._replace(terms=(), integrators=term.integrators).rows(point.speed, point.damping)
+        rows.append(sections)
+        # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
+        powers.append(np.asarray(np.linalg.inv(numerators(*sections)), dtype=float))
+        if b.size == a.size:
+            direct[k], b = b[0], (b - b[0] * a)[1:]
+        outputs.append(np.concatenate((np.zeros(a.size - 1 - b.size), b)) @ powers[-1])
+    (F, g), output, free_powers = chains_dynamics(rows), np.concatenate(outputs), block_diagonal(powers)
     columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.trend)
+    # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there: first
+    # the derivatives to the coefficients of all monic fractions.
+    monic, by_a, first, column = np.zeros((columns.size, shared)), np.zeros((n, shared)), 0, 0
+    for (b, a), own in zip(fractions, powers, strict=True):
+        order, m = a.size - 1, b.size - 1
+        states = slice(first, first + order)
+        by_a[states, column : column + order] = -own.T
+        coefficients = np.column_stack((-own.T @ a[1:], own.T))[:, order - m :]
+        monic[states, column + order : column + order + m + 1] = coefficients
+        if m == order:
+            monic[columns.u, column + order] = 1.0
+        first, column = first + order, column + order + m + 1
+    monic[n : 2 * n] = by_a
+    count = chain_rule.shape[1]
+    common = np.zeros((columns.size, layout.size + 1))
+    common[:, :count] = monic @ chain_rule
+    if structure.delay:
+        common[:n, count], common[columns.u, count] = -(output @ F), -(output @ g)
+    common[:n, -1], common[columns.u, -1], common[columns.u + 1, -1] = -output, -direct.sum(), 1.0
     result = []
     for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
         first = layout.first(k)
         own = theta[first : first + layout.own]
         state = own[:n] if layout.initial_state else np.zeros(n)
-        form = Chain(*sections, F, g, F, g).driving(output, direct, state @ powers)
-        # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
-        wanted = np.zeros((columns.size, layout.size + 1))
-        states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]
-        driven[:, :n] = -powers.T
-        filtered = powers.T
-        coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
-        states[:, n : n + m + 1] = coefficients
-        if m == n:
-            now[n] = 1.0
-        if structure.delay:
-            states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
+        form = Chain(rows, F, g, F, g).driving(output, direct, state @ free_powers)
+        wanted = common.copy()
         if layout.initial_state:
             alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
-            driven_alone[:, :n] = -powers.T
-            alone[:, first : first + n] = powers.T
+            driven_alone[:, :count] = by_a @ chain_rule
+            alone[:, first : first + n] = free_powers.T
         wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
-        states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
-        result.append((rows[:, :-1], rows[:, -1].copy()))
+        found = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
+        result.append((found[:, :-1], found[:, -1].copy()))
     return result
 
 
@@ -181,7 +196,7 @@ class MeasuredRecords:
     def __init__(
         self,
         records: Sequence[Record],
-        structure: Structure,
+        structure: Structure | SumStructure,
         treatment: Treatment,
         known: KnownCoefficients = NOTHING,
     ) -> None:
@@ -228,6 +243,8 @@ class MeasuredRecords:
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
         treatment = self.treatment
+        if isinstance(self.structure, SumStructure):
+            return False
         from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not treatment.integrators
         return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
 
@@ -262,7 +279,9 @@ class MeasuredRecords:
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
         layout, integrators = self.layout, self.treatment.integrators
-        return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
+        terms = self.structure.terms if isinstance(self.structure, SumStructure) else ()
+        free, trend = layout.initial_state, layout.trend
+        return Problem(data, self.structure.zeros, free, trend, periods, integrators=integrators, terms=terms)
 
     def part(self) -> "MeasuredRecords | None":
         """The most active parts of long records, each from a state of its own; None where they tell too little."""
@@ -328,11 +347,14 @@ class MeasuredRecords:
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
         return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
-    def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
+    def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-        A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
+        Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an
+        unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
+        if self.problem.terms:
+            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=nested, known=self.known)
         return best_output_error(
             self.problem,
             self.structure.poles - self.problem.integrators,
@@ -344,15 +366,17 @@ class MeasuredRecords:
             known=self.known,
         )
 
-    def local(self, *starts: tuple[Array, float]) -> Optimum:
+    def local(self, *starts: Begin) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
+        if self.problem.terms:
+            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)
         poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
         return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
         """Which numbers an optimum has, and what they are."""
         layout = self.layout_of(found.model.order, self.structure.delay)
-        theta = layout.theta(found.model)
+        theta = layout.theta(found.additive or found.model)
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
             theta[first : first + layout.own] = [*state, *found.trends[k]]
@@ -363,13 +387,13 @@ class MeasuredRecords:
         parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
-    def squared_error_at(self, model: TransferFunction, delay: float) -> float:
+    def squared_error_at(self, model: Model, delay: float) -> float:
         """Least sum of squared output errors at a given delay, in the basin of a model."""
         return local_minimum(
             self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
         ).squared_error
 
-    def errors_of(self, model: TransferFunction) -> AppliedModel:
+    def errors_of(self, model: Model) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
         layout = self.layout_of(model.order, delay=True)
         theta, residuals = layout.theta(model), []
@@ -384,13 +408,21 @@ class MeasuredRecords:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
-    def free_poles(self, model: TransferFunction) -> ComplexArray:
+    def free_poles(self, model: Model) -> ComplexArray:
         """The poles of a model but its integrators."""
+        if isinstance(model, AdditiveModel):
+            return poles_of_submodels(model)
         return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
 
     @property
     def given(self) -> BoolArray:
         """Which of the coefficients of the structure are known, those that integrators make zero among them."""
+        if isinstance(self.structure, SumStructure):
+            found = np.zeros(self.structure.size - int(self.structure.delay), dtype=bool)
+            if self.known is not NOTHING:
+                found[self.structure.denominators] = np.isfinite(self.known.denominator)
+                found[self.structure.numerators] = np.isfinite(self.known.numerator)
+            return found
         zeros = self.structure.zeros + 1
         if self.known is NOTHING:
             free = self.structure.poles - self.problem.integrators
@@ -400,7 +432,9 @@ class MeasuredRecords:
         return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
 
     def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Layout of the parameters for a number of poles, integrators among them."""
+        """Layout of the parameters for a number of poles, integrators among them; a sum has its own."""
+        if isinstance(self.structure, SumStructure):
+            return replace(self.layout, structure=replace(self.structure, delay=delay))
         return replace(self.layout, structure=Structure(poles, self.structure.zeros, delay))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:

@@ -12,7 +12,7 @@ from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.noise_search import joint_optimum
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.profile_search import Profile, search_delay
@@ -221,8 +221,41 @@ class FittedSamples(NamedTuple):
         return FittedSamples(errors, slopes, tuple(left), None)
 
 
+class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
+    """What the estimators of records in open loop have in common."""
+
+    initial_state: InitialState
+    offset: Offset
+    loss: LossKind
+    input_before: InputBefore
+    noise_model: str
+    integrators: int
+
+    def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
+        """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
+        layout = measured.layout_of(fit.model.order, measured.structure.delay)
+        parts = sensitivities(measured.problem, layout, fit.theta, fit.model.delay)
+        return [data.y_used - eps for data, (_, eps) in zip(measured.problem.records, parts, strict=True)]
+
+    # --- what a fit is judged by -----------------------------------------------------------------------
+
+    def _acting(self, record: Record) -> Record:
+        """The record with what acts on the output from outside."""
+        return record
+
+    def _samples(self, fit: MeasuredFit, measured: Any) -> FittedSamples:
+        """What a fit says of each used sample, from its parameters."""
+        return samples_at(measured, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
+
+    def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
+        """The model on another record."""
+        weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
+        found: AppliedModel = weighed.errors_of(fit.parametrised)
+        return found
+
+
 @dataclass(frozen=True)
-class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
+class DelayProfile(RecordsEstimator):
     """Global search over the delay, refined on the output-error cost together with initial state and offset.
 
     Parameters
@@ -316,31 +349,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.noise_model != "white" and self.loss != "squares":
-            raise OptionError(
-                "noise_model", f"noise_model goes with loss squares, not {self.loss}: outliers have no ARMA model"
-            )
-        if self.integrators and self.offset == "remove":
-            raise OptionError(
-                "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
-            )
-        if self.integrators and self.offset == "drift":
-            raise OptionError(
-                "offset", "offset drift goes without integrators, whose estimated offset is a drift; use estimate"
-            )
-        if not (self.input_before in (None, "first") or np.isfinite(self.input_before)):
-            raise OptionError(
-                "input_before", f"input_before must be a finite number or first; got {self.input_before!r}"
-            )
-        if self.input_before is not None and (self.initial_state != "rest" or self.offset == "remove"):
-            given = f"got initial_state {self.initial_state} and offset {self.offset}"
-            raise OptionError(
-                "input_before", f"input_before goes with initial_state rest and no removed means; {given}"
-            )
-        if self.integrators and self.initial_state == "periodic":
-            raise OptionError(
-                "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"
-            )
+        check_treatment(self)
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
         allowed = self.order if low == high else self.order - 1
@@ -349,7 +358,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             given = f"got {self.zeros} zeros and {self.order} poles" + ", integrators included" * (self.integrators > 0)
             raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
         # Names are made of degrees that make sense only.
-        _check_stable(places_of(self.fixed, Structure(self.poles, self.zeros).names), self.poles)
+        check_stable(places_of(self.fixed, Structure(self.poles, self.zeros).names), self.poles)
 
     @property
     def order(self) -> int:
@@ -359,7 +368,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
         low, high = self.delay_bounds
         if self.noise_model != "white":
-            _check_clocks([records] if isinstance(records, Record) else records)
+            check_clocks([records] if isinstance(records, Record) else records)
         known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
         return MeasuredRecords(
             [records] if isinstance(records, Record) else list(records),
@@ -385,7 +394,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
                     found = measured.best(starts, self.nested)
                     fit = fitted(measured, found, profile, None)
                     if self.noise_model != "white":
-                        fit = _with_noise(measured, fit, found, self, starts)
+                        fit = with_noise(measured, fit, found, self.noise_model, starts, nested=self.nested)
                 else:
                     robust = robust_fit(measured, self.loss, starts, self.nested)
                     fit = fitted(measured, robust.found, profile, robust)
@@ -403,28 +412,6 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             return fitted(measured, found, None, None)
         robust = robust_local(measured, self.loss, found)
         return fitted(measured, robust.found, None, robust)
-
-    def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
-        """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
-        layout = measured.layout_of(fit.model.order, measured.structure.delay)
-        parts = sensitivities(measured.problem, layout, fit.theta, fit.model.delay)
-        return [data.y_used - eps for data, (_, eps) in zip(measured.problem.records, parts, strict=True)]
-
-    # --- what a fit is judged by -----------------------------------------------------------------------
-
-    def _acting(self, record: Record) -> Record:
-        """The record with what acts on the output from outside."""
-        return record
-
-    def _samples(self, fit: MeasuredFit, measured: Any) -> FittedSamples:
-        """What a fit says of each used sample, from its parameters."""
-        return samples_at(measured, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
-
-    def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
-        """The model on another record."""
-        weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
-        found: AppliedModel = weighed.errors_of(fit.model)
-        return found
 
 
 def fitted(
@@ -473,15 +460,17 @@ def fitted(
     )
 
 
-def _with_noise(
+def with_noise(
     measured: MeasuredRecords,
     beside: MeasuredFit,
     found: Optimum,
-    options: DelayProfile,
-    starts: Sequence[tuple[Array, float]],
+    noise_model: str,
+    starts: Sequence[Begin],
+    *,
+    nested: bool = False,
 ) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
-    joint = joint_optimum(measured, found, orders_of(options.noise_model), starts, nested=options.nested)
+    joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
     search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
     fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
     law = beside.uncertainty("robust")
@@ -492,7 +481,7 @@ def _with_noise(
         noise=joint.noise.noise,
         covariance=noise_covariance(joint.noise, fit.residuals, fit.used),
         deviance=joint.noise.deviance,
-        chosen=options.noise_model == "auto",
+        chosen=noise_model == "auto",
         output_error=beside.theta,
         output_error_errors=errors,
         output_error_fit=beside.fit_percent,
@@ -532,16 +521,46 @@ def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
 
 def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
     """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
-    n, delay, fixed = layout.structure.poles, layout.structure.size - 1, fixed.copy()
+    delay, fixed = layout.structure.size - 1, fixed.copy()
     if found.delay_at_bound:
         fixed[delay] = True
     if not found.held_poles.size:
         return np.eye(layout.size)[:, ~fixed]
-    moving = np.pad(found.pole_slopes, ((0, layout.size - len(found.pole_slopes)), (0, 0)))
-    return np.column_stack((moving, np.eye(layout.size)[:, n:][:, ~fixed[n:]]))
+    places = layout.structure.denominators
+    moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
+    moving[places[: len(found.pole_slopes)]] = found.pole_slopes
+    fixed[places] = True
+    return np.column_stack((moving, np.eye(layout.size)[:, ~fixed]))
 
 
-def _check_clocks(records: Sequence[Record]) -> None:
+def check_treatment(options: RecordsEstimator) -> None:
+    """Refuse what does not go together in the treatment of records."""
+    if options.noise_model != "white" and options.loss != "squares":
+        raise OptionError(
+            "noise_model", f"noise_model goes with loss squares, not {options.loss}: outliers have no ARMA model"
+        )
+    if options.integrators and options.offset == "remove":
+        raise OptionError(
+            "offset", "offset remove subtracts means, which an integrating output does not have; use estimate"
+        )
+    if options.integrators and options.offset == "drift":
+        raise OptionError(
+            "offset", "offset drift goes without integrators, whose estimated offset is a drift; use estimate"
+        )
+    if not (options.input_before in (None, "first") or np.isfinite(options.input_before)):
+        raise OptionError(
+            "input_before", f"input_before must be a finite number or first; got {options.input_before!r}"
+        )
+    if options.input_before is not None and (options.initial_state != "rest" or options.offset == "remove"):
+        given = f"got initial_state {options.initial_state} and offset {options.offset}"
+        raise OptionError("input_before", f"input_before goes with initial_state rest and no removed means; {given}")
+    if options.integrators and options.initial_state == "periodic":
+        raise OptionError(
+            "initial_state", "initial_state periodic cannot be: no integrating system has a period; use estimate"
+        )
+
+
+def check_clocks(records: Sequence[Record]) -> None:
     """Refuse clocks on which an ARMA noise has no meaning."""
     for record in records:
         if record.interval is None:
@@ -551,7 +570,7 @@ def _check_clocks(records: Sequence[Record]) -> None:
             )
 
 
-def _check_stable(known: Mapping[int, float], poles: int) -> None:
+def check_stable(known: Mapping[int, float], poles: int) -> None:
     """Refuse denominators that no stable model has."""
     for place, value in known.items():
         if place < poles and not value > 0:

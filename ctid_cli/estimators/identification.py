@@ -11,10 +11,12 @@ import numpy as np
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
-from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
-from ctid_cli.estimators.loop_output_error import LoopFit
-from ctid_cli.estimators.measured_submodels import LaidOut, Options, SubmodelsFit
+from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
+from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
+from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
+from ctid_cli.estimators.rivc import Rivc
 from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
@@ -33,6 +35,9 @@ from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 from ctid_cli.text import Shown
 
+#: Estimators of measured records, and records as each of them lays them out.
+Options = DelayProfile | Rivc | AdditiveOutputError | MeasuredSubmodels | LoopOutputError | FrequencyDomain
+LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
 #: Delays about the estimate at which its cost is computed to be drawn, and how far: in half-widths of the interval.
@@ -69,7 +74,7 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     Parameters
     ----------
-    options : DelayProfile, MeasuredSubmodels, LoopOutputError or FrequencyDomain
+    options : DelayProfile, AdditiveOutputError, MeasuredSubmodels, LoopOutputError or FrequencyDomain
         What was asked for.
     fit : MeasuredFit, SubmodelsFit, LoopFit or FrequencyDomainFit
         The estimate.
@@ -356,7 +361,7 @@ def _cost_of_delay(
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
     profile = CostOfDelay(
-        cache(lambda trial: measured.squared_error_at(fit.model, trial)),
+        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial)),
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,

@@ -12,12 +12,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.additive_problem import Instruments
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
-from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, without_means
+from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
-from ctid_cli.estimators.delay_profile import DelayProfile, FittedSamples, MeasuredFit
-from ctid_cli.estimators.frequency_domain import FrequencyDomain
-from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopOutputError
-from ctid_cli.estimators.rivc import Rivc
+from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
 from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
@@ -242,7 +239,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             loop_radius=problem.loop_radius(ordered),
             in_loop=self.closed,
             consistency=problem.consistency_margin(found.theta),
-            sampling=_sampling_margin(ordered, problem.data.interval),
+            sampling=sampling_margin(ordered, problem.data.interval),
             **quality(equations, float(np.sum((y - y.mean()) ** 2)), y.size),
         )
         samples = self._samples(fit, laid_out)
@@ -306,7 +303,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
 
 
-def _sampling_margin(model: AdditiveModel, interval: float) -> float:
+def sampling_margin(model: AdditiveModel, interval: float) -> float:
     """Return the sampling frequency over twice the greatest imaginary part of a pole; NaN on an irregular clock."""
     fastest = float(np.abs(model.poles.imag).max(initial=0.0))
     if not interval > 0.0:
@@ -317,8 +314,3 @@ def _sampling_margin(model: AdditiveModel, interval: float) -> float:
 def _padded(b: Array, size: int) -> Array:
     """Numerator with its declared length."""
     return np.concatenate((np.zeros(size - b.size), b))
-
-
-#: Estimators of measured records, and records as each of them lays them out.
-Options = DelayProfile | Rivc | MeasuredSubmodels | LoopOutputError | FrequencyDomain
-LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators import identification
-from ctid_cli.estimators.identification import Identification
-from ctid_cli.estimators.measured_submodels import Options
+from ctid_cli.estimators.identification import Identification, Options
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.choose import choose
@@ -31,7 +30,7 @@ def identify(
     ----------
     records : Record or sequence of Record
         One for each experiment.
-    options : DelayProfile, MeasuredSubmodels or Given, optional
+    options : DelayProfile, AdditiveOutputError, MeasuredSubmodels or Given, optional
         An estimator, of which nothing is chosen, or what is given; by default everything is chosen, the hold of the
         input too where it is known at the samples of the output.
     validation : Record, optional

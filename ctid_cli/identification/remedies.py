@@ -10,9 +10,11 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import CtidError
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.criterion import noise_of, penalised
 from ctid_cli.identification.held_back import compared, held_back_errors, long_enough
@@ -40,6 +42,8 @@ SAME = 1e-6
 #: Damping of a pair that is added.
 DAMPING = 0.3
 
+#: Estimators of sums of submodels.
+SUMS = MeasuredSubmodels | AdditiveOutputError
 Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
 #: Where a local search begins: a denominator without its integrators, and a delay [s].
 Near = tuple[Array, float]
@@ -151,7 +155,7 @@ def tried_remedies(
     if isinstance(options, LoopOutputError):
         # Changes are judged by what the input explains, and here it is not what drives the loop.
         return Trials([], [])
-    submodels = isinstance(options, MeasuredSubmodels)
+    submodels = isinstance(options, SUMS)
     # A record in a loop cannot be cut.
     most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
     part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
@@ -214,7 +218,7 @@ def _structures(base: Trial) -> Iterator[Change]:
     options = base.options
     if options.fixed or base.fit.poles_at_infinity:
         return
-    if isinstance(options, MeasuredSubmodels):
+    if isinstance(options, SUMS):
         yield from _submodels(base)
         return
     (denominator, delay), n, m = base.near, options.poles, options.zeros
@@ -447,10 +451,9 @@ def _at(values: Array, used: BoolArray, mask: BoolArray) -> Array:
 def typed(old: Any, new: Any) -> str:
     """Options of ``ctid fit`` that turn one estimator into another."""
     words = []
-    if isinstance(new, MeasuredSubmodels):
-        if old.terms != new.terms and new.factored:
-            words.append(f"--terms {','.join(f'{term.poles}/{term.zeros}' for term in new.terms)}")
-    elif old.delay_bounds != new.delay_bounds:
+    if isinstance(new, SUMS) and old.terms != new.terms and new.factored:
+        words.append(f"--terms {','.join(f'{term.poles}/{term.zeros}' for term in new.terms)}")
+    if old.delay_bounds != new.delay_bounds:
         words.append("--delay {:g}:{:g}".format(*new.delay_bounds))
     if not getattr(new, "factored", False) and (old.poles, old.zeros) != (new.poles, new.zeros):
         words += [f"--poles {new.poles} --zeros {new.zeros}"]

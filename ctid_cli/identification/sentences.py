@@ -1,7 +1,9 @@
 """What is said of each choice: the criterion against the runner-up."""
 
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options
+from ctid_cli.estimators.identification import Options
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
 from ctid_cli.text import count
@@ -21,7 +23,7 @@ NO_INTEGRATOR = (
 
 def spelled(options: Options) -> str:
     """Return a structure in words: poles, zeros and integrators, of each submodel if there are several."""
-    if not isinstance(options, MeasuredSubmodels) or not options.factored:
+    if not isinstance(options, MeasuredSubmodels | AdditiveOutputError) or not options.factored:
         zeros = count(options.zeros, "zero") if options.zeros else "no zero"
         return f"{count(options.poles, 'pole')}, {zeros}{_integrators(getattr(options, 'integrators', 0))}"
     terms = options.terms

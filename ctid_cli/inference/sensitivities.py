@@ -26,7 +26,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.filtering.bank import standard_rows
 from ctid_cli.filtering.filter_data import FilterData, filter_data
 from ctid_cli.filtering.simulate import feedthrough, simulate
-from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import pole_jacobian, unfactored
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 from ctid_cli.signals.held import HeldSignal
@@ -83,6 +83,98 @@ class Structure:
     def error_row(self) -> int:
         """Standard row of the output error."""
         return 3 * self.poles + 1
+
+    @property
+    def denominators(self) -> IndexArray:
+        """Places of the coefficients of the denominator."""
+        return np.arange(self.poles)
+
+    def theta_of(self, model: Model) -> Array:
+        """Parameters of a model of this structure."""
+        assert isinstance(model, TransferFunction)
+        theta = np.zeros(self.size)
+        theta[: self.poles] = model.denominator[1:]
+        last = self.poles + self.zeros + 1
+        theta[last - model.numerator.size : last] = model.numerator
+        theta[last:] = model.delay
+        return theta
+
+    def fractions_of(self, theta: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        """Return B and the monic A of each fraction, and the derivatives of their coefficients by the parameters."""
+        n, last = self.poles, self.poles + self.zeros + 1
+        return [(theta[n:last], np.concatenate(([1.0], theta[:n])))], np.eye(last)
+
+
+@dataclass(frozen=True)
+class SumStructure:
+    """Degrees of a sum of submodels and whether its delay is a parameter."""
+
+    terms: tuple[Term, ...]
+    delay: bool = False
+
+    @property
+    def poles(self) -> int:
+        """Number of poles, integrators included."""
+        return sum(term.order for term in self.terms)
+
+    @property
+    def zeros(self) -> int:
+        """Number of coefficients of all numerators, less one."""
+        return sum(term.zeros + 1 for term in self.terms) - 1
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return sum(term.size for term in self.terms) + int(self.delay)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameter names: those of the submodels and ``delay``."""
+        return names_of(self.terms) + ("delay",) * self.delay
+
+    @property
+    def denominators(self) -> IndexArray:
+        """Places of the coefficients of the denominators."""
+        return np.array([k for k, name in enumerate(self.names) if "_a" in name], dtype=np.intp)
+
+    @property
+    def numerators(self) -> IndexArray:
+        """Places of the coefficients of each numerator, in descending powers."""
+        last = np.cumsum([term.size for term in self.terms]).tolist()
+        places = [np.arange(end - 1, end - term.zeros - 2, -1) for end, term in zip(last, self.terms, strict=True)]
+        return np.concatenate(places).astype(np.intp)
+
+    def theta_of(self, model: Model) -> Array:
+        """Parameters of a model of this structure."""
+        assert isinstance(model, AdditiveModel)
+        return np.concatenate((model.theta, [model.delay] * self.delay))
+
+    def fractions_of(self, theta: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        """Return B and the monic A of each fraction, and the derivatives of their coefficients by the parameters.
+
+        The lowest coefficients of A are zero where there are integrators.
+        """
+        found, slopes, first, row = [], np.zeros((self.poles + self.zeros + 1, self.size - int(self.delay))), 0, 0
+        for term in self.terms:
+            n, width = term.poles, term.zeros + 1
+            monic, own = _monic(theta[first : first + term.size], n)
+            found.append((monic[n:], np.concatenate(([1.0], monic[:n], np.zeros(term.integrators)))))
+            columns = slice(first, first + term.size)
+            slopes[row : row + n, columns] = own[:n]
+            slopes[row + term.order : row + term.order + width, columns] = own[n:]
+            first, row = first + term.size, row + term.order + width
+        return found, slopes
+
+
+def _monic(theta: Array, n: int) -> tuple[Array, Array]:
+    """Return ``a_1 ... a_n, b_0 ... b_m`` of the monic fraction of a submodel, and their derivatives by its own."""
+    highest, size = (theta[n - 1] if n else 1.0), theta.size
+    # The constant term of A is 1; the others are in the order of descending powers.
+    order = [*range(n - 2, -1, -1), *[size] * (n > 0), *range(size - 1, n - 1, -1)]
+    values, slopes = np.append(theta, 1.0)[order] / highest, np.eye(size + 1)[order, :size] / highest
+    if n:
+        slopes[:, n - 1] -= values / highest
+    return values, slopes
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,12 +79,19 @@ class Units:
         power = int(coefficient[1:])
         return self._times("", power) if coefficient[0] == "a" else self._times(self.gain, power - integrators)
 
-    def in_sum(self, name: str, model: AdditiveModel) -> str:
-        """Unit of a parameter of a sum, or of a coefficient of its free response ``c_k p^k/(p^l A)`` on an impulse."""
-        if name == "delay":
-            return self.time
+    def in_sum(self, name: str, model: AdditiveModel, monic: bool = False) -> str:
+        """Unit of a parameter of a sum, or of a coefficient of its free response.
+
+        The free response is ``c_k p^k/(p^l A)`` on an impulse; with monic denominators they go
+        by falling powers.
+        """
         if name.startswith("g"):
             return self.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
+        if not name.startswith("x"):
+            return self.of(name, 0, 0)
+        if monic:
+            places = [k for part in model.submodels for k in range(1, part.order + 1)]
+            return self.of(f"x{places[int(name[1:].partition('_')[0]) - 1]}", 0, 0)
         powers = [k + 1 - part.integrators for part in model.submodels for k in range(part.order)]
         return self._times(self.output, powers[int(name[1:]) - 1])
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ctid_cli.canonical import plain
 from ctid_cli.estimation.optimum.box import Box
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.loop_output_error import LoopFit
@@ -97,12 +98,13 @@ def fit_content(
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
     additive, poles, zeros = additive_of(result.fit), result.fit.model.order, result.options.zeros
+    monic = isinstance(result.options, AdditiveOutputError)
     # The states of a loop are those of plant and controller, in different units.
     nameless = isinstance(result.fit, LoopFit)
 
     def unit(name: str) -> str:
         if additive is not None:
-            return units.in_sum(name, additive)
+            return units.in_sum(name, additive, monic)
         return "" if nameless and name.startswith("x") else units.of(name, poles, zeros)
 
     return [replace(item, unit=unit(item.name)) for item in result.estimates]

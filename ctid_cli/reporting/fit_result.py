@@ -13,9 +13,9 @@ import pandas as pd
 
 from ctid_cli.errors import StorageError
 from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.identification import Identification
+from ctid_cli.estimators.identification import Identification, Options
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import Options, SubmodelsFit
+from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.noise_estimate import NoiseEstimate

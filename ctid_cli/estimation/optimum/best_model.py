@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,12 +10,16 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.optimum.box import Box, Point, box_of, point_of, widened
-from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.chain import all_numerators, numerators, polynomial
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
-from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.projection import Problem, Projected
 from ctid_cli.estimation.optimum.search import Ending, Local
 from ctid_cli.estimation.optimum.starts import SAME, StructureSearch
+from ctid_cli.estimation.optimum.sum_starts import SumGrowth, in_order
 from ctid_cli.filtering.filter_data import FilterData
+from ctid_cli.inference.sensitivities import SumStructure
+from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 
 #: A model found from a part of the records is one of all of them if its mean squared error there is at most AS_GOOD
@@ -22,6 +27,10 @@ from ctid_cli.models.transfer_function import TransferFunction
 AS_GOOD, EXPLAINED = 1.5, 0.05
 #: Records of more samples than the first number are long; a part of them has the second.
 LONG, PART = 100_000, 20_000
+
+
+#: Where a search starts: a denominator, or in a sum the poles of one submodel after the other; and a delay.
+Begin = tuple[Any, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +65,15 @@ class Optimum:
     box: Box = field(repr=False)
     #: Poles at the origin, which the denominator does not have.
     integrators: int = 0
+    #: The submodels, where the model is a sum; numerator and denominator are then those of the sum.
+    additive: AdditiveModel | None = None
+
+    @property
+    def start(self) -> Begin:
+        """Where a search for this model may start."""
+        if self.additive is None:
+            return self.denominator, self.delay
+        return poles_of_submodels(self.additive), self.delay
 
     @property
     def model(self) -> TransferFunction:
@@ -165,6 +183,43 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     return _least(search, poles, zeros, True)
 
 
+def best_sum(
+    problem: Problem,
+    delays: tuple[float, float],
+    starts: Sequence[Begin],
+    *,
+    grown: bool = True,
+    known: KnownCoefficients = NOTHING,
+) -> Optimum:
+    """Return the least sum of squared output errors of a sum of submodels.
+
+    Searches start from the poles of one submodel after the other, and delays; ``grown``: these are looked at over the
+    whole range of the delay, and so are the poles that are found term by term.
+    """
+    box, order = box_of(problem, delays), sum(term.order for term in problem.terms)
+    if known.all_poles:
+        box, starts = widened(box, known.poles), [(known.poles, sum(delays) / 2)]
+    search = StructureSearch(problem, box, known=known)
+    points = [point_of(poles, delay, box, parts=problem.parts) for poles, delay in starts]
+    if grown:
+        points = [each for point in points for each in search.along_delay(problem.zeros, [point])]
+        if not known.all_poles:
+            part = part_of(problem, delays[1]) or problem
+            points += SumGrowth(part, box_of(part, delays)).points()
+    met = [point for point in (known.met(start, box) for start in points) if point is not None]
+    if not met:
+        raise DataError(
+            "no model with the fixed coefficients has all its poles where they are searched: "
+            f"{box.sentence('s')}; change or drop a fixed value"
+        )
+    search.refine(order, problem.zeros, met)
+    if grown:
+        search.refine(order, problem.zeros, search.close_delays(order, problem.zeros))
+    if known is NOTHING:
+        search.put_first(order, problem.zeros, in_order(search.best(order, problem.zeros), problem.terms, box))
+    return _least(search, order, problem.zeros, False)
+
+
 def best_near(search: StructureSearch, zeros: int, denominator: Array, delay: float) -> Optimum:
     """Return the least squared error in the basin of a denominator, without integrators, and a delay."""
     poles = denominator.size - 1
@@ -190,19 +245,16 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
     """Return the model in coefficients of polynomials."""
     assert best.ending is not None
     point, projected = best.point, best.projected
-    a, known, n = point.denominator, search.known, point.poles.size
-    over = numerators(*search.problem.sections(point.speed, point.damping))
+    known, n = search.known, point.poles.size
+    over = all_numerators(search.problem.rows(point.speed, point.damping))
     held = best.held[:n]
-    b = projected.output @ over
-    if projected.direct:
-        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(search.problem.integrators))
-    slopes = point.denominator_slopes()[:, ~held]
+    slopes = point.coefficient_slopes()[:, ~held]
+    additive = _sum_of(search.problem, known, point, projected) if search.problem.terms else None
+    if additive is None:
+        a, b = _fraction_of(search.problem, known, point, projected)
+    else:
+        a, b = (getattr(unfactored(additive), name) for name in ("denominator", "numerator"))
     if known is not NOTHING:
-        # The same up to rounding.
-        a[1:][known.places] = known.denominator[known.places]
-        given = np.isfinite(known.numerator)
-        b = b[b.size - given.size :]
-        b[given] = known.numerator[given]
         slopes = slopes @ null_space(known.slopes(point, n)[:, ~held])
     return Optimum(
         numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
@@ -222,8 +274,50 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
         agree=agree,
         evaluations=search.evaluations,
         box=search.box,
-        integrators=search.problem.integrators,
+        integrators=0 if additive else search.problem.integrators,
+        additive=additive,
     )
+
+
+def _fraction_of(problem: Problem, known: KnownCoefficients, point: Point, projected: Projected) -> tuple[Array, Array]:
+    """Return denominator, without its integrators, and numerator."""
+    a = point.denominator
+    b = projected.output @ all_numerators(problem.rows(point.speed, point.damping))
+    if projected.direct:
+        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(problem.integrators))
+    if known is not NOTHING:
+        # The same up to rounding.
+        a[1:][known.places] = known.denominator[known.places]
+        given = np.isfinite(known.numerator)
+        b = b[b.size - given.size :]
+        b[given] = known.numerator[given]
+    return a, b
+
+
+def _sum_of(problem: Problem, known: KnownCoefficients, point: Point, projected: Projected) -> AdditiveModel:
+    """Return the submodels of a sum; a DataError says that they cannot be told apart."""
+    rows, directs = problem.rows(point.speed, point.damping), problem.submodels(projected.output.size).directs
+    outputs = np.split(projected.output, np.cumsum([term.order for term in problem.terms])[:-1])
+    each = zip(rows, outputs, directs(projected.direct).tolist(), problem.terms, strict=True)
+    found = []
+    for own, output, direct, term in each:
+        a = polynomial(*own)
+        b = np.concatenate(([0.0], output @ numerators(*own))) + direct * a
+        found.append(Submodel(b[term.order - term.zeros :], a[: term.poles + 1], term.integrators))
+    model = AdditiveModel(found, point.delay.seconds)
+    if known is NOTHING:
+        return model
+    # The same up to rounding.
+    theta, structure = model.theta, SumStructure(problem.terms)
+    theta[structure.denominators[known.places]] = known.denominator[known.places]
+    given = np.isfinite(known.numerator)
+    theta[structure.numerators[given]] = known.numerator[given]
+    return AdditiveModel.from_theta(theta, problem.terms, model.delay)
+
+
+def poles_of_submodels(model: AdditiveModel) -> ComplexArray:
+    """Return the poles of each submodel but its integrators, one submodel after the other."""
+    return np.concatenate([np.roots(submodel.denominator) for submodel in model.submodels]).astype(complex)
 
 
 # --- a part of long records, on which searches find out where to start on the whole -------------------

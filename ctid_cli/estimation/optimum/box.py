@@ -18,7 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.optimum.chain import order_of, poles_of, polynomial, polynomial_slopes
+from ctid_cli.estimation.optimum.chain import (
+    Rows,
+    block_diagonal,
+    order_of,
+    poles_of,
+    polynomial,
+    polynomial_slopes,
+    split,
+)
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.frequency_lines import FrequencyLines
@@ -169,7 +177,7 @@ ANYWHERE = Box(0.0, np.inf, delays=(0.0, np.inf), least_damping=0.0)
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Sections, fastest first, and a delay."""
+    """Sections, fastest first, and a delay; in a sum the sections of each submodel, one submodel after the other."""
 
     speed: Array
     #: Damping of a pair; -1 marks a real pole.
@@ -177,6 +185,8 @@ class Point:
     #: Whether the imaginary part of a pair is at its bound.
     edge: BoolArray
     delay: Delay
+    #: Number of poles of each submodel of a sum; empty for one fraction.
+    parts: tuple[int, ...] = ()
 
     @property
     def poles(self) -> ComplexArray:
@@ -201,6 +211,31 @@ class Point:
     def denominator_slopes(self) -> Array:
         """Derivatives of ``a_1 ... a_n`` to the coordinates, shape (n, n)."""
         return np.asarray(polynomial_slopes(self.speed, self.damping) @ self.jacobian())
+
+    @property
+    def rows(self) -> Rows:
+        """Sections of each submodel."""
+        return split(self.speed, self.damping, self.parts) if self.parts else [(self.speed, self.damping)]
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients of the denominator ``a_1 ... a_n``; in a sum of each submodel, with the constant term 1."""
+        if not self.parts:
+            return self.denominator[1:]
+        return np.concatenate([a[-2::-1] / a[-1] for a in (polynomial(*own) for own in self.rows)])
+
+    def coefficient_slopes(self) -> Array:
+        """Their derivatives to the coordinates, shape (n, n)."""
+        if not self.parts:
+            return self.denominator_slopes()
+        found = []
+        for own in self.rows:
+            rising, slopes = (
+                polynomial(*own)[::-1],
+                np.vstack((np.zeros(order_of(own[1])), polynomial_slopes(*own)))[::-1],
+            )
+            found.append((slopes[1:] - np.outer(rising[1:] / rising[0], slopes[0])) / rising[0])
+        return np.asarray(block_diagonal(found) @ self.jacobian())
 
     def whole_sections(self, chosen: BoolArray) -> BoolArray:
         """All coordinates, or poles, of the sections of which one is chosen."""
@@ -306,12 +341,16 @@ def admissible(pole: complex, box: Box) -> complex:
     return complex(-real, copysign(imaginary, pole.imag))
 
 
-def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = None) -> Point:
-    """Admissible sections with given poles."""
-    moved = [admissible(pole, box) for pole in poles.tolist()]
-    units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in moved if p.imag > 0]
-    units += _real_sections(sorted(-p.real for p in moved if p.imag == 0), box)
-    units.sort(key=lambda unit: -unit[0])
+def point_of(
+    poles: ComplexArray, delay: float, box: Box, cell: int | None = None, parts: tuple[int, ...] = ()
+) -> Point:
+    """Admissible sections with given poles; those of the submodels of a sum are given one after the other."""
+    moved, units, first = [admissible(pole, box) for pole in poles.tolist()], [], 0
+    for size in parts or (len(moved),):
+        own, first = moved[first : first + size], first + size
+        each = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in own if p.imag > 0]
+        each += _real_sections(sorted(-p.real for p in own if p.imag == 0), box)
+        units += sorted(each, key=lambda unit: -unit[0])
     low, high = box.delays
     tau = min(max(float(delay), low), high)
     if cell is None:
@@ -321,6 +360,7 @@ def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = Non
         np.array([unit[1] for unit in units]),
         np.array([unit[2] for unit in units]),
         Delay(tau, cell),
+        parts,
     )
 
 
@@ -345,16 +385,16 @@ def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, boo
 def moved_by(point: Point, step: Array, box: Box) -> Point:
     """The point a step away, the delay in quarter periods last, moved back to the set where it leaves it."""
     speed, damping = point.shifted(step)
-    poles = Point(speed, damping, point.edge, point.delay).poles
+    poles = replace(point, speed=speed, damping=damping).poles
     tau = point.delay.seconds + (step[-1] * box.quarter if box.delay_free else 0.0)
     if point.delay.cell < 0:
-        return point_of(poles, tau, box)
+        return point_of(poles, tau, box, parts=point.parts)
     # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
     low, high = point.delay.cell * box.cell, (point.delay.cell + 1) * box.cell
     for edge in (low, high):
         if abs(tau - edge) < TOUCH * box.cell:
             tau = edge
-    return point_of(poles, tau, box, point.delay.cell if low <= tau <= high else None)
+    return point_of(poles, tau, box, point.delay.cell if low <= tau <= high else None, point.parts)
 
 
 def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:

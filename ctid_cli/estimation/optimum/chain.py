@@ -5,27 +5,32 @@ section before it; an integrator, of speed 0, is ``1/s``. The state ``s/w`` time
 itself, so that state i of n has, over the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states
 span all ``B/A u`` of degree m. Real poles may meet and become a pair.
 
+Submodels of a sum are rows of sections side by side: maps are then block diagonal, each with the blocks of its own
+sections, and nothing is divided by the difference of poles of two submodels.
+
 The *rows* of a form are ``z``, from which one map leads to the states of the sections, and ``w``, from which with z
 another one leads to the derivatives of ``x = B/A u`` to the poles. Partial fractions are fast, and their rows do not
 depend on B; where poles are so close that these would amplify rounding, the state space takes over.
 """
 
 import cmath
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import MODAL_CONDITION_LIMIT, Modes, Place, chain_states, modal_pass, to_steady_state
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
 
+Number = TypeVar("Number", np.float64, np.complex128)
 #: Samples that are filtered at a time, which bounds the memory of a long record.
 PIECE = 4096
 
@@ -121,9 +126,56 @@ def numerators(speed: Array, damping: Array) -> Array:
     return result
 
 
-def form_of(speed: Array, damping: Array, length: float) -> "Form":
+#: Speeds and dampings of the sections of each submodel; of a transfer function there is one.
+Rows = Sequence[tuple[Array, Array]]
+
+
+def split(speed: Array, damping: Array, parts: Sequence[int]) -> Rows:
+    """Return the sections of each of several submodels with so many poles."""
+    ends = np.cumsum(np.where(damping < 0.0, 1, 2))
+    last = np.searchsorted(ends, np.cumsum(parts), side="right").tolist()
+    first = [0, *last[:-1]]
+    return [(speed[begin:end], damping[begin:end]) for begin, end in zip(first, last, strict=True)]
+
+
+def block_diagonal(blocks: Sequence[NDArray[Number]]) -> NDArray[Number]:
+    """Return a matrix with blocks along its diagonal."""
+    if len(blocks) == 1:
+        return blocks[0]
+    rows = np.cumsum([0, *(len(block) for block in blocks)])
+    columns = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    whole = np.zeros((rows[-1], columns[-1]), blocks[0].dtype)
+    for k, block in enumerate(blocks):
+        whole[rows[k] : rows[k + 1], columns[k] : columns[k + 1]] = block
+    return whole
+
+
+def submodels_of(rows: Rows) -> IntArray:
+    """Return the submodel that each state belongs to, shape (n,)."""
+    return np.repeat(np.arange(len(rows)), [order_of(damping) for _, damping in rows])
+
+
+def chains_dynamics(rows: Rows) -> tuple[Array, Array]:
+    """Return dynamics F and gain g of all rows of sections side by side."""
+    each = [chain_dynamics(*own) for own in rows]
+    return block_diagonal([F for F, _ in each]), np.concatenate([g for _, g in each])
+
+
+def all_numerators(rows: Rows) -> Array:
+    """Return the numerators of the states, each over the polynomial of its submodel, shape (n, n)."""
+    return block_diagonal([numerators(*own) for own in rows])
+
+
+def form_of(rows: Rows, length: float) -> "Form":
     """Return the form in which sections are filtered over a record of some length [s]."""
-    poles = poles_of(speed, damping)
+    if all(_apart(poles_of(*own), length) for own in rows):
+        return Modal.of(rows)
+    F, g = chains_dynamics(rows)
+    return Chain(rows, F, g, F, g)
+
+
+def _apart(poles: list[complex], length: float) -> bool:
+    """Whether poles are so far apart that partial fractions keep their digits."""
     worst = 1.0
     for i, pole in enumerate(poles):
         # Poles whose resonances, or whose responses within the record, overlap nearly cancel each other: each such pair
@@ -133,10 +185,7 @@ def form_of(speed: Array, damping: Array, length: float) -> "Form":
             apart = abs(pole - other)
             product *= max(1.0, (2.0 / length - pole.real - other.real) / apart) if apart else inf
         worst = max(worst, product)
-    if worst**2 < MODAL_CONDITION_LIMIT:
-        return Modal.of(speed, damping, poles)
-    F, g = chain_dynamics(speed, damping)
-    return Chain(speed, damping, F, g, F, g)
+    return worst**2 < MODAL_CONDITION_LIMIT
 
 
 @lru_cache
@@ -204,12 +253,35 @@ class Fractions:
         return rows.reshape(-1, elapsed.size)
 
 
+def _residues(speed: Array, damping: Array, poles: list[complex]) -> ComplexArray:
+    """Return the states of sections in the modes of their poles, shape (n, n)."""
+    # A state is its gain over the product of s - pole up to the end of its section, the first one of a pair times s/w.
+    n, gain, first = len(poles), 1.0, 0
+    weights = np.zeros((n, n), dtype=complex)
+    products = [1.0 + 0.0j] * n
+    for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
+        last = first if zeta < 0.0 else first + 1
+        for i in range(last + 1):
+            for k in range(first if i < first else 0, last + 1):
+                if i != k:
+                    products[i] *= poles[i] - poles[k]
+        gain *= (w or 1.0) if zeta < 0.0 else w * w
+        weights[last, : last + 1] = [gain / product for product in products[: last + 1]]
+        if zeta >= 0.0:
+            weights[first, : last + 1] = [gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)]
+        first = last + 1
+    return weights
+
+
 @dataclass(frozen=True, eq=False)
 class Modal(Fractions):
     """Sections as partial fractions."""
 
+    #: Damping of all sections.
     damping: Array
     poles: ComplexArray
+    #: The submodel of each pole, shape (n,).
+    submodel: IntArray
     #: From z to the modes of all poles, shape (n, n).
     whole: ComplexArray
     #: States of the sections from the modes of all poles, and from z, shape (n, n).
@@ -217,32 +289,18 @@ class Modal(Fractions):
     states: Array
 
     @classmethod
-    def of(cls, speed: Array, damping: Array, poles: list[complex]) -> "Modal":
+    def of(cls, rows: Rows) -> "Modal":
         """Return the partial fractions of distinct poles."""
-        # A state is its gain over the product of s - pole up to the end of its section, the first one of a pair times
-        # s/w.
-        n, gain, first = len(poles), 1.0, 0
-        weights = np.zeros((n, n), dtype=complex)
-        products = [1.0 + 0.0j] * n
-        for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
-            last = first if zeta < 0.0 else first + 1
-            for i in range(last + 1):
-                for k in range(first if i < first else 0, last + 1):
-                    if i != k:
-                        products[i] *= poles[i] - poles[k]
-            gain *= (w or 1.0) if zeta < 0.0 else w * w
-            weights[last, : last + 1] = [gain / product for product in products[: last + 1]]
-            if zeta >= 0.0:
-                weights[first, : last + 1] = [
-                    gain / w * p / q for p, q in zip(poles[: last + 1], products, strict=False)
-                ]
-            first = last + 1
+        each = [poles_of(*own) for own in rows]
+        poles = [pole for own in each for pole in own]
+        weights = block_diagonal([_residues(*own, found) for own, found in zip(rows, each, strict=True)])
         modes = cls.modes_of(np.array([pole for pole in poles if pole.imag >= 0.0]))
         whole = _both_of_pairs(tuple(pole.imag > 0.0 for pole in poles))
-        return cls(modes, damping, np.array(poles), whole, weights, (weights @ whole).real)
+        damping, states = np.concatenate([own for _, own in rows]), (weights @ whole).real
+        return cls(modes, damping, np.array(poles), submodels_of(rows), whole, weights, states)
 
-    def driving(self, output: Array, direct: float, free: Array) -> "Modal":
-        """Return the form whose w serves ``x = output z + direct u`` and its free response."""
+    def driving(self, output: Array, direct: Array, free: Array) -> "Modal":
+        """Return the form whose w serves ``x = output z + direct u`` of each submodel and its free response."""
         return self
 
     def rate(self, output: Array) -> tuple[Array, float]:
@@ -250,7 +308,7 @@ class Modal(Fractions):
         residues = output @ self.weights
         return ((residues * self.poles) @ self.whole).real, float(residues.sum().real)
 
-    def slopes(self, output: Array, direct: float) -> Array:
+    def slopes(self, output: Array, direct: Array) -> Array:
         """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
         residues = output @ self.weights
         moved = np.zeros((self.poles.size, self.poles.size), complex)
@@ -266,10 +324,10 @@ class Modal(Fractions):
             k += 1
         # dx/dp_i = 1/(s - p_i) x, and 1/((s - p_i)(s - p_k)) is a difference of two fractions.
         inverse = self.poles[:, None] - self.poles
-        np.fill_diagonal(inverse, 1.0)
-        inverse = 1.0 / inverse
+        inverse[inverse == 0.0] = 1.0
+        inverse = np.where(self.submodel[:, None] == self.submodel, 1.0 / inverse, 0.0)
         np.fill_diagonal(inverse, 0.0)
-        single = moved * (direct + inverse @ residues)[:, None] + residues[:, None] * (inverse @ moved)
+        single = moved * (direct[self.submodel] + inverse @ residues)[:, None] + residues[:, None] * (inverse @ moved)
         return np.vstack((self.whole.T @ single, self.whole.T @ (moved * residues[:, None]))).real
 
 
@@ -277,8 +335,7 @@ class Modal(Fractions):
 class Chain:
     """A state space: z are the states of the sections, and w those of a second chain that x drives."""
 
-    speed: Array
-    damping: Array
+    rows: Rows
     dynamics: Array
     gain: Array
     #: Those of the free response.
@@ -288,17 +345,21 @@ class Chain:
     @property
     def states(self) -> Array:
         """Return the map from z to the states of the sections."""
-        return np.eye(order_of(self.damping))
+        return np.eye(sum(order_of(damping) for _, damping in self.rows))
 
-    def driving(self, output: Array, direct: float, free: Array) -> "Chain":
-        """Return the form whose w is driven by ``x = output z + direct u``, and by the free response."""
-        F, g = self.dynamics, self.gain
+    def driving(self, output: Array, direct: Array, free: Array) -> "Chain":
+        """Return the form whose w is driven by ``x = output z + direct u`` of each submodel, and by its free response.
+
+        Each submodel drives a second chain of its own.
+        """
+        F, g, submodel = self.dynamics, self.gain, submodels_of(self.rows)
+        own = np.where(submodel[:, None] == submodel, g[:, None], 0.0)
         double = np.zeros((2 * g.size, 2 * g.size))
         double[: g.size, : g.size] = double[g.size :, g.size :] = F
-        double[g.size :, : g.size] = np.outer(g, output)
+        double[g.size :, : g.size] = own * output
         double_free = double.copy()
-        double_free[g.size :, : g.size] = np.outer(g, free)
-        gain = np.concatenate((g, g * direct))
+        double_free[g.size :, : g.size] = own * free
+        gain = np.concatenate((g, g * direct[submodel]))
         return replace(
             self, dynamics=double, gain=gain, free_dynamics=double_free, free_gain=np.concatenate((g, 0.0 * g))
         )
@@ -330,9 +391,10 @@ class Chain:
         n = output.size
         return output @ self.dynamics[:n, :n], float(output @ self.gain[:n])
 
-    def slopes(self, output: Array, direct: float) -> Array:
+    def slopes(self, output: Array, direct: Array) -> Array:
         """Return the map from ``[z, w]`` to the derivatives of x to the coordinates, B being fixed, shape (2 n, n)."""
-        table, slopes = numerators(self.speed, self.damping), polynomial_slopes(self.speed, self.damping)
+        table = all_numerators(self.rows)
+        slopes = block_diagonal([polynomial_slopes(*own) for own in self.rows])
         return np.vstack((np.zeros_like(table), -np.linalg.solve(table.T, slopes)))
 
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.estimation.optimum.box import Box, Point, at_bounds, moved_by
+from ctid_cli.inference.sensitivities import SumStructure
+from ctid_cli.models.additive import Term
 
 #: Newton steps back to the constraint at most, and the error in ``ln a_i`` at which it holds, up to rounding.
 MOST_STEPS, MET, ROUNDED = 50, 1e-14, 1e-11
@@ -27,6 +29,8 @@ class KnownCoefficients:
 
     denominator: Array
     numerator: Array
+    #: The submodels of a sum, whose coefficients then follow each other; those of a numerator in descending powers.
+    terms: tuple[Term, ...] = ()
 
     @classmethod
     def of(cls, poles: int, zeros: int, values: Mapping[int, float]) -> "KnownCoefficients":
@@ -34,6 +38,14 @@ class KnownCoefficients:
         theta = np.full(poles + zeros + 1, np.nan)
         theta[list(values)] = list(values.values())
         return cls(theta[:poles], theta[poles:])
+
+    @classmethod
+    def of_sum(cls, terms: tuple[Term, ...], values: Mapping[int, float]) -> "KnownCoefficients":
+        """Return them from values by places among the parameters of a sum."""
+        structure = SumStructure(terms)
+        theta = np.full(structure.size, np.nan)
+        theta[list(values)] = list(values.values())
+        return cls(theta[structure.denominators], theta[structure.numerators], terms)
 
     @property
     def size(self) -> int:
@@ -53,7 +65,11 @@ class KnownCoefficients:
     @property
     def poles(self) -> ComplexArray:
         """The poles, where all coefficients of the denominator are known."""
-        return np.roots(np.concatenate(([1.0], self.denominator))).astype(complex)
+        if not self.terms:
+            return np.roots(np.concatenate(([1.0], self.denominator))).astype(complex)
+        ends = np.cumsum([term.poles for term in self.terms])[:-1]
+        own = [np.roots(np.append(a[::-1], 1.0)) for a in np.split(self.denominator, ends)]
+        return np.concatenate(own).astype(complex)
 
     @property
     def all_poles(self) -> bool:
@@ -66,8 +82,8 @@ class KnownCoefficients:
         if self.all_poles:
             slopes[:, :n] = np.eye(n)
         elif self.places.size:
-            a = point.denominator[1:][self.places]
-            slopes[:, :n] = point.denominator_slopes()[self.places] / a[:, None]
+            a = point.coefficients[self.places]
+            slopes[:, :n] = point.coefficient_slopes()[self.places] / a[:, None]
         return slopes
 
     def met(self, point: Point, box: Box) -> Point | None:
@@ -76,7 +92,7 @@ class KnownCoefficients:
             return point
         values, last = np.log(self.denominator[self.places]), np.inf
         for _ in range(MOST_STEPS):
-            error = np.log(point.denominator[1:][self.places]) - values
+            error = np.log(point.coefficients[self.places]) - values
             size = float(np.abs(error).max())
             if size <= MET or ROUNDED >= size >= last:
                 return point

@@ -7,6 +7,8 @@ them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``; since ``
 exact. Known coefficients of B leave Phi, and their part of the response leaves y. The derivatives of ``B/A u`` at a
 fixed B are the same, so that nothing else changes.
 
+A sum of submodels has columns of each of them in the place of those of ``B/A u``, and everything else in common.
+
 References
 ----------
 L. Kaufman, "A variable projection method for solving separable nonlinear least squares problems", *BIT* 15 (1975)
@@ -14,16 +16,28 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 """
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
-from ctid_cli.estimation.optimum.chain import Form, Modal, form_of, numerators, order_of, polynomial
+from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.estimation.optimum.chain import (
+    Form,
+    Modal,
+    Rows,
+    block_diagonal,
+    form_of,
+    numerators,
+    order_of,
+    polynomial,
+    split,
+)
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.innovations import SampledNoise
+from ctid_cli.models.additive import Term
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-11
@@ -42,12 +56,15 @@ class Problem(NamedTuple):
     trend: tuple[int, ...]
     #: Period [s] of each record that repeats for ever, else 0.
     periods: tuple[float, ...]
-    #: Known coefficients ``b_0 ... b_m`` of the numerator, NaN for those that are free; empty where all are.
+    #: Known coefficients of the numerators in descending powers, NaN for those that are free; empty where all are. In a
+    #: sum they belong to denominators with the constant term 1.
     numerator: Array = np.zeros(0)
     #: Poles at 0 that the model has besides. The lowest powers of time are then part of a free response.
     integrators: int = 0
     #: The noise by whose innovations errors count, of each record; empty where that is white.
     noises: tuple[SampledNoise, ...] = ()
+    #: The submodels of a sum, which then say what ``zeros`` and ``integrators`` say of one fraction.
+    terms: tuple[Term, ...] = ()
 
     @property
     def laid_out(self) -> Iterator[tuple[FilterData | FrequencyLines, float, SampledNoise | None]]:
@@ -69,11 +86,64 @@ class Problem(NamedTuple):
         """The frequency response, if there is one in their place."""
         return next((data for data in self.records if isinstance(data, FrequencyLines)), None)
 
-    def sections(self, speed: Array, damping: Array) -> tuple[Array, Array]:
-        """Return the sections with the integrators behind them."""
-        if not self.integrators:
-            return speed, damping
-        return np.append(speed, np.zeros(self.integrators)), np.append(damping, -np.ones(self.integrators))
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Number of poles of each submodel of a sum, integrators not among them; empty for one fraction."""
+        return tuple(term.poles for term in self.terms)
+
+    @property
+    def coefficients(self) -> int:
+        """Number of coefficients of all numerators."""
+        return sum(term.zeros + 1 for term in self.terms) if self.terms else self.zeros + 1
+
+    def submodels(self, order: int) -> "Submodels":
+        """Return which states make up the response, of a model with so many poles, integrators included."""
+        return _submodels(self.terms, order, self.zeros, self.integrators)
+
+    def rows(self, speed: Array, damping: Array) -> Rows:
+        """Return the sections of each submodel with its integrators behind them."""
+        if not self.terms:
+            return [_integrating(speed, damping, self.integrators)]
+        each = zip(split(speed, damping, self.parts), self.terms, strict=True)
+        return [_integrating(*own, term.integrators) for own, term in each]
+
+
+def _integrating(speed: Array, damping: Array, integrators: int) -> tuple[Array, Array]:
+    """Return sections with integrators behind them."""
+    if not integrators:
+        return speed, damping
+    return np.append(speed, np.zeros(integrators)), np.append(damping, -np.ones(integrators))
+
+
+class Submodels(NamedTuple):
+    """Which states of the sections make up a response."""
+
+    terms: tuple[Term, ...]
+    #: Places of the states that span the strictly proper part of all ``B/A u``: of each submodel its last m + 1.
+    spanning: IntArray
+    #: Which submodel has u itself besides, as one of degree n has; none where -1.
+    direct: int
+    #: Which states belong to poles that are searched, not to integrators.
+    searched: BoolArray
+
+    def directs(self, weight: float) -> Array:
+        """Return the weight of u in each submodel."""
+        found = np.zeros(len(self.terms))
+        if self.direct >= 0:
+            found[self.direct] = weight
+        return found
+
+
+@lru_cache
+def _submodels(terms: tuple[Term, ...], order: int, zeros: int, integrators: int) -> Submodels:
+    terms = terms or (Term(order - integrators, zeros, integrators),)
+    first, spanning, direct, searched = 0, list[int](), -1, list[bool]()
+    for k, term in enumerate(terms):
+        spanning += range(first + term.order - min(term.zeros + 1, term.order), first + term.order)
+        direct = k if term.zeros == term.order else direct
+        searched += [True] * term.poles + [False] * term.integrators
+        first += term.order
+    return Submodels(terms, np.array(spanning, dtype=np.int64), direct, np.array(searched, dtype=bool))
 
 
 class Weights(NamedTuple):
@@ -110,12 +180,22 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
     known = np.isfinite(problem.numerator)
     if not known.any():
         return None
-    speed, damping = problem.sections(speed, damping)
-    table = numerators(speed, damping)
-    if problem.zeros == len(table):
-        table = np.vstack((np.pad(table, ((0, 0), (1, 0))), polynomial(speed, damping)))
-    else:
-        table = table[-problem.zeros - 1 :, -problem.zeros - 1 :]
+    rows = problem.rows(speed, damping)
+    own = problem.submodels(sum(order_of(zeta) for _, zeta in rows))
+    tables, directs = [], []
+    for k, ((w, zeta), term) in enumerate(zip(rows, own.terms, strict=True)):
+        # Known coefficients of a submodel belong to a denominator with the constant term 1.
+        scale = polynomial(w, zeta)[term.poles] if problem.terms else 1.0
+        table, width = numerators(w, zeta) / scale, term.zeros + 1
+        if k == own.direct:
+            tables.append(np.pad(table, ((0, 0), (1, 0))))
+            directs.append(polynomial(w, zeta) / scale)
+        else:
+            tables.append(table[-width:, -width:])
+            directs.append(np.zeros(width))
+    table = block_diagonal(tables)
+    if own.direct >= 0:
+        table = np.vstack((table, np.concatenate(directs)))
     asked = table[:, known]
     lengths = np.linalg.norm(asked, axis=0)
     whole, triangle = np.linalg.qr(asked / lengths, mode="complete")
@@ -127,15 +207,14 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
 def _columns(problem: Problem, columns: Columns, rows: Array, states: Array) -> tuple[Array, Array]:
     """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models."""
     *many, records, q, _ = rows.shape
-    n, shared = columns.n, problem.zeros + 1
-    proper, own = min(shared, n), n * problem.free_response + len(columns.trend)
+    n, shared, submodels = columns.n, problem.coefficients, problem.submodels(columns.n)
+    proper, own = submodels.spanning.size, n * problem.free_response + len(columns.trend)
     # The numerator is common to all records; a free response and a trend are zero outside their own.
     phi = np.zeros((*many, records, q, shared + records * own))
-    # The last m + 1 states of the chain span B/A u; of degree n there is u itself besides.
     to_states = np.swapaxes(states, -1, -2)
-    phi[..., :proper] = rows[..., :n] @ to_states[..., n - proper :]
-    if shared > n:
-        phi[..., n] = rows[..., columns.u]
+    phi[..., :proper] = rows[..., :n] @ to_states[..., submodels.spanning]
+    if submodels.direct >= 0:
+        phi[..., proper] = rows[..., columns.u]
     for k in range(records if own else 0):
         place, record = shared + k * own, slice(k, k + 1)
         if problem.free_response:
@@ -149,8 +228,7 @@ class Span:
 
     def __init__(self, problem: Problem, triangles: Triangles, weights: Weights | None) -> None:
         self.triangles, self.weights = triangles, weights
-        self.n, self.shared = triangles.columns.n, problem.zeros + 1
-        self.proper = min(self.shared, self.n)
+        self.n, self.shared = triangles.columns.n, problem.coefficients
         phi, y = _columns(problem, triangles.columns, triangles.rows, triangles.form.states)
         if weights is not None:
             both = phi[:, : self.shared]
@@ -194,27 +272,29 @@ def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slo
 
     Where :func:`slopes` will follow, one pass over the records can serve both.
     """
-    form = form_of(*problem.sections(speed, damping), problem.length)
+    form = form_of(problem.rows(speed, damping), problem.length)
     second = slopes_too and isinstance(form, Modal)
     triangles = _triangles(problem, [form] * len(problem.records), delay, second)
     span = Span(problem, triangles, weights_of(problem, speed, damping))
     shared, own = span.solution()
     n, records = span.n, len(problem.records)
     output, free, trend = np.zeros(n), np.zeros((records, n)), np.zeros((records, len(problem.trend)))
-    output[n - span.proper :] = shared[: span.proper]
+    submodels = problem.submodels(n)
+    proper = submodels.spanning.size
+    output[submodels.spanning] = shared[:proper]
     if problem.free_response or problem.trend:
         own = own.reshape(records, -1)
         if problem.free_response:
             free = own[:, :n]
         trend = own[:, own.shape[1] - len(problem.trend) :]
-    direct = float(shared[n]) if shared.size > n else 0.0
+    direct = float(shared[proper]) if submodels.direct >= 0 else 0.0
     squared_error = float(span.residual @ span.residual)
     return Projected(squared_error, output, direct, free, trend, span)
 
 
 def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delay: Delay) -> Array:
     """Return the squared errors of many sections of one order at one delay, to compare starts."""
-    forms = [form_of(*problem.sections(*own), problem.length) for own in sections]
+    forms = [form_of(problem.rows(*own), problem.length) for own in sections]
     errors = np.zeros(len(forms))
     modal = [k for k, form in enumerate(forms) if isinstance(form, Modal)]
     if np.isfinite(problem.numerator).any():
@@ -248,18 +328,23 @@ def slopes(
     problem: Problem, speed: Array, damping: Array, delay: Delay, projected: Projected, delay_free: bool
 ) -> Slopes:
     """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delay."""
-    span, output, direct = projected.span, projected.output, projected.direct
+    span, output = projected.span, projected.output
+    submodels = problem.submodels(span.n)
+    direct = submodels.directs(projected.direct)
     triangles = span.triangles
     if not triangles.columns.second or triangles.delay != delay:
         forms = [triangles.form.driving(output, direct, free) for free in projected.free]
         span = Span(problem, _triangles(problem, forms, delay, True), weights_of(problem, speed, damping))
     form, columns, _, rows = span.triangles
-    n = order_of(damping)
+    searched = submodels.searched
+    n = int(np.count_nonzero(searched))
     psi = np.zeros((*rows.shape[:2], n + delay_free))
     states = 2 * columns.n
-    psi[:, :, :n] = rows[:, :, :states] @ form.slopes(output, direct)[:, :n]
+    psi[:, :, :n] = rows[:, :, :states] @ form.slopes(output, direct)[:, searched]
+    if problem.terms and span.weights is not None:
+        psi[:, :, :n] += _of_constants(problem, speed, damping, projected, span.triangles)
     if problem.free_response:
-        maps = np.stack([form.slopes(free, 0.0)[:, :n] for free in projected.free])
+        maps = np.stack([form.slopes(free, 0.0 * direct)[:, searched] for free in projected.free])
         psi[:, :, :n] += rows[:, :, columns.free_states] @ maps
     if delay_free:
         # dx/dtau = -x'(t - tau).
@@ -270,3 +355,19 @@ def slopes(
     psi -= span.left @ (span.left.T @ psi)
     residual = span.residual
     return Slopes(float(residual @ residual), -(psi.T @ residual), psi.T @ psi)
+
+
+def _of_constants(problem: Problem, speed: Array, damping: Array, projected: Projected, triangles: Triangles) -> Array:
+    """Return what the constant terms of the denominators do to the output if known numerators keep their values."""
+    found, first = [], 0
+    form, columns, _, rows = triangles
+    directs = problem.submodels(columns.n).directs(projected.direct)
+    sections = split(speed, damping, problem.parts)
+    for (_, zetas), term, direct in zip(sections, problem.terms, directs.tolist(), strict=True):
+        own = np.zeros(columns.n)
+        own[first : first + term.order] = projected.output[first : first + term.order]
+        first += term.order
+        response = rows[:, :, : columns.n] @ (own @ form.states) + direct * rows[:, :, columns.u]
+        # The constant term is the product of all w^2 and p.
+        found += [response * power for zeta in zetas.tolist() for power in ((1.0,) if zeta < 0 else (2.0, 0.0))]
+    return np.stack(found, axis=-1)

@@ -394,7 +394,7 @@ class Descent:
 
         The border must be a factor of two away: next to it a direction is short, not flat.
         """
-        variance = here.squared_error / max(self.count - free.size - self.problem.zeros - 1, 1)
+        variance = here.squared_error / max(self.count - free.size - self.problem.coefficients, 1)
         direction = vectors[:, 0] / np.abs(vectors[:, 0]).max()
         # What the curvature promises over a factor of two.
         expected = values[0] * (RIDGE / np.abs(vectors[:, 0]).max()) ** 2
@@ -433,7 +433,7 @@ def local_minimum(
     box = box or box_of(problem, delays)
     if known.all_poles:
         box = widened(box, poles)
-    return Descent(problem, box, known).descend(point_of(poles, delay, box), (), *effort)
+    return Descent(problem, box, known).descend(point_of(poles, delay, box, parts=problem.parts), (), *effort)
 
 
 def _same(one: Point, other: Point) -> bool:
@@ -497,4 +497,4 @@ def _unbounded(point: Point, step: Array, box: Box) -> Point | None:
         if tau < 0 or (delay.cell >= 0 and not delay.cell * box.cell <= tau <= (delay.cell + 1) * box.cell):
             return None
         delay = delay._replace(seconds=tau)
-    return Point(speed, damping, point.edge, delay)
+    return replace(point, speed=speed, damping=damping, delay=delay)

@@ -113,6 +113,10 @@ class StructureSearch:
         """Return where the lowest minimum of a structure is."""
         return self._minima[poles, zeros][0].point
 
+    def put_first(self, poles: int, zeros: int, point: Point) -> None:
+        """Have the lowest minimum of a structure at another point of equal cost."""
+        self._minima[poles, zeros][0] = self.descent(zeros).local(point)
+
     def ends(self, poles: int, zeros: int) -> list[float]:
         """Return the squared errors at which the searches for a structure have ended."""
         return self._ends[poles, zeros]
@@ -175,7 +179,9 @@ class StructureSearch:
                 cells.add(cell)
                 # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
                 border = max(own, cell) * width
-                points += [point_of(point.poles, tau, self.box, cell) for tau in ((cell + 0.5) * width, border)]
+                points += [
+                    point_of(point.poles, tau, self.box, cell, point.parts) for tau in ((cell + 0.5) * width, border)
+                ]
         return points
 
     def from_below(self, poles: int, zeros: int) -> list[Point]:
@@ -220,8 +226,8 @@ class StructureSearch:
         zeta = self.box.least_damping
         frequencies = np.linspace(resolution, highest, count).tolist()
         alone = self._with_pairs(zeros, roots, [(w, zeta, delay) for w in frequencies])
-        best = [alone[k] for k in _lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)]
-        delays = self._delays(LOOKED_AT) or [delay]
+        best = [alone[k] for k in lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)]
+        delays = self.delays(LOOKED_AT) or [delay]
         if self.box.delay_free:
             best += self._with_pairs(zeros, roots, [(w, zeta, tau) for _, w, _ in best for tau in delays])
         lowest: dict[float, Point] = {}
@@ -294,10 +300,11 @@ class StructureSearch:
         """Return also starts at the minima of the profile over the delay, for the poles of the best start."""
         if not self.box.delay_free or not points:
             return points
-        trials = [point_of(points[0].poles, delay, self.box) for delay in self._delays(MOST_DELAYS)]
-        return points + [trials[k] for k in _lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
+        poles, parts = points[0].poles, points[0].parts
+        trials = [point_of(poles, delay, self.box, parts=parts) for delay in self.delays(MOST_DELAYS)]
+        return points + [trials[k] for k in lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
 
-    def _delays(self, most: int) -> list[float]:
+    def delays(self, most: int) -> list[float]:
         """Delays that are spread over the whole range, at most one for each of its cells; none of a known delay."""
         low, high = self.box.delays
         spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / most)
@@ -319,7 +326,7 @@ class StructureSearch:
         return points
 
 
-def _lowest_minima(values: Array, most: int) -> list[int]:
+def lowest_minima(values: Array, most: int) -> list[int]:
     """Return the places of the lowest local minima, the lowest first."""
     padded = np.concatenate(([np.inf], values, [np.inf]))
     minima = np.flatnonzero((values <= padded[:-2]) & (values < padded[2:]))

@@ -1,0 +1,123 @@
+"""Where searches for sums of submodels start: at sums that grow term by term."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+
+from ctid_cli.arrays import ComplexArray
+from ctid_cli.estimation.optimum.box import Box, Point, point_of
+from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.search import Descent, Local
+from ctid_cli.estimation.optimum.starts import APART, StructureSearch
+from ctid_cli.models.additive import Term
+
+#: Frequencies of an added pole or pair, and dampings of a pair.
+FREQUENCIES, DAMPINGS = 24, (0.005, 0.05, 0.5)
+#: Sums that are kept of each step, places at which each grows, and orders in which terms are added.
+KEPT, PLACES, MOST_ORDERS = 2, 2, 3
+#: Delays at which the first term is looked for.
+FIRST_DELAYS = 10
+
+
+class SumGrowth:
+    """Sums that grow: the first term over the whole range of the delay, each other one beside the best so far."""
+
+    def __init__(self, problem: Problem, box: Box) -> None:
+        self.problem, self.box = problem, box
+
+    def points(self) -> list[Point]:
+        """Return the best sums of all terms, in several orders of growth where terms differ."""
+        terms = self.problem.terms
+        distinct = dict.fromkeys(tuple(terms[k] for k in order) for order in permutations(range(min(len(terms), 6))))
+        # Of many terms only the given order is tried.
+        orders = list(distinct)[:MOST_ORDERS] if len(terms) <= 6 else [terms]
+        return [_rearranged(local.point, order, terms, self.box) for order in orders for local in self._grown(order)]
+
+    def _grown(self, order: tuple[Term, ...]) -> list[Local]:
+        """Return the lowest minima of a sum whose terms are added in an order."""
+        best: list[Local] = []
+        for count in range(1, len(order) + 1):
+            term = order[count - 1]
+            # A term of many poles grows pair by pair.
+            for poles in sorted({term.poles, *range(2 - term.poles % 2, term.poles, 2)} - {0}) or [0]:
+                zeros = min(term.zeros, poles + term.integrators)
+                terms = (*order[: count - 1], Term(poles, zeros, term.integrators))
+                best = self._added(terms, best)
+        return best
+
+    def _added(self, terms: tuple[Term, ...], known: Sequence[Local]) -> list[Local]:
+        """Return the lowest minima of a sum, from those that have fewer poles in the last term."""
+        problem = replace_terms(self.problem, terms)
+        search = StructureSearch(problem, self.box)
+        descent, order = search.descent(problem.zeros), sum(term.poles for term in terms)
+        found: list[Local] = []
+        bases = [(local.point.poles, local.point.delay.seconds) for local in known]
+        # The whole range of the delay for what comes first.
+        delays = search.delays(FIRST_DELAYS) or [self.box.delays[0]]
+        bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in delays]
+        starts: list[Point] = []
+        for roots, delay in bases:
+            added = order - roots.size
+            starts += _extended(descent, self.box, problem.parts, (roots, delay), added)
+        if not known:
+            starts = descent.sorted(starts)[: PLACES * KEPT]
+        for start in starts:
+            # What moves the squared error by less than the variance of the noise is not seen.
+            found.append(descent.descend(start, found, near=1.0 / descent.count))
+        found.sort(key=lambda local: local.squared_error)
+        distinct = [one for k, one in enumerate(found) if one not in found[:k]]
+        return distinct[:KEPT]
+
+
+def _extended(
+    descent: Descent, box: Box, parts: tuple[int, ...], base: tuple[ComplexArray, float], added: int
+) -> list[Point]:
+    """Return the best few of all poles, or pairs, added to the last submodel of a sum, by elimination alone."""
+    roots, delay = base
+    if not added:
+        return [point_of(roots, delay, box, parts=parts)]
+    frequencies = np.geomspace(box.spread[0], min(box.fastest, box.imaginary), FREQUENCIES + 2)[1:-1].tolist()
+    new = [(w, zeta) for w in frequencies for zeta in (DAMPINGS if added == 2 else (1.0,))]
+    pairs = [w * complex(-zeta, np.sqrt(1.0 - zeta * zeta)) for w, zeta in new]
+    poles = [[pole, pole.conjugate()] if added == 2 else [complex(-abs(pole))] for pole in pairs]
+    points = [point_of(np.concatenate((roots, own)), delay, box, parts=parts) for own in poles]
+    chosen: list[int] = []
+    for k in np.argsort(descent.squared_errors(points), kind="stable").tolist():
+        if all(np.abs(np.log(new[k]) - np.log(new[other])).max() > APART for other in chosen):
+            chosen.append(k)
+        if len(chosen) == PLACES:
+            break
+    return [points[k] for k in chosen]
+
+
+def replace_terms(problem: Problem, terms: tuple[Term, ...]) -> Problem:
+    """Return the same records for another sum."""
+    return problem._replace(terms=terms, integrators=sum(term.integrators for term in terms))
+
+
+def _rearranged(point: Point, order: Sequence[Term], terms: Sequence[Term], box: Box) -> Point:
+    """Return a point of terms in an order as one of the same terms in another."""
+    groups = _groups(point.poles, [term.poles for term in order])
+    left = list(zip(order, groups, strict=True))
+    found = [left.pop(next(k for k, (own, _) in enumerate(left) if own == term))[1] for term in terms]
+    return _joined(found, point, box)
+
+
+def in_order(point: Point, terms: Sequence[Term], box: Box) -> Point:
+    """Return the same sum with submodels of one structure by rising natural frequency."""
+    groups = _groups(point.poles, [term.poles for term in terms])
+    rising = sorted(range(len(groups)), key=lambda k: float(np.abs(groups[k]).min(initial=np.inf)))
+    alike = {term: iter([groups[k] for k in rising if terms[k] == term]) for term in terms}
+    return _joined([next(alike[term]) for term in terms], point, box)
+
+
+def _joined(groups: Sequence[ComplexArray], point: Point, box: Box) -> Point:
+    parts = tuple(group.size for group in groups)
+    moved = point_of(np.concatenate(groups), point.delay.seconds, box, parts=parts)
+    return replace(moved, delay=point.delay)
+
+
+def _groups(poles: ComplexArray, sizes: Sequence[int]) -> list[ComplexArray]:
+    return np.split(poles, np.cumsum(sizes)[:-1])
