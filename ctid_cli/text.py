@@ -22,7 +22,7 @@ def count(n: int, noun: str) -> str:
 
 
 def probability(p: float) -> str:
-    """A p-value: of a tiny one nobody believes the digits, and of none there is a dash."""
+    """A p-value: of a tiny one the digits mean nothing, and of none there is a dash."""
     if p != p:
         return "p = -"
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"

@@ -284,7 +284,7 @@ class SubmodelEstimate(NamedTuple):
             found = self.problem.model(self.theta)
         except DataError as error:
             text = "the iterations ended where the terms cannot be told apart"
-            raise DataError(f"{text}: {error} Start closer.") from None
+            raise DataError(f"{text}: {error}; give a closer start") from None
         return found if self.problem.fixed else found.sorted()
 
     @property

@@ -135,7 +135,7 @@ def _outliers(found: Identification, time_unit: str) -> str:
         largest = max(largest, float(np.abs(off).max(initial=0.0)))
         of = f" of experiment {k}" * (len(found.records) > 1)
         times = [f"{t:.6g}" for t in record.t[use][places][:LISTED]]
-        listed_times += [f"t = {', '.join(times)}{', ...' * (places.size > LISTED)} {time_unit}{of}"] * (
+        listed_times += [f"t = {', '.join(times)} {time_unit}{', ...' * (places.size > LISTED)}{of}"] * (
             places.size > 0
         )
     if not total:

@@ -44,7 +44,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
     >>> data = FrequencyData(w, 2.0 / (1j * w + 1.0) + noise, np.full(100, 0.02 * np.sqrt(2.0)))
     >>> found = identify_frequency_response(data, FrequencyDomain(1, 0))
     >>> {item.name: round(item.estimate, 2) for item in found.estimates if item.status == "free"}
-    {'b0': 1.99, 'a1': 0.99}
+    {'b0': 2.01, 'a1': 1.01}
     """
     prepared = options.prepare(data)
     fit = prepared.fit()

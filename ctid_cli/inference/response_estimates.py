@@ -74,12 +74,14 @@ def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
 
 
 def variance_about_mean(noise: NoiseModel, count: int) -> float:
-    """Mean variance of so many successive samples of a noise about their own mean.
+    """Mean variance of ``count`` successive samples of a noise about their own mean.
 
     Noise that is slow for a record wanders far beyond what the record shows of it.
     """
     of_mean = float(noise.covariance_of(np.full((count, 1), 1 / count))[0, 0])
-    return float(noise.first_autocovariances[0]) - of_mean
+    variance = float(noise.first_autocovariances[0])
+    # Above zero in spite of rounding, where the samples hardly differ.
+    return max(variance - of_mean, float(np.finfo(float).eps) * variance)
 
 
 def squared_correlations(noise: NoiseModel) -> float:

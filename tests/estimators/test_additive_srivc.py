@@ -287,7 +287,10 @@ def test_flexible_beam_from_rough_initial_values():
     reached = 0
     for seed in range(8):
         record, _, sigma = beam_record(seed)
-        fit = fitted(record, AdditiveModel(BEAM_START.submodels, 4 / 4096))
+        try:
+            fit = fitted(record, AdditiveModel(BEAM_START.submodels, 4 / 4096))
+        except DataError:  # two submodels met
+            continue
         if fit.status is Status.CONVERGED and fit.cost < 1.2 * sigma**2:
             reached += 1
             frequencies = [part.natural_frequency for part in fit.additive.submodels]

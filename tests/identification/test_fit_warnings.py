@@ -161,7 +161,7 @@ def test_the_held_back_fit_is_that_of_fits_that_did_not_see_the_blocks():
 
 def test_several_records_say_which_one():
     warnings = identify([CLEAN, spoilt(record_of(seed=1), [500], 2.0)], KNOWN).warnings
-    assert warnings[0].startswith("1 output sample is an outlier (t = 100 of experiment 2)")
+    assert warnings[0].startswith("1 output sample is an outlier (t = 100 s of experiment 2)")
 
 
 def test_a_long_record_is_tried_on_its_beginning():

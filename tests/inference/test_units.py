@@ -20,7 +20,7 @@ def test_a_monic_denominator(poles, zeros, units):
 
 def test_submodels_whose_denominators_end_in_one():
     model = AdditiveModel([Submodel([1.0], [1.0], 2), Submodel([1.0], [0.5, 1.0])])
-    units = {"g1_b0": "mm/V/s^2", "g2_a1": "s", "g2_b1": "mm/V*s", "c1": "mm/s", "c2": "mm", "c3": "mm*s"}
+    units = {"g1_b0": "mm/V/s^2", "g2_a1": "s", "g2_b1": "mm/V*s", "x1": "mm/s", "x2": "mm", "x3": "mm*s"}
     units |= {"delay": "s"}
     assert {name: Units("s", "V", "mm").in_sum(name, model) for name in units} == units
 

@@ -131,7 +131,7 @@ Rows = Sequence[tuple[Array, Array]]
 
 
 def split(speed: Array, damping: Array, parts: Sequence[int]) -> Rows:
-    """Return the sections of each of several submodels with so many poles."""
+    """Return the sections of each of several submodels of given orders."""
     ends = np.cumsum(np.where(damping < 0.0, 1, 2))
     last = np.searchsorted(ends, np.cumsum(parts), side="right").tolist()
     first = [0, *last[:-1]]

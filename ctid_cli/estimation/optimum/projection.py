@@ -97,7 +97,7 @@ class Problem(NamedTuple):
         return sum(term.zeros + 1 for term in self.terms) if self.terms else self.zeros + 1
 
     def submodels(self, order: int) -> "Submodels":
-        """Return which states make up the response, of a model with so many poles, integrators included."""
+        """Return which states make up the response, of a model of a given order, integrators included."""
         return _submodels(self.terms, order, self.zeros, self.integrators)
 
     def rows(self, speed: Array, damping: Array) -> Rows:
