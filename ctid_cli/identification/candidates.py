@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
+
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
@@ -11,7 +13,8 @@ from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.delay_profile import DelayProfile, fitted
 from ctid_cli.identification.criterion import Candidate, Ranking, ranked
-from ctid_cli.inference.sensitivities import Structure
+
+from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
@@ -72,9 +75,11 @@ class Span(NamedTuple):
 
 
 def with_hold(record: Record, hold: Hold) -> Record:
-    """Return a record with another hold of its input."""
-    signal = record.input
-    return record if signal.hold == hold else replace(record, input=HeldSignal(signal.t, signal.values, hold))
+    """Return a record with another hold of its inputs."""
+    inputs = record.held
+    if all(signal.hold == hold for signal in inputs.values()):
+        return record
+    return replace(record, inputs={name: HeldSignal(one.t, one.values, hold) for name, one in inputs.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +120,11 @@ class Structures:
         """Fit a structure; None where there are too few samples."""
         if (poles, zeros) not in self.found:
             options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
-            structure = Structure(options.order, zeros, delay=self.search.box.delay_free)
-            own = measured.layout_of(options.order, structure.delay).own * len(self.records)
-            size = structure.size - options.integrators + own
+            laid_out = measured.with_degrees(options.order, zeros)
+            size = laid_out.layout.size - options.integrators
             if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
                 return None
-            found = fitted(measured.with_structure(structure), self._least(poles, zeros), None, None)
+            found = fitted(laid_out, self._least(poles, zeros), None, None)
             self.found[poles, zeros] = Candidate(options, self.hold, found, size)
         return self.found[poles, zeros]
 
@@ -132,8 +136,8 @@ class Structures:
         if self.near is None:
             return best_of_orders(self.search, poles, zeros)
         start = self.near(poles, zeros)
-        alone = start.denominator[: start.denominator.size - self.options.integrators]
-        return best_near(self.search, zeros, alone, start.delay)
+        alone = np.atleast_1d(np.poly(self.measured.free_poles(start)).real)
+        return best_near(self.search, zeros, (alone, tuple(delays_of(start))))
 
 
 class SmallModels:

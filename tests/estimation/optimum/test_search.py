@@ -73,7 +73,7 @@ def test_a_minimum_is_lower_than_everything_around_it(seed):
     for _ in range(40):
         speed, damping = point.shifted(1e-3 * rng.standard_normal(4))
         tau = point.delay.seconds + 1e-3 * rng.standard_normal()
-        there = point_of(type(point)(speed, damping, point.edge, point.delay).poles, tau, descent.box)
+        there = point_of(type(point)(speed, damping, point.edge, point.delays).poles, tau, descent.box)
         assert descent.value(there).squared_error >= found.squared_error * (1 - 1e-12)
 
 
@@ -87,7 +87,7 @@ def test_a_minimum_in_a_kink_is_pinned_to_its_sample(seed):
     assert found.ending is Ending.CONVERGED
     assert found.pinned
     assert found.point.delay.seconds == 2.0
-    before, after = (descent.local(replace(found.point, delay=Delay(2.0, cell))).gradient[-1] for cell in (3, 4))
+    before, after = (descent.local(found.point.with_delays([Delay(2.0, cell)])).gradient[-1] for cell in (3, 4))
     assert before < 0 < after
 
 

@@ -1,0 +1,43 @@
+"""The transfer function of one of several inputs, as a model with the joint law of all parameters."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from ctid_cli.inference.fitted_model import FittedModel
+from ctid_cli.inference.model_responses import Estimated
+from ctid_cli.inference.sensitivities import Parametric
+from ctid_cli.inference.uncertainty import Uncertainty
+from ctid_cli.models.transfer_function import TransferFunction
+
+_OWN = re.compile(r"[ab]\d+|delay")
+
+
+@dataclass(frozen=True, eq=False)
+class InputFit(FittedModel):
+    """What a fit with several inputs says of one of them.
+
+    Parameters
+    ----------
+    model : TransferFunction
+        The transfer function from this input to the output.
+    parameter_names : tuple of str
+        Names of all parameters of the fit, those of other transfer functions empty.
+    law : Uncertainty
+        Covariance of all parameters.
+    """
+
+    model: TransferFunction
+    parameter_names: tuple[str, ...]
+    law: Uncertainty
+
+    @classmethod
+    def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
+        """Return the transfer function of an input; a common denominator has names without one."""
+        own = [each.removeprefix(f"{name}_") for each in names]
+        return cls(model, tuple(each if _OWN.fullmatch(each) else "" for each in own), law)
+
+    def _estimated(self) -> Estimated:
+        """The transfer function with the joint law of all parameters."""
+        return Estimated(Parametric(self.model, self.parameter_names), self.law)
