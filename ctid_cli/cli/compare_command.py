@@ -64,8 +64,10 @@ def _record(models: Sequence[NamedFit], file: Path, columns: RecordOptions, hold
     from ctid_cli.signals.measurement import open_table
 
     own = models[0].columns
-    if not (columns.time or columns.input or columns.output) and set(own.values()) <= set(open_table(file).names):
-        columns = replace(columns, time=own["time"], input=own["input"], output=own["output"])
+    inputs = own["input"] if isinstance(own["input"], list) else [own["input"]]
+    names = {str(own["time"]), *inputs, str(own["output"])}
+    if not (columns.time or columns.input or columns.output) and names <= set(open_table(file).names):
+        columns = replace(columns, time=own["time"], input=inputs, output=[own["output"]])
     found = columns.read(file, hold or models[0].hold)
     require_units(found.record.name, models[0], found.time_unit, found.input_unit, found.output_unit)
     return found

@@ -90,7 +90,7 @@ def fit(
     _check_draws(bootstrap)
     _check_predicted(predict, treatment.noise)
     loop.check()
-    asked = Asked(model, treatment, loop.use)
+    asked = Asked(model, treatment, loop.use, columns.names)
     options = options_of(asked)
     if asked.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and submodels or a loop are fitted to one; give one file")

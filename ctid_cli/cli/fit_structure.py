@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import typer
 
@@ -18,6 +18,7 @@ from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, Los
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
     from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimators.delay_profile import InputModel
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
@@ -34,32 +35,68 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
+T = TypeVar("T")
 HoldOption = Annotated[AskedHold, typer.Option("--hold", help="Input between its samples; else chosen.")]
+
+
+@dataclass(frozen=True)
+class PerInput(Generic[T]):
+    """What an option says of all inputs, and of single ones."""
+
+    shared: T | None
+    own: dict[str, T]
+
+
+def per_input(option: str, given: Sequence[str] | None, read: Callable[[str], T]) -> PerInput[T]:
+    """Read an option that is given for all inputs, or as INPUT=VALUE for single ones."""
+    shared: T | None = None
+    own: dict[str, T] = {}
+    for text in given or ():
+        name, equals, value = (part.strip() for part in text.rpartition("="))
+        try:
+            found = read(value)
+        except ValueError:
+            what = f"{option} must be a whole number, or INPUT=NUMBER for one of several inputs"
+            raise UsageError(f"{what}; got {text!r}") from None
+        if (equals and name in own) or (not equals and shared is not None):
+            raise UsageError(f"{option} is given twice{f' for {name}' * bool(equals)}; give it once")
+        if equals:
+            own[name] = found
+        else:
+            shared = found
+    return PerInput(shared, own)
 
 
 @dataclass(frozen=True)
 class StructureOptions:
     """Range of the delay, and poles at the origin."""
 
-    delay: Annotated[
-        str | None,
+    delays: Annotated[
+        list[str] | None,
         typer.Option(
             "--delay",
-            metavar="LOW:HIGH|VALUE",
-            help="Range or value [time unit]; else chosen.",
+            metavar="[INPUT=]LOW:HIGH|VALUE",
+            help="Range or value [time unit]; else chosen. Of one of several inputs: INPUT=...",
         ),
     ] = None
-    integrators: Annotated[
-        int | None,
+    each_integrators: Annotated[
+        list[str] | None,
         typer.Option(
-            "--integrators", help="Additional poles at the origin (of a sum: in its first submodel); else chosen."
+            "--integrators",
+            metavar="[INPUT=]N",
+            help="Additional poles at the origin (of a sum: in its first submodel); else chosen.",
         ),
     ] = None
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Range of the delay, a known one twice; None where it is not given."""
-        return None if self.delay is None else delay_bounds(self.delay)
+        """Range of the delay, a known one twice; None where it is not given for all inputs."""
+        return per_input("--delay", self.delays, delay_bounds).shared
+
+    @property
+    def integrators(self) -> int | None:
+        """Poles at the origin; None where they are not given for all inputs."""
+        return per_input("--integrators", self.each_integrators, int).shared
 
 
 @dataclass(frozen=True)
@@ -94,10 +131,18 @@ class TreatmentOptions:
 class ModelOptions(StructureOptions):
     """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
-    poles: Annotated[
-        int | None, typer.Option("--poles", help="Poles, 1 to 12 (0 with --integrators); else chosen.")
+    each_poles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--poles",
+            metavar="[INPUT=]N",
+            help="Poles, 1 to 12 (0 with --integrators); else chosen. INPUT=N: denominators of their own.",
+        ),
     ] = None
-    zeros: Annotated[int | None, typer.Option("--zeros", help="Zeros, fewer than poles; else chosen.")] = None
+    each_zeros: Annotated[
+        list[str] | None,
+        typer.Option("--zeros", metavar="[INPUT=]N", help="Zeros, fewer than poles; else chosen."),
+    ] = None
     model: Annotated[ModelForm, typer.Option("--model", help="One transfer function, or a sum of submodels.")] = (
         "fraction"
     )
@@ -107,6 +152,16 @@ class ModelOptions(StructureOptions):
     fix: Annotated[
         list[str] | None, typer.Option("--fix", metavar="NAME=VALUE", help="Hold a parameter; repeatable.")
     ] = None
+
+    @property
+    def poles(self) -> int | None:
+        """Number of poles; None where it is not given for all inputs."""
+        return per_input("--poles", self.each_poles, int).shared
+
+    @property
+    def zeros(self) -> int | None:
+        """Number of zeros; None where it is not given for all inputs."""
+        return per_input("--zeros", self.each_zeros, int).shared
 
 
 @dataclass(frozen=True)
@@ -178,6 +233,8 @@ class Asked:
     treatment: FitOptions
     #: What of the loop that the record was taken in counts.
     loop: LoopUse = "none"
+    #: Names of several inputs, else empty.
+    inputs: tuple[str, ...] = ()
 
     @property
     def simulated(self) -> bool:
@@ -217,6 +274,7 @@ def as_usage_errors() -> Iterator[None]:
 def options_of(asked: Asked) -> MeasuredSubmodels | LoopOutputError | Given:
     """Return the estimator, or what of it is given; a UsageError says which options do not go together."""
     _refuse_other_form(asked)
+    _refuse_inputs(asked)
     if asked.simulated:
         return _in_loop(asked)
     if not asked.iterated:
@@ -244,13 +302,47 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
 
 def _given(asked: Asked) -> Given:
     model, treatment = asked.model, asked.treatment
-    fixed = _fixed(model.fix)
-    if fixed and model.poles is None:
+    delays = [f"{name}_delay=" for name in asked.inputs]
+    known = [text.replace("_delay=", "=", 1) for text in model.fix or () if text.startswith(tuple(delays))]
+    model = replace(
+        model,
+        fix=[text for text in model.fix or () if not text.startswith(tuple(delays))] or None,
+        delays=[*(model.delays or ()), *known] or None,
+    )
+    fixed, inputs = _fixed(model.fix), inputs_of(model, asked.inputs)
+    own = [one.poles for one in inputs or () if one.poles is not None]
+    if inputs and any(one.zeros is not None for one in inputs) and model.poles is None and not own:
+        raise UsageError("--poles is missing: with the zeros of single inputs it must be given")
+    poles = model.poles if model.poles is not None else max(own, default=None)
+    if fixed and poles is None:
         raise UsageError("--poles is missing: with --fix it must be given")
     # The names of known parameters are those of a number of zeros.
-    zeros = 0 if fixed and model.zeros is None else model.zeros
+    zeros = 0 if (fixed or own or (inputs and any(one.zeros is not None for one in inputs))) else None
+    zeros = zeros if model.zeros is None else model.zeros
     given = given_of(model, treatment, treatment.hold)
-    return replace(given, poles=model.poles, zeros=zeros, loss=treatment.loss, fixed=fixed, noise_model=treatment.noise)
+    given = replace(given, poles=poles, zeros=zeros, loss=treatment.loss, fixed=fixed, noise_model=treatment.noise)
+    return replace(given, inputs=inputs)
+
+
+def inputs_of(model: ModelOptions, names: Sequence[str]) -> tuple[InputModel, ...] | None:
+    """Return what is given of each of several inputs."""
+    from ctid_cli.estimators.delay_profile import InputModel
+
+    each: dict[str, PerInput[Any]] = {
+        "poles": per_input("--poles", model.each_poles, int),
+        "zeros": per_input("--zeros", model.each_zeros, int),
+        "delay_bounds": per_input("--delay", model.delays, delay_bounds),
+        "integrators": per_input("--integrators", model.each_integrators, int),
+    }
+    if not names:
+        return None
+    poles = each["poles"]
+    missing = [name for name in names if name not in poles.own]
+    if poles.own and poles.shared is None and missing:
+        raise UsageError(f"--poles is given for {', '.join(poles.own)} and not for {', '.join(missing)}")
+    return tuple(
+        InputModel(name, **{field: one.own[name] for field, one in each.items() if name in one.own}) for name in names
+    )
 
 
 def _in_loop(asked: Asked) -> LoopOutputError:
@@ -293,6 +385,28 @@ def _submodels(asked: Asked) -> MeasuredSubmodels:
         factored=asked.model.model == "additive" or asked.integrators > 0,
         fixed=_fixed(asked.model.fix),
     )
+
+
+def _refuse_inputs(asked: Asked) -> None:
+    """Options of single inputs that the record does not have, and what is not available for several."""
+    model = asked.model
+    for option, texts in (
+        ("--poles", model.each_poles),
+        ("--zeros", model.each_zeros),
+        ("--delay", model.delays),
+        ("--integrators", model.each_integrators),
+    ):
+        for text in texts or ():
+            name, equals, _ = text.rpartition("=")
+            if equals and name not in asked.inputs:
+                named = f"the inputs are {', '.join(asked.inputs)}" if asked.inputs else "name several with --input"
+                raise UsageError(f"{option} {text} is for an input {name!r}; {named}")
+    if len(asked.inputs) > 1 and asked.model.model == "additive":
+        raise UsageError("--model additive has one input; give one --input, or drop --model")
+    if len(asked.inputs) > 1 and asked.loop != "none":
+        raise UsageError(
+            "a record in a loop is fitted with one input; give one --input, or drop --loop and --reference"
+        )
 
 
 def _refuse_other_form(asked: Asked) -> None:

@@ -108,7 +108,11 @@ class Degrees:
 
     def model(self, fractions: Sequence[TransferFunction]) -> AnyModel:
         """Return the model with given transfer functions."""
-        return MultiInputModel(dict(zip(self.inputs, fractions, strict=True)), self.common) if self.several else fractions[0]
+        return (
+            MultiInputModel(dict(zip(self.inputs, fractions, strict=True)), self.common)
+            if self.several
+            else fractions[0]
+        )
 
     def with_orders(self, model: AnyModel, delays: Sequence[bool]) -> "Degrees":
         """Return the degrees for the denominators of a model, some of whose poles may be missing."""

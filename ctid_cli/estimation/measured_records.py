@@ -52,9 +52,7 @@ RANDOM_STARTS = 2
 COLLINEAR, INVOLVED = 1e-6, 1e-3
 
 
-def sensitivities(
-    problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]
-) -> list[tuple[Array, Array]]:
+def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]) -> list[tuple[Array, Array]]:
     """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
 
     The delays are those of theta where they are parameters. The last coefficients of a denominator are zero where the
@@ -487,8 +485,9 @@ def _period(record: Record) -> float:
 
 def _one_period(data: FilterData, period: float) -> FilterData:
     """Return the record with the breaks of its input within one period."""
-    within, data = data.tu < data.tu[0] + period * (1 - 1e-9), data._replace(
-        further=tuple(_one_period(one, period) for one in data.further)
+    within, data = (
+        data.tu < data.tu[0] + period * (1 - 1e-9),
+        data._replace(further=tuple(_one_period(one, period) for one in data.further)),
     )
     if within.all():
         return data

@@ -48,9 +48,7 @@ class RobustFit:
         return [x + loss.weight(r) * r for x, loss, r in each]
 
 
-def robust_fit(
-    measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Start], nested: bool
-) -> RobustFit:
+def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Start], nested: bool) -> RobustFit:
     """Search for the least Huber loss, and from there for Tukey's.
 
     The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.

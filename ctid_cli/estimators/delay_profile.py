@@ -453,7 +453,8 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         unknown = [name for name in own if name not in names]
         if unknown:
             raise OptionError(
-                "inputs", f"there is no input {unknown[0]!r}; the record has {', '.join(names) if any(names) else 'one'}"
+                "inputs",
+                f"there is no input {unknown[0]!r}; the record has {', '.join(names) if any(names) else 'one'}",
             )
         return [self._alone(own[name]) if name in own else replace(self, inputs=None, fixed=None) for name in names]
 
@@ -464,7 +465,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _degrees(self, names: tuple[str, ...], *, free: bool = True) -> Degrees:
         """Return the degrees for inputs of some names; if not free, without integrators and delays."""
-        each = self._each(names) if self.inputs else [replace(self, fixed=None)] * len(names) if len(names) > 1 else [self]
+        each = (
+            self._each(names) if self.inputs else [replace(self, fixed=None)] * len(names) if len(names) > 1 else [self]
+        )
         blocks = each[:1] if self.common else each
         return Degrees(
             tuple(one.order if free else one.poles for one in blocks),

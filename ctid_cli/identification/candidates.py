@@ -11,11 +11,10 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
-from ctid_cli.estimators.delay_profile import DelayProfile, fitted
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, fitted
 from ctid_cli.identification.criterion import Candidate, Ranking, ranked
 
-from ctid_cli.models.several_inputs import delays_of
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
@@ -92,7 +91,7 @@ class Structures:
     measured: MeasuredRecords
     search: StructureSearch
     #: Models of another setting, from which all searches start.
-    near: Callable[[int, int], TransferFunction] | None = None
+    near: Callable[[int, int], AnyModel] | None = None
     found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
@@ -102,18 +101,24 @@ class Structures:
         setting: Setting,
         integrators: int,
         delays: tuple[float, float],
-        near: Callable[[int, int], TransferFunction] | None = None,
+        near: Callable[[int, int], AnyModel] | None = None,
+        inputs: tuple[InputModel, ...] | None = None,
     ) -> "Structures":
         """Lay records out."""
         hold, state, before, offset = setting
         least = int(not integrators)
         options = DelayProfile(
-            *(least, 0, delays), initial_state=state, offset=offset, integrators=integrators, input_before=before
+            *(least, 0, delays),
+            initial_state=state,
+            offset=offset,
+            integrators=integrators,
+            input_before=before,
+            inputs=inputs,
         )
         held = [with_hold(record, hold) for record in records]
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
-        box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
+        box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
         return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK), near)
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
@@ -128,7 +133,7 @@ class Structures:
             self.found[poles, zeros] = Candidate(options, self.hold, found, size)
         return self.found[poles, zeros]
 
-    def model(self, poles: int, zeros: int) -> TransferFunction:
+    def model(self, poles: int, zeros: int) -> AnyModel:
         """Return a model that has been fitted."""
         return self.found[poles, zeros].fit.model
 
@@ -149,9 +154,11 @@ class SmallModels:
         span: Span,
         delays: tuple[float, float],
         most: int = len(SMALL),
-        near: TransferFunction | None = None,
+        near: AnyModel | None = None,
+        inputs: tuple[InputModel, ...] | None = None,
     ) -> None:
         self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
+        self.inputs = inputs
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
@@ -177,13 +184,22 @@ class SmallModels:
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             model = self.near
             near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(self.records, *key, self.delays, near)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, near, self.inputs)
         return self._structures[key]
 
 
-def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:
-    """Fit structures of ever more poles, until the best lies inside or there are no more."""
-    families = [Structures.of(records, setting, integrators, delays) for integrators in span.integrators]
+def grid(
+    records: Sequence[Record],
+    setting: Setting,
+    span: Span,
+    delays: tuple[float, float],
+    inputs: tuple[InputModel, ...] | None = None,
+) -> Ranking:
+    """Fit structures of ever more poles, until the best lies inside or there are no more.
+
+    Several inputs share poles and the number of zeros; what is given of the delays of single ones is in ``inputs``.
+    """
+    families = [Structures.of(records, setting, integrators, delays, inputs=inputs) for integrators in span.integrators]
     found: list[Candidate] = []
     most = span.poles[1] + max(span.integrators)
     for order in range(1, min(most, MOST_POLES) + 1):

@@ -3,7 +3,8 @@
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
-from ctid_cli.text import count
+from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.text import count, listed
 
 #: What is said where the beginning of a record is not looked at.
 STATE_OF_PART = (
@@ -81,9 +82,15 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given) -> list
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best)}; {_below(ranking, other, other.name)}.")
-    if given.delay_bounds is None:
-        found.append(f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {best.fit.model.delay:.4g}.")
-    return found
+    return found + of_range(ranking, delays, given)
+
+
+def of_range(ranking: Ranking, delays: tuple[float, float], given: Given) -> list[str]:
+    """Return the range of the delay where it was chosen."""
+    if given.delays_given is not None:
+        return []
+    at = listed(f"{delay:.4g}" for delay in delays_of(ranking.best.fit.model))
+    return [f"Delay: searched from 0 to {delays[1]:g} (--delay), found at {at}."]
 
 
 def of_criterion(ranking: Ranking) -> str:

@@ -43,7 +43,7 @@ class NamedFit:
     fit: FittedModel
     units: Units
     hold: Any
-    columns: Mapping[str, str]
+    columns: Mapping[str, Any]
 
 
 def named_fits(files: Sequence[Path]) -> list[NamedFit]:

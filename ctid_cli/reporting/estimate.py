@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctid_cli.canonical import plain
 from ctid_cli.inference.intervals import NORMAL, UncertainValue
+from ctid_cli.signals.measurement import SEPARATOR
 from ctid_cli.signals.sampled_signal import SECONDS
 
 if TYPE_CHECKING:
@@ -39,6 +40,11 @@ class Units:
     def seconds(self) -> float | None:
         """Seconds in the unit of time; None where the label is not known."""
         return SECONDS.get(self.time)
+
+    def of_input(self, k: int) -> Units:
+        """Units of one of several inputs, whose labels stand one after the other."""
+        labels = self.input.split(SEPARATOR)
+        return replace(self, input=labels[k]) if len(labels) > 1 else self
 
     def of(self, name: str, poles: int, zeros: int) -> str:
         """Unit of a parameter."""

@@ -10,6 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray, IntArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.residual_tests import ResidualTests
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, outline, plain
 from ctid_cli.signals.measurement import Measurement
@@ -40,9 +41,7 @@ def identification_drawing(
                 axes.margins(x=0.0)
                 _name_panels(axes, axes, measurement, k, len(measurements), units)
         elif kind == "correlation":
-            both = figure.subplots(1, 2)
-            draw_autocorrelation(both[0], result.tests, len(measurements), _tested(result))
-            draw_cross_correlation(both[1], result.tests, len(measurements), _tested(result))
+            draw_correlations(figure.subplots(1, 2), result, len(measurements))
         elif kind == "profile":
             draw_profile(figure.add_subplot(), result, units)
         else:
@@ -63,7 +62,22 @@ def _tested(result: Identification) -> str:
 def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Measurement], units: Units) -> None:
     drawn = measurements[:MOST_DRAWN]
     grid = figure.add_gridspec(2 * len(drawn) + 1, 2, height_ratios=[2, 1.2] * len(drawn) + [2])
-    for k, measurement in enumerate(drawn):
+    draw_records(figure, grid, result, measurements, units)
+    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements), _tested(result))
+    draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
+
+
+def draw_correlations(both: Sequence[Any], result: Identification, experiments: int) -> None:
+    """Correlation of the residuals with themselves, and with the input."""
+    draw_autocorrelation(both[0], result.tests, experiments, _tested(result))
+    draw_cross_correlation(both[1], result.tests, experiments, _tested(result))
+
+
+def draw_records(
+    figure: Figure, grid: Any, result: Identification, measurements: Sequence[Measurement], units: Units
+) -> None:
+    """Output and residuals of the first experiments, each in two rows of a grid."""
+    for k, measurement in enumerate(measurements[:MOST_DRAWN]):
         output = figure.add_subplot(grid[2 * k, :])
         error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
         _draw_output(output, result, measurement, k, units)
@@ -71,8 +85,6 @@ def _draw_all(figure: Figure, result: Identification, measurements: Sequence[Mea
         output.margins(x=0.0)
         _draw_residuals(error, result, measurement, k, units)
         _name_panels(output, error, measurement, k, len(measurements), units)
-    draw_autocorrelation(figure.add_subplot(grid[-1, 0]), result.tests, len(measurements), _tested(result))
-    draw_profile(figure.add_subplot(grid[-1, 1]), result, units)
 
 
 def _draw_output(axes: Any, result: Identification, measurement: Measurement, k: int, units: Units) -> None:
@@ -159,7 +171,7 @@ def _draw_band(axes: Any, band: float, label: str) -> None:
 
 def draw_profile(axes: Any, result: Identification, units: Units) -> None:
     """The search over the delay."""
-    profile, delay = result.fit.profile, result.fit.model.delay
+    profile, delay = result.fit.profile, fractions_of(result.fit.model)[0].delay
     axes.set_xlabel(plain(f"delay [{units.time}]"))
     axes.set_ylabel(plain(f"cost [({units.output})²]"))
     if profile is None:

@@ -14,7 +14,7 @@ import pandas as pd
 from ctid_cli.arrays import Array
 from ctid_cli.errors import StorageError
 from ctid_cli.estimation.optimum.box import Box
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, Options, SubmodelsFit
@@ -28,6 +28,7 @@ from ctid_cli.reporting.estimate import PARAMETER_FORMATS, Units, parameter_fram
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import additive_of, derived_of, fit_content, parameters_of
 from ctid_cli.reporting.fit_plot import identification_drawing
+from ctid_cli.reporting.inputs_plot import inputs_drawing
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
@@ -103,7 +104,8 @@ class FitResult(Result):
 
     def drawing(self) -> Drawing:
         """Return the figure of output, residuals, their correlation, and the search over the delay."""
-        return identification_drawing(self.fitted, self.records.measurements, self.units)
+        kind = inputs_drawing if isinstance(self.fitted.fit, MultiInputFit) else identification_drawing
+        return kind(self.fitted, self.records.measurements, self.units)
 
     # --- sections ----------------------------------------------------------------------------------
 
@@ -131,9 +133,13 @@ class FitResult(Result):
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
-        hold, (low, high) = first.record.input.hold, options.delay_bounds
-        searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-        yield "model", f"{_structure(options)}; delay {searched}"
+        hold = first.hold
+        if isinstance(fit, MultiInputFit) and isinstance(options, DelayProfile):
+            yield "model", "common denominator" if options.common else "a denominator for each input"
+            for name, own in zip(fit.model.parts, options._each(list(fit.model.parts)), strict=True):
+                yield f"input {name}", f"{_structure(own)}; delay {_searched(own, units)}"
+        else:
+            yield "model", f"{_structure(options)}; delay {_searched(options, units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
         yield from _loop(options, first)
@@ -179,9 +185,12 @@ class FitResult(Result):
             for name, limit, value in fit.box.limits_met(fit.held_poles):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"
                 yield "at bound", f"{limit.what}, {value:.4g}{unit}: {limit.meaning}"
-        for k, test in enumerate(self.fitted.tests, start=1):
+        names = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
+        for k, test in enumerate(self.fitted.tests):
             what = "residuals" if fit.noise is None else "innovations"
-            yield what if len(fit.residuals) == 1 else f"{what} {k}", _tested(test)
+            record, place = divmod(k, len(names))
+            number_of = f" {record + 1}" * (len(fit.residuals) > 1)
+            yield f"{what}{number_of}", _tested(test, f"input {names[place]}".strip())
 
     def file_text(self, folder: Path, command: str | None = None) -> str:
         """Return the text of ``fit.json`` in a folder, from which the records are named."""
@@ -227,13 +236,19 @@ def _polynomial(coefficients: Sequence[float], errors: Array) -> str:
 
 def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
     """What is not known of a band-limited input for want of the samples beyond the ends."""
-    signal = measurement.record.input
+    signal = next(iter(measurement.record.held.values()))
     if signal.hold != "band-limited" or options.initial_state == "periodic":
         return ""
     doubt = band_limited_doubt(signal.t, signal.values)
     known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {doubt.ends:.2g} {units.input}"
     rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
     return f", {known}{rough}"
+
+
+def _searched(options: Options, units: Units) -> str:
+    """Range of the delay, or its known value."""
+    low, high = options.delay_bounds
+    return f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
 
 
 def _structure(options: Options) -> str:
@@ -299,7 +314,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     clock = "regular clock" if record.interval is not None else "irregular clock"
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
     labels = measurement.label("input", units.input), measurement.label("output", units.output)
-    columns = f"input {labels[0]}, output {labels[1]}"
+    columns = f"input{'s' * record.several} {labels[0]}, output {labels[1]}"
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
@@ -314,8 +329,12 @@ def _offset(result: Identification, units: Units) -> str:
     fit, options = result.fit, result.options
     if options.offset != "remove":
         return TREATMENTS[options.offset]
-    pairs = zip(fit.input_offsets, fit.offsets, strict=True)
-    means = "; ".join(f"{u:.6g} {units.input}, {y:.6g} {units.output}" for u, y in pairs)
+    count_of = len(fit.input_offsets) // len(fit.offsets)
+    each = [fit.input_offsets[k : k + count_of] for k in range(0, len(fit.input_offsets), count_of)]
+    means = "; ".join(
+        ", ".join([*(f"{u:.6g} {units.of_input(k).input}" for k, u in enumerate(levels)), f"{y:.6g} {units.output}"])
+        for levels, y in zip(each, fit.offsets, strict=True)
+    )
     return f"{TREATMENTS['remove']}: {means}"
 
 
@@ -370,10 +389,10 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
 
 
-def _tested(test: ResidualTests) -> str:
+def _tested(test: ResidualTests, input: str) -> str:
     """Return the outcome of the tests of residuals; the warnings say what to do."""
     white = "white" if test.white else "not white"
-    free = "independent of the input" if test.uncorrelated else "dependent on the input"
+    free = f"independent of the {input}" if test.uncorrelated else f"dependent on the {input}"
     return f"{white} (p = {number(test.whiteness_p_value, 2)}), {free} (p = {number(test.cross_p_value, 2)})"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
+from ctid_cli.estimators.identification import models_of
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.reporting.document import Tool
@@ -21,15 +22,19 @@ if TYPE_CHECKING:
 def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
     """Return what the page of a fit shows as tables by the names of their files; several records are numbered."""
     fitted, units = result.fitted, result.units
-    tables = {
-        "step.csv": response_frame(fitted.step_response(), units.gain, units),
-        "bode.csv": frequency_frame(fitted.frequency_response(), units),
-    }
+    tables = {}
+    for k, (name, model) in enumerate(models_of(fitted).items()):
+        tail, own = f"_{name}" if name else "", units.of_input(k)
+        tables[f"step{tail}.csv"] = response_frame(model.step_response(), own.gain, own)
+        tables[f"bode{tail}.csv"] = frequency_frame(model.frequency_response(), own)
     several = len(result.records.data) > 1
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"
         used, residuals = fitted.fit.used[k], fitted.fit.residuals[k]
-        columns = {t: record.t[used], f"input [{units.input}]": record.input.at(record.t[used])}
+        columns = {t: record.t[used]}
+        for i, (name, signal) in enumerate(record.held.items()):
+            label = name if record.several else "input"
+            columns[f"{label} [{units.of_input(i).input}]"] = signal.at(record.t[used])
         columns[f"measured [{units.output}]"] = record.y[used]
         columns[f"simulated [{units.output}]"] = record.y[used] - residuals
         tables[f"simulation{number}.csv"] = pd.DataFrame(columns)

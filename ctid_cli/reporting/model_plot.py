@@ -10,6 +10,7 @@ from ctid_cli.arrays import ComplexArray
 from ctid_cli.estimators.identification import DelayCosts, Identification, Validation
 from ctid_cli.inference.frequency_response import FrequencyResponse
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, plain
 from ctid_cli.reporting.fit_plot import draw_overlay, draw_profile
@@ -135,7 +136,7 @@ def delay_drawing(result: Identification, near: DelayCosts | None, units: Units)
         draw_profile(panels[0], result, units)
         if near is None:
             return
-        axes, delay = panels[1], result.fit.model.delay
+        axes, delay = panels[1], fractions_of(result.fit.model)[0].delay
         share = 100.0 * (near.costs / near.least - 1.0)
         allowed = 100.0 * (near.allowed / near.least - 1.0)
         axes.plot(near.delays, share, ".-", color=DARK, linewidth=0.8, markersize=4, label="all other parameters free")

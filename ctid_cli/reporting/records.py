@@ -11,7 +11,6 @@ from ctid_cli.errors import DataError
 from ctid_cli.reporting.estimate import Units
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import ROLES
 from ctid_cli.text import count
 
 
@@ -71,6 +70,7 @@ class Records:
 
     def content(self) -> dict[str, Any]:
         """Return files, columns and units for JSON."""
-        columns = {role: getattr(self.measurements[0], role) for role in ROLES}
+        first = self.measurements[0]
+        columns = {"time": first.time, "input": first.columns, "output": first.output}
         files = [record.name for record in self.data]
         return {"files": files, "columns": columns, "units": asdict(self.units)}

@@ -213,6 +213,16 @@ class Record:
             )
         return next(iter(self.held.values()))
 
+    @property
+    def hold(self) -> Hold:
+        """How the inputs behave between their samples; that of the first one where they differ."""
+        return next(iter(self.held.values())).hold
+
+    @property
+    def each_input(self) -> list[Record]:
+        """The record with each of its inputs alone."""
+        return [self.of_input(name) for name in self.held]
+
     def driven_by(self, **inputs: HeldSignal) -> Record:
         """Return the record with some of its inputs changed."""
         return replace(self, inputs={**self.held, **inputs})

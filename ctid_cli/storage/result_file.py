@@ -172,6 +172,8 @@ def encoded(value: Any) -> Any:
         return value.name
     if isinstance(value, tuple | list):
         return [encoded(item) for item in value]
+    if isinstance(value, Mapping):
+        return {"type": "Mapping", "values": {name: encoded(item) for name, item in value.items()}}
     return _number(value.item() if isinstance(value, np.generic) else value)
 
 
@@ -194,6 +196,11 @@ def decoded(content: Any, hint: Any, place: str = "result") -> Any:
         return _array(content, np.dtype(get_args(choices[1])[0]), place)
     if origin in (tuple, Sequence):
         return _sequence(content, choices, place)
+    if origin is Mapping:
+        values = content.get("values") if isinstance(content, Mapping) else None
+        if not isinstance(values, Mapping):
+            _refuse_part(place)
+        return {name: decoded(item, choices[1], f"{place}.{name}") for name, item in values.items()}
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _instance(content, hint, place)
     if isinstance(hint, type) and hasattr(hint, "_fields"):

@@ -125,6 +125,11 @@ class Box:
         """Bounds of the delay of each input."""
         return each_bounds(self.delays)
 
+    @property
+    def several_delays(self) -> bool:
+        """Whether there are several inputs."""
+        return len(self.each_delay) > 1
+
     @cached_property
     def free_delays(self) -> tuple[int, ...]:
         """Inputs whose delays are searched."""

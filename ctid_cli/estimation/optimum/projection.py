@@ -290,7 +290,9 @@ def responses(problem: Problem, speed: Array, damping: Array, delays: Delays, pr
         parts = []
         for rows in rows_of(forms, columns, delays, data, period, channels=problem.channels):
             each = enumerate(zip(projected.outputs, projected.directs, strict=True))
-            parts.append(np.sum([out @ rows[columns.z(k)] + own * rows[columns.u(k)] for k, (out, own) in each], axis=0))
+            parts.append(
+                np.sum([out @ rows[columns.z(k)] + own * rows[columns.u(k)] for k, (out, own) in each], axis=0)
+            )
         found.append(np.concatenate(parts))
     return found
 

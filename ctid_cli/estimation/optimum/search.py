@@ -426,9 +426,7 @@ class Descent:
             ending = Ending.RIDGE
         elif promise <= CONVERGED:
             ending = Ending.AT_BOUND if bound.any() else Ending.CONVERGED
-        return replace(
-            here, ending=ending, promise=promise, held=held, pinned=pinned, delays_at_bound=tuple(at_bound)
-        )
+        return replace(here, ending=ending, promise=promise, held=held, pinned=pinned, delays_at_bound=tuple(at_bound))
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
         """Whether the squared error moves by less than the residual's variance as far as the set reaches.

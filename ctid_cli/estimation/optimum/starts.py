@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple, TypeVar
 
@@ -163,7 +164,7 @@ class StructureSearch:
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """Return the best single poles, or single pairs."""
-        delay = self.best(1, 0).seconds if poles > 1 else self.box.middle
+        delay = self.best(1, 0).seconds if poles > 1 else self._first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
     def _beside(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
@@ -188,10 +189,21 @@ class StructureSearch:
                         points.append(point_of(point.poles, seconds, self.box, within))
         return points
 
+    @cached_property
+    def _first_delays(self) -> tuple[float, ...]:
+        """Delays to start from: the middle of the range; of several inputs those of a pole of its own for each."""
+        problem, count = self.problem, len(self.problem.channels)
+        if count < 2:
+            return self.box.middle
+        channels = tuple(Channel(channel.input, k) for k, channel in enumerate(problem.channels))
+        ones, integrators = (1,) * count, (problem.integrators,) * count
+        apart = problem._replace(zeros=0, channels=channels, orders=ones, block_integrators=integrators)
+        return block_starts(apart, replace(self.box, orders=ones), 0, self.seed)[0].seconds
+
     def from_below(self, poles: int, zeros: int) -> list[Point]:
         """Return starts from smaller models, and along the delay."""
         if poles == 0:
-            middle = point_of(np.zeros(0, dtype=complex), self.box.middle, self.box)
+            middle = point_of(np.zeros(0, dtype=complex), self._first_delays, self.box)
             return self.along_delay(zeros, [middle])
         contained = self._alone(zeros, poles) if poles <= 2 else []
         others: list[Point] = []
@@ -220,7 +232,7 @@ class StructureSearch:
         count = min(int(highest / resolution), RESOLVED // samples)
         if poles < 2 or count < self.effort.pairs:
             return []
-        roots, delay = np.zeros(0, dtype=complex), self.box.middle
+        roots, delay = np.zeros(0, dtype=complex), self._first_delays
         if poles > 2:
             smaller = self.best(poles - 2, min(zeros, poles - 3))
             roots, delay = smaller.poles, smaller.seconds

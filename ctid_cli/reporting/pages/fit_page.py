@@ -7,8 +7,9 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.identification import Identification, costs_about_delay
+from ctid_cli.estimators.identification import Identification, costs_about_delay, models_of
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.citations import bibtex
 from ctid_cli.reporting.document import Section, pairs
 from ctid_cli.reporting.estimate import Units
@@ -37,14 +38,18 @@ POINTS = 500
 
 def fit_page(result: FitResult, content: Mapping[str, Any]) -> str:
     """Return the page as HTML, of a fit and what its file says."""
-    fitted, model = result.fitted, result.fitted.fit.model
-    terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
-    equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
+    fitted = result.fitted
+    names = models_of(fitted)
+    equations = []
+    for name, model in zip(names, fractions_of(fitted.fit.model), strict=True):
+        terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+        equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
+        equations.append(f"Response to {name}: {equation}" if name else equation)
     quality = Section("How good it is", frame=pairs(result.quality()))
     chapters = [
         Chapter("Before using it", [Section(sentences=[f"- {text}" for text in fitted.warnings] or [FINE])]),
         Chapter("Data", [result.data(), Section(frame=pairs(result.settings()))]),
-        Chapter("Model", [Section(sentences=[equation]), result.parameters(), result.derived(), quality]),
+        Chapter("Model", [Section(sentences=equations), result.parameters(), result.derived(), quality]),
         *_figures(fitted, result.records.measurements, result.records.validation, result.units),
         Chapter("Provenance", provenance(_origin(content), content["command"])),
         Chapter("How to cite", citation(bibtex(fitted))),
@@ -97,8 +102,12 @@ def _figures(
     residuals += [part("correlation", "Their correlation with themselves and with the input.")] if result.tests else []
     yield Chapter("Residuals", [*residuals, Section(notes=[test.sentence for test in result.tests])])
     yield Chapter("Responses", _responses(result, measurements, units))
-    poles = poles_drawing(result.poles(), result.fit.model.zeros, units)
-    yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
+    drawn = []
+    for (name, model), fraction in zip(models_of(result).items(), fractions_of(result.fit.model), strict=True):
+        of = f" of the response to {name}" if name else ""
+        poles = poles_drawing(model.poles(), fraction.zeros, units)
+        drawn.append(Section(drawing=poles, caption=f"Poles with their regions, and zeros{of}."))
+    yield Chapter("Poles", drawn)
     if result.fit.profile is not None:
         near = costs_about_delay(result)
         caption = "The search over the whole range" + (", and the cost about the estimate." if near else ".")
@@ -107,6 +116,15 @@ def _figures(
 
 def _responses(result: Identification, measurements: Sequence[Measurement], units: Units) -> list[Section]:
     """Return the model over frequency and time, with the frequency response of the first record without a model."""
+    if measurements[0].record.several:
+        sections = []
+        for k, (name, model) in enumerate(models_of(result).items()):
+            own = units.of_input(k)
+            bode = bode_drawing(model.frequency_response(), None, own)
+            sections.append(Section(drawing=bode, caption=f"Frequency response to {name}, with pointwise 95 % bands."))
+            step = step_drawing(model.step_response(), own)
+            sections.append(Section(drawing=step, caption=f"Response to a unit step of {name}, with its band."))
+        return sections
     notes: list[str] = []
     found = None
     try:
