@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -123,7 +124,7 @@ class Degrees:
 def _slices(first: int, sizes: Sequence[int]) -> list[slice]:
     """Places of several parts in a row."""
     ends = first + np.cumsum([0, *sizes])
-    return [slice(int(i), int(j)) for i, j in zip(ends[:-1], ends[1:], strict=True)]
+    return [slice(*pair) for pair in pairwise(ends.tolist())]
 
 
 @dataclass(frozen=True)

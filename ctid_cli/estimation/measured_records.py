@@ -197,12 +197,12 @@ class MeasuredRecords:
         """Degrees of the transfer function of the first input."""
         return self.degrees.structure
 
-    def with_degrees(self, poles: int, zeros: int) -> "MeasuredRecords":
-        """The same records for other degrees, which all inputs share; integrators are among the poles."""
+    def with_degrees(self, poles: int, zeros: Sequence[int]) -> "MeasuredRecords":
+        """The same records for a common denominator, integrators among its poles, and numerators of other degrees."""
         other = copy(self)
-        degrees = replace(self.degrees, orders=(poles,), zeros=(zeros,) * len(self.degrees.zeros))
+        degrees = replace(self.degrees, orders=(poles,), zeros=tuple(zeros))
         other.layout = replace(self.layout, degrees=degrees)
-        other.problem = self.problem._replace(zeros=zeros)
+        other.problem = self.problem._replace(zeros=max(zeros), channels=degrees.channels)
         return other
 
     @property
@@ -473,8 +473,8 @@ def refuse_collinear(record: Record) -> None:
     if values[-1] < COLLINEAR * values[0]:
         alike = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
         raise DataError(
-            f"{named(record)}the inputs {' and '.join(alike)} are collinear: one is a linear function of the others, and "
-            "their responses cannot be told apart; drop one, or record them moving independently"
+            f"{named(record)}the inputs {' and '.join(alike)} are collinear: one is a linear function of the others, "
+            "and their responses cannot be told apart; drop one, or record them moving independently"
         )
 
 

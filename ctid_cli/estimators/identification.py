@@ -19,7 +19,7 @@ from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.derived import derived_parameters
-from ctid_cli.inference.fit import DeferredFields, Status
+from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
@@ -29,8 +29,8 @@ from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, resi
 from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
-from ctid_cli.signals.checks import require_integer
 from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 from ctid_cli.text import Shown
 

@@ -8,12 +8,11 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
+from ctid_cli.estimation.optimum.best_model import Optimum, Start, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, fitted
-from ctid_cli.identification.criterion import Candidate, Ranking, ranked
-
+from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, ranked
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
@@ -52,11 +51,14 @@ class Span(NamedTuple):
     zeros: tuple[int, int] = (0, MOST_POLES)
     integrators: tuple[int, ...] = (0, 1)
 
+    #: Whether each of several inputs may have fewer zeros than its structure.
+    fewer_zeros: bool = True
+
     @classmethod
-    def only(cls, options: DelayProfile) -> "Span":
+    def only(cls, options: DelayProfile, fewer_zeros: bool) -> "Span":
         """Return the span of one structure."""
         poles, zeros = options.poles, options.zeros
-        return cls((poles, poles), (zeros, zeros), (options.integrators,))
+        return cls((poles, poles), (zeros, zeros), (options.integrators,), fewer_zeros)
 
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
         """Yield poles and zeros of all structures of an order, integrators included."""
@@ -92,6 +94,8 @@ class Structures:
     search: StructureSearch
     #: Models of another setting, from which all searches start.
     near: Callable[[int, int], AnyModel] | None = None
+    #: Whether each of several inputs may have fewer zeros than its structure.
+    fewer_zeros: bool = False
     found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
@@ -103,6 +107,7 @@ class Structures:
         delays: tuple[float, float],
         near: Callable[[int, int], AnyModel] | None = None,
         inputs: tuple[InputModel, ...] | None = None,
+        fewer_zeros: bool = False,
     ) -> "Structures":
         """Lay records out."""
         hold, state, before, offset = setting
@@ -119,19 +124,52 @@ class Structures:
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
         box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
-        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK), near)
+        search = StructureSearch(measured.problem, box, effort=QUICK)
+        return cls(held, hold, options, measured, search, near, fewer_zeros)
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
         if (poles, zeros) not in self.found:
             options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
-            laid_out = measured.with_degrees(options.order, zeros)
+            laid_out = measured.with_degrees(options.order, [zeros] * len(measured.degrees.zeros))
             size = laid_out.layout.size - options.integrators
             if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
                 return None
             found = fitted(laid_out, self._least(poles, zeros), None, None)
-            self.found[poles, zeros] = Candidate(options, self.hold, found, size)
+            candidate = Candidate(options, self.hold, found, size)
+            self.found[poles, zeros] = self._with_fewer_zeros(candidate) if self.fewer_zeros else candidate
         return self.found[poles, zeros]
+
+    def _with_fewer_zeros(self, candidate: Candidate) -> Candidate:
+        """Return a candidate whose inputs have only the zeros that are worth their parameters, in white noise."""
+        names = self.measured.degrees.inputs
+        zeros = [candidate.options.zeros] * len(names)
+        if candidate.fit.poles_at_infinity or len(names) < 2:
+            return candidate
+        worth = float(np.exp(PENALTY * np.log(candidate.fit.count) / candidate.fit.count))
+        for k in range(len(names)):
+            while zeros[k] > 0:
+                fewer = [*zeros[:k], zeros[k] - 1, *zeros[k + 1 :]]
+                trial = self._near(candidate, fewer)
+                if trial.fit.cost > candidate.fit.cost * worth:
+                    break
+                candidate, zeros = trial, fewer
+        return candidate
+
+    def _near(self, candidate: Candidate, zeros: Sequence[int]) -> Candidate:
+        """Fit numerators of other degrees near a candidate."""
+        own = {one.name: one for one in candidate.options.inputs or ()}
+        names = self.measured.degrees.inputs
+        inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
+        laid_out = self.measured.with_degrees(candidate.options.order, zeros)
+        search = StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
+        fit = fitted(laid_out, best_near(search, max(zeros), self._start(candidate.fit.model)), None, None)
+        size = laid_out.layout.size - candidate.options.integrators
+        return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
+
+    def _start(self, model: AnyModel) -> Start:
+        """Return the poles of a model, without integrators, and its delays."""
+        return np.atleast_1d(np.poly(self.measured.free_poles(model)).real), tuple(delays_of(model))
 
     def model(self, poles: int, zeros: int) -> AnyModel:
         """Return a model that has been fitted."""
@@ -140,9 +178,7 @@ class Structures:
     def _least(self, poles: int, zeros: int) -> Optimum:
         if self.near is None:
             return best_of_orders(self.search, poles, zeros)
-        start = self.near(poles, zeros)
-        alone = np.atleast_1d(np.poly(self.measured.free_poles(start)).real)
-        return best_near(self.search, zeros, (alone, tuple(delays_of(start))))
+        return best_near(self.search, zeros, self._start(self.near(poles, zeros)))
 
 
 class SmallModels:
@@ -184,7 +220,9 @@ class SmallModels:
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             model = self.near
             near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(self.records, *key, self.delays, near, self.inputs)
+            self._structures[key] = Structures.of(
+                self.records, *key, self.delays, near, self.inputs, self.span.fewer_zeros
+            )
         return self._structures[key]
 
 
@@ -199,7 +237,10 @@ def grid(
 
     Several inputs share poles and the number of zeros; what is given of the delays of single ones is in ``inputs``.
     """
-    families = [Structures.of(records, setting, integrators, delays, inputs=inputs) for integrators in span.integrators]
+    families = [
+        Structures.of(records, setting, integrators, delays, None, inputs, span.fewer_zeros)
+        for integrators in span.integrators
+    ]
     found: list[Candidate] = []
     most = span.poles[1] + max(span.integrators)
     for order in range(1, min(most, MOST_POLES) + 1):

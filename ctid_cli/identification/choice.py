@@ -80,14 +80,15 @@ class Given:
     def span(self) -> Span:
         """Structures that are admitted; where inputs have degrees of their own, small ones to compare treatments."""
         if self.typed:
-            integrators = [one.integrators for one in self.inputs or () if one.integrators is not None]
-            return Span((1, 3), (0, 2), (max(integrators, default=self.integrators or 0),))
+            own = [one.integrators for one in self.inputs or () if one.integrators is not None]
+            return Span((1, 3), (0, 2), (max(own, default=self.integrators or 0),))
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )
         none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
         free = (0,) if none else (0, 1)
-        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
+        integrators = free if self.integrators is None else (self.integrators,)
+        return Span(poles, zeros, integrators, not isinstance(self.zeros, int))
 
     def check(self) -> None:
         """Refuse what does not go together, with an OptionError."""

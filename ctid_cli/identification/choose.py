@@ -100,7 +100,7 @@ class _Choosing:
             return self._typed(setting, delays)
         ranking = self._grid(setting, delays)
         # Small models may miss so much that a state makes up for it, or that their delay is far too long.
-        span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
+        span, narrower = Span.only(ranking.best.options, self.span.fewer_zeros), self._range_of(ranking, delays)
         narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
         confirmed = self._setting(span, narrower, ranking.best.fit.model)
         if (narrower, confirmed) != (delays, setting):

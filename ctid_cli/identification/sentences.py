@@ -23,6 +23,9 @@ def spelled(candidate: Candidate) -> str:
     """Return a structure in words."""
     options = candidate.options
     zeros = count(options.zeros, "zero") if options.zeros else "no zero"
+    own = [one for one in options.inputs or () if one.zeros is not None]
+    if own:
+        zeros = f"numerators of degree {listed(f'{one.zeros} ({one.name})' for one in own)}"
     besides = f" and {count(options.integrators, 'integrator')}" if options.integrators else ""
     return f"{count(options.poles, 'pole')}, {zeros}{besides}"
 

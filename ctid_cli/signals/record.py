@@ -147,7 +147,8 @@ class Record:
         loop = ", in a loop" if self.loop else ""
         inputs = f", inputs {', '.join(self.held)}" if self.several else ""
         name = f"{self.name!r}, " if self.name else ""
-        return f"Record({name}{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s, {clock}{missing}{inputs}{loop})"
+        span = f"{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s"
+        return f"Record({name}{span}, {clock}{missing}{inputs}{loop})"
 
     def _require_loop(self, loop: Loop, where: str) -> None:
         if loop.reference.size != self.t.size:

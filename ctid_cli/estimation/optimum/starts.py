@@ -374,8 +374,8 @@ def _lowest_minima(values: Array, most: int) -> list[int]:
 def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> list[Point]:
     """Return starts of a sum of fractions with several denominators, the most likely first.
 
-    The search of one denominator sees the output less the response of the others, as they are known by then: twice, from
-    the first denominator on and from the last one on. The lowest minima of each are combined.
+    The search of one denominator sees the output less the response of the others, as they are known by then: twice,
+    from the first denominator on and from the last one on. The lowest minima of each are combined.
     """
     blocks, found = range(len(problem.orders)), list[Point]()
     for order in (blocks, blocks[::-1]):

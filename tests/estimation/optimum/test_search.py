@@ -1,7 +1,5 @@
 """Local searches against a general optimiser in the same box, and what they say about where they end."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
