@@ -559,6 +559,11 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
+        inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
+        if list(measured.degrees.inputs) != inputs:
+            given = ", ".join(filter(None, measured.degrees.inputs)) or "one input"
+            wanted = ", ".join(filter(None, inputs)) or "one input"
+            raise DataError(f"{named(measured.records[0])}the record has {given}, and the model has {wanted}")
         weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
         found: AppliedModel = weighed.errors_of(fit.model)
         return found

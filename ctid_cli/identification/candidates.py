@@ -44,6 +44,17 @@ class Setting(NamedTuple):
         return self.initial_state, self.input_before
 
 
+class Several(NamedTuple):
+    """What is known of several inputs, which share a denominator."""
+
+    #: Given ranges of their delays.
+    inputs: tuple[InputModel, ...] | None = None
+    #: Whether each may have fewer zeros than the structure.
+    fewer_zeros: bool = True
+    #: Delays of a small model.
+    first_delays: tuple[float, ...] | None = None
+
+
 class Span(NamedTuple):
     """Least and greatest number of poles (integrators not among them) and of zeros, and the numbers of integrators."""
 
@@ -51,14 +62,11 @@ class Span(NamedTuple):
     zeros: tuple[int, int] = (0, MOST_POLES)
     integrators: tuple[int, ...] = (0, 1)
 
-    #: Whether each of several inputs may have fewer zeros than its structure.
-    fewer_zeros: bool = True
-
     @classmethod
-    def only(cls, options: DelayProfile, fewer_zeros: bool) -> "Span":
+    def only(cls, options: DelayProfile) -> "Span":
         """Return the span of one structure."""
         poles, zeros = options.poles, options.zeros
-        return cls((poles, poles), (zeros, zeros), (options.integrators,), fewer_zeros)
+        return cls((poles, poles), (zeros, zeros), (options.integrators,))
 
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
         """Yield poles and zeros of all structures of an order, integrators included."""
@@ -106,26 +114,25 @@ class Structures:
         integrators: int,
         delays: tuple[float, float],
         near: Callable[[int, int], AnyModel] | None = None,
-        inputs: tuple[InputModel, ...] | None = None,
-        fewer_zeros: bool = False,
+        several: "Several | None" = None,
     ) -> "Structures":
         """Lay records out."""
         hold, state, before, offset = setting
-        least = int(not integrators)
+        least, several = int(not integrators), several or Several()
         options = DelayProfile(
             *(least, 0, delays),
             initial_state=state,
             offset=offset,
             integrators=integrators,
             input_before=before,
-            inputs=inputs,
+            inputs=several.inputs,
         )
         held = [with_hold(record, hold) for record in records]
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
         box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
-        search = StructureSearch(measured.problem, box, effort=QUICK)
-        return cls(held, hold, options, measured, search, near, fewer_zeros)
+        search = StructureSearch(measured.problem, box, effort=QUICK, first_delays=several.first_delays)
+        return cls(held, hold, options, measured, search, near, several.fewer_zeros)
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
@@ -191,10 +198,10 @@ class SmallModels:
         delays: tuple[float, float],
         most: int = len(SMALL),
         near: AnyModel | None = None,
-        inputs: tuple[InputModel, ...] | None = None,
+        several: Several | None = None,
     ) -> None:
         self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
-        self.inputs = inputs
+        self.several = several
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
@@ -220,9 +227,7 @@ class SmallModels:
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             model = self.near
             near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(
-                self.records, *key, self.delays, near, self.inputs, self.span.fewer_zeros
-            )
+            self._structures[key] = Structures.of(self.records, *key, self.delays, near, self.several)
         return self._structures[key]
 
 
@@ -231,16 +236,10 @@ def grid(
     setting: Setting,
     span: Span,
     delays: tuple[float, float],
-    inputs: tuple[InputModel, ...] | None = None,
+    several: Several | None = None,
 ) -> Ranking:
-    """Fit structures of ever more poles, until the best lies inside or there are no more.
-
-    Several inputs share poles and the number of zeros; what is given of the delays of single ones is in ``inputs``.
-    """
-    families = [
-        Structures.of(records, setting, integrators, delays, None, inputs, span.fewer_zeros)
-        for integrators in span.integrators
-    ]
+    """Fit structures of ever more poles, until the best lies inside or there are no more."""
+    families = [Structures.of(records, setting, integrators, delays, None, several) for integrators in span.integrators]
     found: list[Candidate] = []
     most = span.poles[1] + max(span.integrators)
     for order in range(1, min(most, MOST_POLES) + 1):

@@ -87,8 +87,7 @@ class Given:
         )
         none = isinstance(self.poles, int) or self.offset in ("remove", "drift") or self.initial_state == "periodic"
         free = (0,) if none else (0, 1)
-        integrators = free if self.integrators is None else (self.integrators,)
-        return Span(poles, zeros, integrators, not isinstance(self.zeros, int))
+        return Span(poles, zeros, free if self.integrators is None else (self.integrators,))
 
     def check(self) -> None:
         """Refuse what does not go together, with an OptionError."""

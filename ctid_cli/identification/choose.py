@@ -15,7 +15,7 @@ from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import SMALL, Setting, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking
 from ctid_cli.identification.initial_states import (
@@ -88,7 +88,7 @@ class _Choosing:
         whole = given.initial_state == "periodic"
         self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
         self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
-        self.inputs = given.delays_of_inputs
+        self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
         self.said: list[str] = []
 
@@ -100,7 +100,7 @@ class _Choosing:
             return self._typed(setting, delays)
         ranking = self._grid(setting, delays)
         # Small models may miss so much that a state makes up for it, or that their delay is far too long.
-        span, narrower = Span.only(ranking.best.options, self.span.fewer_zeros), self._range_of(ranking, delays)
+        span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
         narrower = narrower if narrower[1] < MUCH_NARROWER * delays[1] else delays
         confirmed = self._setting(span, narrower, ranking.best.fit.model)
         if (narrower, confirmed) != (delays, setting):
@@ -114,7 +114,7 @@ class _Choosing:
 
     def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
         """Return the choice where the degrees of each input are given."""
-        ranking = self._small(self._common([setting], delays[1]), self.span, delays).compared([setting])
+        ranking = self.models.compared([setting])
         delays = self._range_of(ranking, delays)
         given, treated = self.given, ranking.best.options
         degrees: Any = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
@@ -140,7 +140,7 @@ class _Choosing:
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        return grid(self.many, setting, self.span, delays, self.inputs)
+        return grid(self.many, setting, self.span, delays, self.several)
 
     def _small(
         self,
@@ -150,7 +150,7 @@ class _Choosing:
         near: AnyModel | None = None,
         most: int = len(SMALL),
     ) -> SmallModels:
-        return SmallModels(records, span, delays, most, near, self.inputs)
+        return SmallModels(records, span, delays, most, near, self.several)
 
     # --- the range of the delay ------------------------------------------------------------------------
 
@@ -166,7 +166,13 @@ class _Choosing:
         # An estimated state does no harm to the delay; rest may.
         settings = self._settings(latest)[-1:]
         models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        self._note(models)
         return self._range_of(models, (0.0, latest)), latest
+
+    def _note(self, models: Ranking) -> None:
+        """Keep the delays of the best small model, from which later searches of several inputs start."""
+        if self.several.first_delays is None:
+            self.several = self.several._replace(first_delays=tuple(delays_of(models.best.fit.model)))
 
     def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
         """Return the range that the delay of the best model asks for, within another; that one where it is given."""
@@ -190,7 +196,9 @@ class _Choosing:
         models = self._small(self._common(settings, delays[1]), span, delays, near)
         if self.given.offset is None:
             settings += [each._replace(offset="none") for each in settings]
-        best = self._treated(models.compared(settings), delays[1])
+        ranking = models.compared(settings)
+        self._note(ranking)
+        self.models, best = models, self._treated(ranking, delays[1])
         setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
         holds = self._holds()
         if len(holds) > 1:

@@ -23,7 +23,7 @@ class InputFit(FittedModel):
     model : TransferFunction
         The transfer function from this input to the output.
     parameter_names : tuple of str
-        Names of all parameters of the fit, those of other transfer functions empty.
+        Names of all parameters of the fit; those that this transfer function does not have begin with "other".
     law : Uncertainty
         Covariance of all parameters.
     """
@@ -35,8 +35,8 @@ class InputFit(FittedModel):
     @classmethod
     def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
         """Return the transfer function of an input; a common denominator has names without one."""
-        own = [each.removeprefix(f"{name}_") for each in names]
-        return cls(model, tuple(each if _OWN.fullmatch(each) else "" for each in own), law)
+        own = [(each.removeprefix(f"{name}_"), each) for each in names]
+        return cls(model, tuple(bare if _OWN.fullmatch(bare) else f"other {each}" for bare, each in own), law)
 
     def _estimated(self) -> Estimated:
         """The transfer function with the joint law of all parameters."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import UsageError
-from ctid_cli.estimators.identification import models_of
+from ctid_cli.estimators.identification import Identification, models_of
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.reporting.document import Tool
@@ -63,9 +64,14 @@ def model_code(fit: FittedModel, tool: Tool, time_unit: str, pade: int | None = 
     """Return the name of a file and the code in it that builds a model in another tool, with every digit."""
     if pade is not None and tool != "control":
         raise UsageError(f"--pade is for control, which knows no delays, not for {tool}, where the delay stays exact")
+    models = models_of(fit) if isinstance(fit, Identification) else {"": fit}
+    variables = {name: "G" + f"_{re.sub(r'[^A-Za-z0-9_]', '_', name)}" * bool(name) for name in models}
     if tool == "matlab":
-        return "G.m", fit.to_matlab(time_unit=time_unit)
-    return f"G_{tool}.py", fit.to_python("G", tool, pade)
+        parts = [model.to_matlab(variables[name], time_unit=time_unit) for name, model in models.items()]
+        parts += [f"G = [{', '.join(variables.values())}];\n"] * (len(models) > 1)
+        return "G.m", "".join(parts)
+    parts = [model.to_python(variables[name], tool, pade) for name, model in models.items()]
+    return f"G_{tool}.py", "\n".join(parts)
 
 
 def stored_model_code(file: Path, tool: Tool, pade: int | None = None) -> str:

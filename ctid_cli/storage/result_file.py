@@ -10,7 +10,7 @@ import math
 import os
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -216,7 +216,10 @@ def _one_of(content: Any, choices: Sequence[Any], place: str) -> Any:
     left = [choice for choice in choices if choice is not type(None)]
     if isinstance(content, Mapping) and len(left) > 1:
         left = [choice for choice in left if getattr(choice, "__name__", "") == content.get("type")]
-    return decoded(content, left[0], place) if left else _refuse_part(place)
+    for choice in left[:-1]:
+        with suppress(DataError):
+            return decoded(content, choice, place)
+    return decoded(content, left[-1], place) if left else _refuse_part(place)
 
 
 def _sequence(content: Any, choices: Sequence[Any], place: str) -> tuple[Any, ...]:

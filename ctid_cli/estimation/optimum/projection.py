@@ -4,8 +4,8 @@ r"""Variable projection: the squared output error over the denominator and the d
 
 or a sum of such responses, of several inputs. For given poles and delays B, C, c and d follow by linear least squares.
 With Phi their columns and P the projection on them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``;
-since ``r`` is orthogonal to Phi its gradient is exact. Known coefficients of B leave Phi, and their part of the response
-leaves y. The derivatives of ``B/A u`` at a fixed B are the same, so that nothing else changes.
+since ``r`` is orthogonal to Phi its gradient is exact. Known coefficients of B leave Phi, and their part of the
+response leaves y. The derivatives of ``B/A u`` at a fixed B are the same, so that nothing else changes.
 
 References
 ----------

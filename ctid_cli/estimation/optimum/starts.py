@@ -74,6 +74,7 @@ class StructureSearch:
         effort: Effort = THOROUGH,
         known: KnownCoefficients = NOTHING,
         pilot: "StructureSearch | None" = None,
+        first_delays: tuple[float, ...] | None = None,
     ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
         self.effort = effort
@@ -81,6 +82,7 @@ class StructureSearch:
         self.known = known
         #: The search of a part of the records, from whose minima this one starts.
         self.pilot = pilot
+        self._given_delays = first_delays
         self._descents: dict[int, Descent] = {}
         self._minima: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
@@ -164,7 +166,7 @@ class StructureSearch:
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """Return the best single poles, or single pairs."""
-        delay = self.best(1, 0).seconds if poles > 1 else self._first_delays
+        delay = self.best(1, 0).seconds if poles > 1 else self.first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
     def _beside(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
@@ -190,11 +192,11 @@ class StructureSearch:
         return points
 
     @cached_property
-    def _first_delays(self) -> tuple[float, ...]:
+    def first_delays(self) -> tuple[float, ...]:
         """Delays to start from: the middle of the range; of several inputs those of a pole of its own for each."""
         problem, count = self.problem, len(self.problem.channels)
-        if count < 2:
-            return self.box.middle
+        if self._given_delays is not None or count < 2:
+            return self._given_delays or self.box.middle
         channels = tuple(Channel(channel.input, k) for k, channel in enumerate(problem.channels))
         ones, integrators = (1,) * count, (problem.integrators,) * count
         apart = problem._replace(zeros=0, channels=channels, orders=ones, block_integrators=integrators)
@@ -203,7 +205,7 @@ class StructureSearch:
     def from_below(self, poles: int, zeros: int) -> list[Point]:
         """Return starts from smaller models, and along the delay."""
         if poles == 0:
-            middle = point_of(np.zeros(0, dtype=complex), self._first_delays, self.box)
+            middle = point_of(np.zeros(0, dtype=complex), self.first_delays, self.box)
             return self.along_delay(zeros, [middle])
         contained = self._alone(zeros, poles) if poles <= 2 else []
         others: list[Point] = []
@@ -232,7 +234,7 @@ class StructureSearch:
         count = min(int(highest / resolution), RESOLVED // samples)
         if poles < 2 or count < self.effort.pairs:
             return []
-        roots, delay = np.zeros(0, dtype=complex), self._first_delays
+        roots, delay = np.zeros(0, dtype=complex), self.first_delays
         if poles > 2:
             smaller = self.best(poles - 2, min(zeros, poles - 3))
             roots, delay = smaller.poles, smaller.seconds
