@@ -427,9 +427,9 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             self._alone(one)
         if not self.inputs:
             self._check_zeros(self.zeros, self.order, low == high)
-        # Names are made of degrees that make sense only.
-        degrees = self._degrees(tuple(names) or ("",), free=False)
-        _check_stable(places_of(self.fixed, degrees.names), degrees)
+        # Names are made of degrees that make sense only; of several inputs once these are known.
+        if self.fixed and not self.inputs and not any("_" in one.name for one in self.fixed):
+            self._known(("",))
 
     def _alone(self, one: InputModel) -> "DelayProfile":
         """Return the estimator of one of several inputs by itself."""
@@ -458,6 +458,13 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
             )
         return [self._alone(own[name]) if name in own else replace(self, inputs=None, fixed=None) for name in names]
 
+    def _known(self, names: tuple[str, ...]) -> dict[int, float]:
+        """Return the values of the fixed parameters by their places, for inputs of some names."""
+        degrees = self._degrees(names, free=False)
+        known = places_of(self.fixed, degrees.names)
+        _check_stable(known, degrees)
+        return known
+
     @property
     def common(self) -> bool:
         """Whether several inputs share a denominator."""
@@ -465,9 +472,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _degrees(self, names: tuple[str, ...], *, free: bool = True) -> Degrees:
         """Return the degrees for inputs of some names; if not free, without integrators and delays."""
-        each = (
-            self._each(names) if self.inputs else [replace(self, fixed=None)] * len(names) if len(names) > 1 else [self]
-        )
+        each = self._each(names)
         blocks = each[:1] if self.common else each
         return Degrees(
             tuple(one.order if free else one.poles for one in blocks),
@@ -487,8 +492,7 @@ class DelayProfile(Estimator[MeasuredRecords, MeasuredFit]):
         if self.noise_model != "white":
             _check_clocks(several)
         names = tuple(several[0].held) if several and several[0].several else ("",)
-        coefficients = self._degrees(names, free=False)
-        known = places_of(self.fixed, coefficients.names)
+        coefficients, known = self._degrees(names, free=False), self._known(names)
         degrees, bounds = self._degrees(names), tuple(one.delay_bounds for one in self._each(names))
         orders = coefficients.orders if not coefficients.common else ()
         return MeasuredRecords(

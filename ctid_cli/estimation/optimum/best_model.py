@@ -198,6 +198,8 @@ def _of_blocks(free: StructureSearch, points: list[Point], nested: bool, known: 
     poles, zeros = sum(problem.orders), problem.zeros
     if nested or not points:
         points = points + block_starts(problem, box, free.random_starts, free.seed)
+    if known.all_poles:
+        points = [point_of(known.poles, point.seconds, box) for point in points]
     search.refine(poles, zeros, _met(points, box, known))
     if nested:
         around = search.along_delay(zeros, [search.best(poles, zeros)])[1:]
