@@ -120,7 +120,7 @@ class Box:
     #: Numbers of poles of several denominators; empty of one.
     orders: tuple[int, ...] = ()
 
-    @property
+    @cached_property
     def each_delay(self) -> tuple[tuple[float, float], ...]:
         """Bounds of the delay of each input."""
         return each_bounds(self.delays)

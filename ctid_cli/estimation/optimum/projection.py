@@ -14,7 +14,7 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -344,10 +344,9 @@ def slopes(
     """
     moving = (0,) * free_delays if isinstance(free_delays, bool) else free_delays
     span, outputs, directs, channels = projected.span, projected.outputs, projected.directs, problem.channels
-    triangles = span.triangles
-    orders = [order_of(damping) for _, damping in split_sections(speed, damping, problem.orders)]
-    ends = np.cumsum([0, *np.add(orders, problem.each_integrators)])
-    of_block = [slice(*pair) for pair in pairwise(ends.tolist())]
+    triangles, orders = span.triangles, problem.orders or (order_of(damping),)
+    ends = list(accumulate((n + count for n, count in zip(orders, problem.each_integrators, strict=True)), initial=0))
+    of_block = [slice(*pair) for pair in pairwise(ends)]
     if not triangles.columns.second or each_delay(triangles.delays) != each_delay(delays):
         driven = [
             [
@@ -358,18 +357,18 @@ def slopes(
         ]
         span = Span(problem, _triangles(problem, driven, delays, True), weights_of(problem, speed, damping))
     forms, columns, _, rows = span.triangles
-    first = np.cumsum([0, *orders])
-    psi = np.zeros((*rows.shape[:2], int(first[-1]) + len(moving)))
+    first = list(accumulate(orders, initial=0))
+    psi = np.zeros((*rows.shape[:2], first[-1] + len(moving)))
     for k, (form, output, direct, channel) in enumerate(zip(forms, outputs, directs, channels, strict=True)):
-        begin, n = int(first[channel.block]), orders[channel.block]
+        begin, n = first[channel.block], orders[channel.block]
         psi[:, :, begin : begin + n] += rows[:, :, columns.states(k)] @ form.slopes(output, direct)[:, :n]
         if channel.input in moving:
             # dx/dtau = -x'(t - tau).
             of_z, of_u = form.rate(output)
-            place = int(first[-1]) + moving.index(channel.input)
+            place = first[-1] + moving.index(channel.input)
             psi[:, :, place] -= rows[:, :, columns.z(k)] @ of_z + of_u * rows[:, :, columns.u(k)]
     for block in range(len(columns.free)):
-        begin, n, form = int(first[block]), orders[block], forms[[channel.block for channel in channels].index(block)]
+        begin, n, form = first[block], orders[block], forms[[channel.block for channel in channels].index(block)]
         each = [form.slopes(free[of_block[block]], 0.0)[:, :n] for free in projected.free]
         psi[:, :, begin : begin + n] += rows[:, :, columns.free_states(block)] @ np.stack(each)
     psi = psi.reshape(span.residual.size, -1)

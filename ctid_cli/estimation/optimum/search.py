@@ -21,6 +21,7 @@ from ctid_cli.estimation.optimum.box import (
     point_of,
     widened,
 )
+from ctid_cli.estimation.optimum.chain import order_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
 from ctid_cli.estimation.optimum.triangle import Delay
@@ -156,7 +157,7 @@ class Descent:
         )
         found = slopes(self.problem, point.speed, point.damping, delays, projected, free)
         inner = self.box.quarter * np.eye(found.gradient.size)
-        n = point.poles.size
+        n = order_of(point.damping)
         inner[:n, :n] = point.jacobian()
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
 
@@ -172,7 +173,7 @@ class Descent:
 
     def _delay_places(self, point: Point) -> dict[int, int]:
         """Places of the free delays among the coordinates, by their inputs."""
-        return {k: place for place, k in enumerate(self.box.free_delays, start=point.poles.size)}
+        return {k: place for place, k in enumerate(self.box.free_delays, start=order_of(point.damping))}
 
     def _freedom(self, here: Local, lengths: Array, kinked: Mapping[int, int] = NO_DELAYS) -> Freedom:
         """Return where a search can go, coordinates measured in given lengths; not along delays in a kink."""
@@ -276,7 +277,7 @@ class Descent:
         forces = self._forces(here)
         steps = np.full(size, DIFFERENCE)
         if self.box.cell > 0:
-            steps[here.point.poles.size :] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
+            steps[order_of(here.point.damping) :] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
         rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
         for side in (1.0, -1.0):
             for i in range(size):
@@ -487,14 +488,18 @@ def _same(one: Point, other: Point) -> bool:
 def _alike(here: Local, other: Local, box: Box) -> bool:
     """Whether two places are so close that one minimum must be meant."""
     near = here.squared_error < (1 + CLOSE) * other.squared_error
-    cells = [[delay.cell for delay in one.point.delays] for one in (here, other)]
-    if not near or cells[0] != cells[1] or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
+    pairs = list(zip(here.point.delays, other.point.delays, strict=True))
+    if (
+        not near
+        or any(one.cell != two.cell for one, two in pairs)
+        or not np.array_equal(here.point.damping < 0, other.point.damping < 0)
+    ):
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
-    later = np.subtract(here.point.seconds, other.point.seconds) / box.quarter
+    later = max(abs(one.seconds - two.seconds) for one, two in pairs) / box.quarter
     # On an irregular clock minima lie closer along the delay.
     nearest = CLOSE if box.cell > 0 else CLOSE_BETWEEN_KINKS
-    return bool(np.abs(away).max(initial=0.0) < CLOSE and np.abs(later).max() < nearest)
+    return bool(np.abs(away).max(initial=0.0) < CLOSE and later < nearest)
 
 
 def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
@@ -532,7 +537,7 @@ def _unbounded(point: Point, step: Array, box: Box) -> Point | None:
     """The point a small step away, in the same coordinates, admissible or not; none across a sample."""
     speed, damping = point.shifted(step)
     delays = list(point.delays)
-    for place, k in enumerate(box.free_delays, start=point.poles.size):
+    for place, k in enumerate(box.free_delays, start=order_of(point.damping)):
         if step[place]:
             tau, cell = delays[k].seconds + step[place] * box.quarter, delays[k].cell
             if tau < 0 or (cell >= 0 and not cell * box.cell <= tau <= (cell + 1) * box.cell):
