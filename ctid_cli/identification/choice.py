@@ -81,7 +81,10 @@ class Given:
         """Structures that are admitted; where inputs have degrees of their own, small ones to compare treatments."""
         if self.typed:
             own = [one.integrators for one in self.inputs or () if one.integrators is not None]
-            return Span((1, 3), (0, 2), (max(own, default=self.integrators or 0),))
+            treated = None not in (self.initial_state, self.offset, self.delays_given) and self.hold != "auto"
+            # Where nothing of the treatment is open the smallest will do.
+            poles, zeros = ((1, 1), (0, 0)) if treated else ((1, 3), (0, 2))
+            return Span(poles, zeros, (max(own, default=self.integrators or 0),))
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )
