@@ -19,7 +19,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.layout import Degrees, Layout
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.optimum.best_model import (
     Optimum,
     Start,

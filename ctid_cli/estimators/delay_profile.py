@@ -10,7 +10,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError, UsageError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
-from ctid_cli.estimation.layout import Degrees, Layout
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Optimum

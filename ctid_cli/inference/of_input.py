@@ -34,7 +34,24 @@ class InputFit(FittedModel):
 
     @classmethod
     def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
-        """Return the transfer function of an input; a common denominator has names without one."""
+        """Return the transfer function of an input; a common denominator has names without one.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+        model : TransferFunction
+            Its transfer function.
+        names : tuple of str
+            Names of all parameters of the fit.
+        law : Uncertainty
+            Covariance of all parameters.
+
+        Returns
+        -------
+        InputFit
+            The transfer function with its law.
+        """
         own = [(each.removeprefix(f"{name}_"), each) for each in names]
         return cls(model, tuple(bare if _OWN.fullmatch(bare) else f"other {each}" for bare, each in own), law)
 

@@ -225,11 +225,33 @@ class Record:
         return [self.of_input(name) for name in self.held]
 
     def driven_by(self, **inputs: HeldSignal) -> Record:
-        """Return the record with some of its inputs changed."""
+        """Return the record with some of its inputs changed.
+
+        Parameters
+        ----------
+        **inputs : HeldSignal
+            New inputs by name.
+
+        Returns
+        -------
+        Record
+            The changed record.
+        """
         return replace(self, inputs={**self.held, **inputs})
 
     def of_input(self, name: str) -> Record:
-        """Return the record with one of its inputs alone."""
+        """Return the record with one of its inputs alone.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        Record
+            The record, its output unchanged.
+        """
         return replace(self, inputs={name: self.held[name]}) if self.several else self
 
     @property

@@ -172,10 +172,12 @@ class StructureSearch:
     def _beside(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
         """Starts in the cells of each delay beside that of a minimum, where they are not yet among these cells.
 
-        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next.
+        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next. With
+        several inputs that was seen beside slow poles too.
         """
         width, points = self.box.cell, list[Point]()
-        if not width or not point.speed.size or float(point.speed.max()) * width < FAST:
+        slow = len(self.box.each_delay) < 2 and float(point.speed.max(initial=0.0)) * width < FAST
+        if not width or not point.speed.size or slow:
             return []
         for k in self.box.free_delays:
             (low, high), own = self.box.each_delay[k], point.delays[k].cell
