@@ -19,13 +19,20 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import check_greatest_delay, check_record
-from ctid_cli.estimation.optimum.best_model import Optimum, best_output_error, most_active_parts
-from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
+from ctid_cli.estimation.optimum.best_model import (
+    Optimum,
+    Start,
+    best_output_error,
+    most_active_parts,
+    poles_of_start,
+)
+from ctid_cli.estimation.optimum.box import Bounds, anywhere, each_bounds, point_of
 from ctid_cli.estimation.optimum.chain import Chain, chain_dynamics, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, rows_of
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.innovations import sampled
@@ -33,114 +40,77 @@ from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.signal_features import outliers
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.several_inputs import AnyModel, delays_of, fractions_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
-#: Parameters of the powers of time that the output has beside the response.
-TREND_NAMES = ("offset", "drift", "drift2", "drift3")
 #: Random starts, this number and as many again for each pole.
 RANDOM_STARTS = 2
+#: Inputs are collinear if a combination of them, each of length one, is shorter than this; those with more than so
+#: large a share in it are named.
+COLLINEAR, INVOLVED = 1e-6, 1e-3
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Which numbers stand where in the parameter vector: coefficients, delay, then each experiment's own."""
-
-    structure: Structure
-    experiments: int = 1
-    initial_state: bool = False
-    #: Powers of time.
-    trend: tuple[int, ...] = ()
-    #: Poles at the origin: that many of the last coefficients of the denominator are zero.
-    integrators: int = 0
-
-    @property
-    def own(self) -> int:
-        """Number of parameters that belong to one experiment."""
-        return self.structure.poles * self.initial_state + len(self.trend)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.structure.size + self.experiments * self.own
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names; those of an experiment end in its number where there are several."""
-        names = list(self.structure.names)
-        for k in range(self.experiments):
-            tail = f"_{k + 1}" if self.experiments > 1 else ""
-            names += [f"x{i}{tail}" for i in range(1, self.structure.poles + 1)] * self.initial_state
-            names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
-        return tuple(names)
-
-    def theta(self, model: TransferFunction) -> Array:
-        """The parameters of a model of this structure, and zeros for what belongs to the experiments."""
-        theta, n = np.zeros(self.size), self.structure.poles
-        theta[:n] = model.denominator[1:]
-        last = n + self.structure.zeros + 1
-        theta[last - model.numerator.size : last] = model.numerator
-        if self.structure.delay:
-            theta[last] = model.delay
-        return theta
-
-    def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
-        """Initial state and offset of one experiment."""
-        first = self.first(experiment)
-        own = theta[first : first + self.own]
-        states = self.structure.poles * self.initial_state
-        return own[:states], float(own[states]) if self.trend[:1] == (0,) else 0.0
-
-    def first(self, experiment: int) -> int:
-        """Where the parameters of an experiment begin."""
-        return self.structure.size + experiment * self.own
-
-
-def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) -> list[tuple[Array, Array]]:
+def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]) -> list[tuple[Array, Array]]:
     """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
 
-    The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
+    The delays are those of theta where they are parameters. The last coefficients of a denominator are zero where the
     problem has integrators.
     """
-    structure, n, m = layout.structure, layout.structure.poles, layout.structure.zeros
-    a, b = np.concatenate(([1.0], theta[:n])), theta[n : n + m + 1]
-    stable = np.roots(a[: n + 1 - problem.integrators]).astype(complex)
-    point = point_of(stable, theta[n + m + 1] if structure.delay else delay, ANYWHERE)
-    sections = problem.sections(point.speed, point.damping)
-    F, g = chain_dynamics(*sections)
+    degrees, channels = layout.degrees, problem.channels
+    denominators = [np.concatenate(([1.0], theta[place])) for place in degrees.a]
+    each = zip(denominators, problem.each_integrators, strict=True)
+    stable = [np.roots(a[: a.size - count]).astype(complex) for a, count in each]
+    places = [degrees.delay(k) for k in range(len(delays))]
+    seconds = [given if place is None else theta[place] for given, place in zip(delays, places, strict=True)]
+    orders = tuple(poles.size for poles in stable)
+    point = point_of(np.concatenate(stable), seconds, anywhere(len(seconds), orders))
+    problem = problem._replace(orders=orders if len(orders) > 1 else ())
+    blocks = problem.blocks(point.speed, point.damping)
+    dynamics = [chain_dynamics(*sections) for sections in blocks]
     # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-    powers = np.linalg.inv(numerators(*sections))
-    direct = b[0] if m == n else 0.0
-    output = ((b - direct * a)[1:] if m == n else np.concatenate((np.zeros(n - 1 - m), b))) @ powers
-    columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.trend)
+    powers = [np.linalg.inv(numerators(*sections)) for sections in blocks]
+    numerator = [theta[place] for place in degrees.b]
+    outputs, directs = [], []
+    for b, channel in zip(numerator, channels, strict=True):
+        a = denominators[channel.block]
+        direct = b[0] if b.size == a.size else 0.0
+        proper = (b - direct * a)[1:] if b.size == a.size else np.concatenate((np.zeros(a.size - 1 - b.size), b))
+        outputs.append(proper @ powers[channel.block])
+        directs.append(direct)
+    columns = Columns.of(degrees.orders, True, layout.initial_state, layout.trend, channels)
     result = []
-    for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
-        first = layout.first(k)
+    for record, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
+        first = layout.first(record)
         own = theta[first : first + layout.own]
-        state = own[:n] if layout.initial_state else np.zeros(n)
-        form = Chain(*sections, F, g, F, g).driving(output, direct, state @ powers)
-        # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there.
-        wanted = np.zeros((columns.size, layout.size + 1))
-        states, driven, now, measured = wanted[:n], wanted[n : 2 * n], wanted[columns.u], wanted[columns.u + 1]
-        driven[:, :n] = -powers.T
-        filtered = powers.T
-        coefficients = np.column_stack((-filtered @ a[1:], filtered))[:, n - m :]
-        states[:, n : n + m + 1] = coefficients
-        if m == n:
-            now[n] = 1.0
-        if structure.delay:
-            states[:, n + m + 1], now[n + m + 1] = -(output @ F), -(output @ g)
-        if layout.initial_state:
-            alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
-            driven_alone[:, :n] = -powers.T
-            alone[:, first : first + n] = powers.T
+        states_of = [slice(place.start + first, place.stop + first) for place in degrees.a]
+        # Columns of the rows that are wanted, each a combination of the states, the inputs and what else stands there.
+        wanted, forms = np.zeros((columns.size, layout.size + 1)), []
+        for k, (channel, output, direct) in enumerate(zip(channels, outputs, directs, strict=True)):
+            n, m, block = columns.orders[k], degrees.zeros[k], channel.block
+            F, g = dynamics[block]
+            state = theta[states_of[block]] if layout.initial_state else np.zeros(n)
+            forms.append(Chain.of(*blocks[block]).driving(output, direct, state @ powers[block]))
+            filtered = powers[block].T
+            states, now = wanted[columns.z(k)], wanted[columns.u(k)]
+            wanted[columns.states(k)][n:, degrees.a[block]] = -filtered
+            states[:, degrees.b[k]] = np.column_stack((-filtered @ denominators[block][1:], filtered))[:, n - m :]
+            if m == n:
+                now[degrees.b[k].start] = 1.0
+            if (place := places[channel.input]) is not None:
+                states[:, place], now[place] = -(output @ F), -(output @ g)
+            states[:, -1], now[-1] = -output, -direct
+        for block in range(len(columns.free)):
+            n, filtered = degrees.orders[block], powers[block].T
+            wanted[columns.free_states(block)][n:, degrees.a[block]] = -filtered
+            wanted[columns.free_z(block), states_of[block]] = filtered
         wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
-        states[:, -1], now[-1], measured[-1] = -output, -direct, 1.0
+        wanted[columns.y, -1] = 1.0
         wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        rows = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
+        parts = rows_of(forms, columns, point.delays, data, period, channels=channels)
+        rows = np.vstack([part.T @ wanted for part in parts])
         result.append((rows[:, :-1], rows[:, -1].copy()))
     return result
 
@@ -148,14 +118,14 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) 
 class Treatment(NamedTuple):
     """How records are laid out."""
 
-    delay_bounds: tuple[float, float]
+    delay_bounds: Bounds
     initial_state: InitialState
     offset: Offset
     hold_output: OutputHold
     #: Whether samples far from their neighbours are bridged while the search looks for starts.
     bridge: bool = False
-    #: Poles at the origin, counted among those of the structure.
-    integrators: int = 0
+    #: Poles at the origin, counted among those of the structure; of each denominator.
+    integrators: tuple[int, ...] = (0,)
     #: Input before the first sample of a record that begins at rest [input unit].
     input_before: InputBefore = None
 
@@ -181,19 +151,19 @@ class MeasuredRecords:
     def __init__(
         self,
         records: Sequence[Record],
-        structure: Structure,
+        structure: Structure | Degrees,
         treatment: Treatment,
         known: KnownCoefficients = NOTHING,
     ) -> None:
         if not records:
             raise DataError("there is no record to estimate from")
-        self.structure = structure
         self.treatment, self.known = treatment, known
-        free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
+        free_state, integrators = treatment.initial_state == "estimate", max(treatment.integrators)
+        degrees = Degrees.of(structure, integrators) if isinstance(structure, Structure) else structure
         # Integrators make powers of time of an offset of their input; the lower ones are their free responses.
         highest = {"estimate": integrators, "drift": 1}.get(treatment.offset, -1)
         trend = tuple(range(integrators if free_state else 0, highest + 1))
-        self.layout = Layout(structure, len(records), free_state, trend, integrators)
+        self.layout = Layout(degrees, len(records), free_state, trend)
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
@@ -201,8 +171,10 @@ class MeasuredRecords:
         level = treatment.input_before
         centred = [without_means(record) if removed else above_level(record, level) for record in bridged]
         self.records = [one for one, _, _ in centred]
-        self.input_offsets = [u0 for _, u0, _ in centred]
+        self.input_offsets = [u0 for _, levels, _ in centred for u0 in levels]
         self.offsets = [y0 for _, _, y0 in centred]
+        for record in self.records if degrees.several else ():
+            refuse_collinear(record)
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
             may_be_constant = self.layout.initial_state or treatment.input_before is not None
@@ -216,42 +188,69 @@ class MeasuredRecords:
         """Highest frequency that matters in an output [rad/s]."""
         return max(output_bandwidth(record) for record in self.records)
 
-    def with_structure(self, structure: Structure) -> "MeasuredRecords":
-        """The same records for another model."""
+    @property
+    def degrees(self) -> Degrees:
+        """Degrees of the model."""
+        return self.layout.degrees
+
+    @property
+    def structure(self) -> Structure:
+        """Degrees of the transfer function of the first input."""
+        return self.degrees.structure
+
+    def with_degrees(self, poles: int, zeros: Sequence[int]) -> "MeasuredRecords":
+        """The same records for a common denominator, integrators among its poles, and numerators of other degrees."""
         other = copy(self)
-        other.structure = structure
-        other.layout = replace(self.layout, structure=structure)
-        other.problem = self.problem._replace(zeros=structure.zeros)
+        degrees = replace(self.degrees, orders=(poles,), zeros=tuple(zeros))
+        other.layout = replace(self.layout, degrees=degrees)
+        other.problem = self.problem._replace(zeros=max(zeros), channels=degrees.channels)
         return other
 
     @property
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
         treatment = self.treatment
-        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not treatment.integrators
-        return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
+        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not any(treatment.integrators)
+        single = len(self.data) == 1 and not self.degrees.several
+        return from_rest and single and self.structure.zeros < self.structure.poles
 
     def _check_input(self, record: Record) -> None:
         """Refuse what an input cannot tell."""
-        low, high = self.treatment.delay_bounds
-        if high > 0:
-            check_greatest_delay(record, high)
-        first, before = float(record.input.values[0]), self.treatment.input_before
-        if np.ptp(record.input.values) > 0.0 or before not in (None, "first", first):
-            return
-        if low < high or self.treatment.initial_state != "estimate":
+        if tuple(record.held) != self.degrees.inputs and self.degrees.several:
             raise DataError(
-                f"{named(record)}the input is constant ({first:g}) over the whole record; if the record begins with "
-                "its step, give the level of the input before it: input_before (--input-before VALUE)"
+                f"{named(record)}the inputs are {', '.join(record.held)}, and those of the model are "
+                f"{', '.join(self.degrees.inputs)}"
             )
+        if record.several and (record.loop is not None or record.feedback):
+            raise DataError(f"{named(record)}a record in a loop is fitted with one input; give one")
+        before = self.treatment.input_before
+        for (name, signal), (low, high) in zip(
+            record.held.items(), each_bounds(self.treatment.delay_bounds), strict=True
+        ):
+            if high > 0:
+                check_greatest_delay(record, high)
+            first = float(signal.values[0])
+            if np.ptp(signal.values) > 0.0 or before not in (None, "first", first):
+                continue
+            if low < high or self.treatment.initial_state != "estimate":
+                raise DataError(
+                    f"{named(record)}the input {f'{name} ' * record.several}is constant ({first:g}) over the whole "
+                    "record; if the record begins with its step, give the level of the input before it: input_before "
+                    "(--input-before VALUE)"
+                )
 
     def _lay_out(self, record: Record) -> FilterData:
         # At rest the input before the record is known to be zero, whatever the delay, and that of a periodic record is
         # known too; otherwise it is not known.
         treatment = self.treatment
-        known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
+        known_after = self.greatest_delay if treatment.initial_state == "estimate" else 0.0
         periodic = treatment.initial_state == "periodic"
         return filter_data(record, known_after, treatment.hold_output, periodic=periodic)
+
+    @property
+    def greatest_delay(self) -> float:
+        """The greatest delay of all inputs [s]."""
+        return max(high for _, high in each_bounds(self.treatment.delay_bounds))
 
     @cached_property
     def problem(self) -> Problem:
@@ -261,20 +260,28 @@ class MeasuredRecords:
             data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
-        layout, integrators = self.layout, self.treatment.integrators
-        return Problem(data, self.structure.zeros, layout.initial_state, layout.trend, periods, integrators=integrators)
+        layout, degrees, integrators = self.layout, self.degrees, self.treatment.integrators
+        found = Problem(
+            *(data, max(degrees.zeros), layout.initial_state, layout.trend, periods),
+            integrators=integrators[0],
+            channels=degrees.channels,
+        )
+        if degrees.common:
+            return found
+        orders = tuple(n - count for n, count in zip(degrees.orders, integrators, strict=True))
+        return found._replace(orders=orders, block_integrators=integrators)
 
     def part(self) -> "MeasuredRecords | None":
         """The most active parts of long records, each from a state of its own; None where they tell too little."""
         treatment = self.treatment
-        parts = most_active_parts(self.data, treatment.delay_bounds[1])
+        parts = most_active_parts(self.data, self.greatest_delay)
         if parts is None or treatment.initial_state == "periodic":
             return None
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
         cut = [_cut(record, part) for record, part in zip(self.records, parts, strict=True)]
         with suppress(DataError):
             own = treatment._replace(initial_state="estimate", offset=offset, bridge=False, input_before=None)
-            return MeasuredRecords(cut, self.structure, own)
+            return MeasuredRecords(cut, self.degrees, own)
         return None
 
     @cached_property
@@ -328,14 +335,14 @@ class MeasuredRecords:
         each = zip(self.outputs, errors, weighting.pseudo_errors, strict=True)
         return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
-    def best(self, starts: Sequence[tuple[Array, float]], nested: bool) -> Optimum:
+    def best(self, starts: Sequence[Start], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
         A profile under an unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
         return best_output_error(
             self.problem,
-            self.structure.poles - self.problem.integrators,
+            self.degrees.poles - sum(self.problem.each_integrators),
             self.treatment.delay_bounds,
             starts,
             nested=nested or not self.plain or self.known is not NOTHING,
@@ -344,15 +351,19 @@ class MeasuredRecords:
             known=self.known,
         )
 
-    def local(self, *starts: tuple[Array, float]) -> Optimum:
+    def local(self, *starts: Start) -> Optimum:
         """Return the least output error in the basins of denominators, without their integrators, and delays."""
-        poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
+        poles, delays = poles_of_start(starts[0]).size, self.treatment.delay_bounds
         return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
+
+    def model(self, found: Optimum) -> AnyModel:
+        """The model of an optimum."""
+        return self.degrees.model(found.fractions)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
         """Which numbers an optimum has, and what they are."""
-        layout = self.layout_of(found.model.order, self.structure.delay)
-        theta = layout.theta(found.model)
+        layout = self.layout_of(self.model(found))
+        theta = layout.theta(self.model(found))
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
             theta[first : first + layout.own] = [*state, *found.trends[k]]
@@ -360,20 +371,25 @@ class MeasuredRecords:
 
     def simulated(self, found: Optimum) -> list[Array]:
         """Outputs of an optimum at the used samples of each record."""
-        parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
+        parts = sensitivities(self.problem, *self.parameters(found), found.delays)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
-    def squared_error_at(self, model: TransferFunction, delay: float) -> float:
-        """Least sum of squared output errors at a given delay, in the basin of a model."""
-        return local_minimum(
-            self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
-        ).squared_error
+    def squared_error_at(self, model: AnyModel, delay: float, k: int = 0) -> float:
+        """Least sum of squared output errors at a given delay of an input, in the basin of a model."""
+        delays = delays_of(model)
+        delays[k] = delay
+        bounds = tuple(
+            (delay, delay) if i == k else pair for i, pair in enumerate(each_bounds(self.treatment.delay_bounds))
+        )
+        poles = self.free_poles(model)
+        return local_minimum(self.problem, poles, delays, bounds, known=self.known).squared_error
 
-    def errors_of(self, model: TransferFunction) -> AppliedModel:
+    def errors_of(self, model: AnyModel) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
-        layout = self.layout_of(model.order, delay=True)
+        free = [True] * len(fractions_of(model))
+        layout = replace(self.layout, degrees=self.degrees.with_orders(model, free))
         theta, residuals = layout.theta(model), []
-        found = sensitivities(self.problem, layout, theta, model.delay)
+        found = sensitivities(self.problem, layout, theta, delays_of(model))
         for k, (psi, eps) in enumerate(found):
             own = slice(layout.first(k), layout.first(k) + layout.own)
             noises = self.problem.noises
@@ -384,24 +400,29 @@ class MeasuredRecords:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
-    def free_poles(self, model: TransferFunction) -> ComplexArray:
+    def free_poles(self, model: AnyModel) -> ComplexArray:
         """The poles of a model but its integrators."""
-        return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
+        each = zip(fractions_of(model), self.problem.each_integrators, strict=False)
+        return np.concatenate(
+            [np.roots(one.denominator[: one.denominator.size - count]) for one, count in each]
+        ).astype(complex)
 
     @property
     def given(self) -> BoolArray:
-        """Which of the coefficients of the structure are known, those that integrators make zero among them."""
-        zeros = self.structure.zeros + 1
-        if self.known is NOTHING:
-            free = self.structure.poles - self.problem.integrators
-            of_a, of_b = np.zeros(free, dtype=bool), np.zeros(zeros, dtype=bool)
-        else:
-            of_a, of_b = np.isfinite(self.known.denominator), np.isfinite(self.known.numerator)
-        return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
+        """Which of the coefficients are known, those that integrators make zero among them."""
+        of_a = np.isfinite(self.known.denominator) if self.known is not NOTHING else np.zeros(0, dtype=bool)
+        found, first = [], 0
+        for n, count in zip(self.degrees.orders, self.problem.each_integrators, strict=True):
+            own = of_a[first : first + n - count] if of_a.size else np.zeros(n - count, dtype=bool)
+            found += [own, np.ones(count, dtype=bool)]
+            first += n - count
+        zeros = sum(self.problem.sizes)
+        found.append(np.isfinite(self.known.numerator) if self.known is not NOTHING else np.zeros(zeros, dtype=bool))
+        return np.concatenate(found)
 
-    def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Layout of the parameters for a number of poles, integrators among them."""
-        return replace(self.layout, structure=Structure(poles, self.structure.zeros, delay))
+    def layout_of(self, model: AnyModel) -> Layout:
+        """Layout of the parameters of a model, some of whose poles may be missing."""
+        return replace(self.layout, degrees=self.degrees.with_orders(model, self.degrees.delays))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
         """Initial states and offsets of the experiments, means that were subtracted included."""
@@ -422,27 +443,50 @@ def _bridged(record: Record) -> Record:
 
 def _cut(record: Record, part: slice) -> Record:
     """Some samples of a record whose input is known at them."""
-    t, signal = record.t[part], record.input
-    return Record(t, record.y[part], HeldSignal(t, signal.values[part], signal.hold), name=record.name)
+    t = record.t[part]
+    inputs = {name: HeldSignal(t, signal.values[part], signal.hold) for name, signal in record.held.items()}
+    return Record(t, record.y[part], inputs, name=record.name)
 
 
-def above_level(record: Record, before: InputBefore) -> tuple[Record, float, float]:
-    """Record whose input counts from the level before its first sample, that level, and zero for its output."""
-    signal = record.input
-    level = float(signal.values[0]) if before == "first" else float(before or 0.0)
-    if not level:
-        return record, 0.0, 0.0
-    return replace(record, input=HeldSignal(signal.t, signal.values - level, signal.hold)), level, 0.0
+def above_level(record: Record, before: InputBefore) -> tuple[Record, list[float], float]:
+    """Record whose inputs count from the levels before its first sample, these levels, and zero for its output."""
+    firsts = [float(signal.values[0]) for signal in record.held.values()]
+    levels = firsts if before == "first" else [float(before or 0.0)] * len(firsts)
+    return _lowered(record, levels), levels, 0.0
 
 
-def without_means(record: Record) -> tuple[Record, float, float]:
-    """Record less the mean of its output samples and the time average of its input."""
+def without_means(record: Record) -> tuple[Record, list[float], float]:
+    """Record less the mean of its output samples and the time averages of its inputs."""
     y0 = float(np.nanmean(record.y))
-    signal = record.input
-    u0 = float(np.mean(signal.at(record.t)))
-    centred = HeldSignal(signal.t, signal.values - u0, signal.hold)
+    means = [float(np.mean(signal.at(record.t))) for signal in record.held.values()]
     loop = record.loop and replace(record.loop, reference=record.loop.reference - record.loop.reference.mean())
-    return Record(record.t, record.y - y0, centred, name=record.name, loop=loop), u0, y0
+    return Record(record.t, record.y - y0, _lowered(record, means).inputs, name=record.name, loop=loop), means, y0
+
+
+def _lowered(record: Record, levels: Sequence[float]) -> Record:
+    """Record whose inputs are less by some levels."""
+    if not any(levels):
+        return record
+    pairs = zip(record.held.items(), levels, strict=True)
+    return replace(
+        record, inputs={name: HeldSignal(one.t, one.values - level, one.hold) for (name, one), level in pairs}
+    )
+
+
+def refuse_collinear(record: Record) -> None:
+    """Refuse inputs of which one is a combination of the others: nothing tells their responses apart."""
+    u = np.column_stack([signal.at(record.t) for signal in record.held.values()])
+    u = u - u.mean(axis=0)
+    lengths = np.linalg.norm(u, axis=0)
+    if not lengths.all():
+        return
+    _, values, right = np.linalg.svd(u / lengths, full_matrices=False)
+    if values[-1] < COLLINEAR * values[0]:
+        alike = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
+        raise DataError(
+            f"{named(record)}the inputs {' and '.join(alike)} are collinear: one is a linear function of the others, "
+            "and their responses cannot be told apart; drop one, or record them moving independently"
+        )
 
 
 def _period(record: Record) -> float:
@@ -452,7 +496,10 @@ def _period(record: Record) -> float:
 
 def _one_period(data: FilterData, period: float) -> FilterData:
     """Return the record with the breaks of its input within one period."""
-    within = data.tu < data.tu[0] + period * (1 - 1e-9)
+    within, data = (
+        data.tu < data.tu[0] + period * (1 - 1e-9),
+        data._replace(further=tuple(_one_period(one, period) for one in data.further)),
+    )
     if within.all():
         return data
     # A regular pass takes a break for each sample.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import LONG, Optimum
+from ctid_cli.estimation.optimum.best_model import LONG, Optimum, Start, poles_of_start
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
 
 #: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
@@ -28,7 +28,7 @@ def joint_optimum(
     measured: MeasuredRecords,
     found: Optimum,
     orders: Orders | None,
-    starts: Sequence[tuple[Array, float]],
+    starts: Sequence[Start],
     *,
     nested: bool,
 ) -> JointOptimum:
@@ -40,13 +40,13 @@ def joint_optimum(
     joint = _near(measured, found, orders)
     if not sum(joint.noise.orders):
         return joint
-    white, size = measured.whitened_by(joint.noise.noise), found.denominator.size
+    white, size = measured.whitened_by(joint.noise.noise), poles_of_start(found.start).size
     # Poles that have run to infinity are not looked for again.
-    alike = [start for start in starts if start[0].size == size]
-    starts = [(joint.found.denominator, joint.found.delay), *alike]
+    alike = [start for start in starts if poles_of_start(start).size == size]
+    starts = [joint.found.start, *alike]
     nested = nested and sum(e.size for e in measured.outputs) <= LONG
     other = white.best(starts, nested) if nested else white.local(*starts)
-    if other.denominator.size != found.denominator.size:
+    if poles_of_start(other.start).size != size:
         return joint
     return min((joint, _settled(measured, JointOptimum(other, joint.noise))), key=lambda each: each.noise.deviance)
 
@@ -76,7 +76,7 @@ def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
     """Plant and noise in turn, until the likelihood rises no further."""
     (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
-        found = measured.whitened_by(noise.noise).local((found.denominator, found.delay))
+        found = measured.whitened_by(noise.noise).local(found.start)
         following = fit_arma(_errors(measured, found), steps, noise.orders, noise)
         settled, noise = noise.deviance - following.deviance < SETTLED, following
         if settled:

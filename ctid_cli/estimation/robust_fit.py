@@ -16,7 +16,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import Optimum, Start
 from ctid_cli.estimation.optimum.search import ROUNDING
 from ctid_cli.inference.robust_loss import Loss, RobustKind, scale_of
 
@@ -48,16 +48,14 @@ class RobustFit:
         return [x + loss.weight(r) * r for x, loss, r in each]
 
 
-def robust_fit(
-    measured: MeasuredRecords, kind: RobustKind, starts: Sequence[tuple[Array, float]], nested: bool
-) -> RobustFit:
+def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Start], nested: bool) -> RobustFit:
     """Search for the least Huber loss, and from there for Tukey's.
 
     The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.
     """
     best = _descend(measured, measured.best(starts, nested), "huber")
     for _ in range(MOST_SEARCHES):
-        at = [(best.found.denominator, best.found.delay), *starts]
+        at = [best.found.start, *starts]
         trial = _descend(measured, measured.with_outputs(best.modified()).best(at, nested), "huber")
         smaller = [min(pair, key=lambda loss: loss.scale) for pair in zip(best.losses, trial.losses, strict=True)]
         if trial.cost(smaller) > best.cost(smaller) * (1.0 - WORTHWHILE):
@@ -85,7 +83,7 @@ def _descend(
     here = _at(measured, found, kind, losses)
     settled = losses is not None
     for k in range(MOST_FITS):
-        there = measured.with_outputs(here.modified()).local((here.found.denominator, here.found.delay))
+        there = measured.with_outputs(here.modified()).local(here.found.start)
         there = replace(there, tried=found.tried, agree=found.agree, poles_at_infinity=found.poles_at_infinity)
         following = _at(measured, there, kind, here.losses if settled else None)
         if settled and following.cost(here.losses) >= here.cost(here.losses) * (1.0 - DONE):

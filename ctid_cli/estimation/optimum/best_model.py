@@ -8,12 +8,13 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum.box import Box, Point, box_of, point_of, widened
-from ctid_cli.estimation.optimum.chain import numerators
+from ctid_cli.estimation.optimum.box import Bounds, Box, Point, box_of, point_of, widened
+from ctid_cli.estimation.optimum.chain import numerators, polynomial
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import Ending, Local
-from ctid_cli.estimation.optimum.starts import SAME, StructureSearch
+from ctid_cli.estimation.optimum.starts import SAME, StructureSearch, block_starts
+from ctid_cli.estimation.optimum.triangle import SINGLE, Channel
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.models.transfer_function import TransferFunction
 
@@ -28,12 +29,13 @@ LONG, PART = 100_000, 20_000
 class Optimum:
     """The least output error that was found."""
 
-    #: Coefficients in descending powers, the denominator monic.
-    numerator: Array
-    denominator: Array
-    delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, zeros without
-    #: it; and those of the powers of time.
+    #: Coefficients in descending powers: numerators of the fractions, and the monic denominators of the blocks.
+    numerators: tuple[Array, ...]
+    denominators: tuple[Array, ...]
+    #: Delay of each input [s].
+    delays: tuple[float, ...]
+    #: Of each record, coefficients of C in the free responses ``C/A delta(t - t_s)``, descending powers, zeros without
+    #: them; and those of the powers of time.
     free_responses: Array
     trends: Array
     squared_error: float
@@ -46,28 +48,74 @@ class Optimum:
     #: keep them, where no bound of the set holds the poles; and the poles that are held.
     pole_slopes: Array
     held_poles: ComplexArray
-    #: Whether the delay would leave its bounds.
-    delay_at_bound: bool
-    #: Whether the delay sits in a kink of the cost, at a sample.
+    #: Inputs whose delays would leave their bounds.
+    delays_at_bound: tuple[int, ...]
+    #: Whether a delay sits in a kink of the cost, at a sample.
     pinned: bool
     tried: int
     agree: int
     evaluations: int
     box: Box = field(repr=False)
-    #: Poles at the origin, which the denominator does not have.
-    integrators: int = 0
+    channels: tuple[Channel, ...] = SINGLE
+    #: Poles at the origin of each block, which the denominators do not have.
+    integrators: tuple[int, ...] = (0,)
+
+    @property
+    def numerator(self) -> Array:
+        """The numerator of the first fraction."""
+        return self.numerators[0]
+
+    @property
+    def denominator(self) -> Array:
+        """The denominator of the first block."""
+        return self.denominators[0]
+
+    @property
+    def delay(self) -> float:
+        """The delay of the first input [s]."""
+        return self.delays[0]
+
+    @property
+    def start(self) -> "Start":
+        """What a search near it starts from."""
+        return self.denominators, self.delays
+
+    @property
+    def fractions(self) -> tuple[TransferFunction, ...]:
+        """The fractions that the model is a sum of."""
+        whole = [np.append(a, np.zeros(count)) for a, count in zip(self.denominators, self.integrators, strict=True)]
+        return tuple(
+            TransferFunction(b, whole[channel.block], self.delays[channel.input])
+            for b, channel in zip(self.numerators, self.channels, strict=True)
+        )
 
     @property
     def model(self) -> TransferFunction:
-        """The model."""
-        return TransferFunction(self.numerator, np.append(self.denominator, np.zeros(self.integrators)), self.delay)
+        """The first fraction: the model, where there is one input."""
+        return self.fractions[0]
+
+
+#: A denominator, or those of several blocks, and a delay, or those of several inputs [s].
+Start = tuple[ArrayLike | tuple[Array, ...], float | tuple[float, ...]]
+
+
+def _point(start: Start, box: Box) -> Point:
+    """Return the admissible point of a start."""
+    return point_of(poles_of_start(start), start[1], box)
+
+
+def poles_of_start(start: Start) -> ComplexArray:
+    """Return the poles of all denominators of a start."""
+    given = start[0]
+    denominators = given if isinstance(given, tuple) and np.ndim(given[0]) else (np.asarray(given, dtype=float),)
+    return np.concatenate([np.roots(a) for a in denominators]).astype(complex)
 
 
 def best_output_error(
     problem: Problem,
     poles: int,
-    delays: tuple[float, float] = (0.0, 0.0),
-    starts: Sequence[tuple[ArrayLike, float]] = (),
+    delays: Bounds = (0.0, 0.0),
+    starts: Sequence[Start] = (),
     *,
     nested: bool = True,
     fewer_poles: bool = True,
@@ -87,13 +135,15 @@ def best_output_error(
     zeros, box = problem.zeros, box_of(problem, delays)
     if known.all_poles:
         box = widened(box, known.poles)
-    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in starts]
+    points = [_point(start, box) for start in starts]
     search = StructureSearch(problem, box, random_starts, seed)
-    part = part_of(problem, delays[1]) if nested else None
+    if len(problem.orders) > 1:
+        return _of_blocks(search, points, nested, known)
+    part = part_of(problem, max(high for _, high in box.each_delay)) if nested else None
     if known is not NOTHING:
         if part is not None:
             there = best_output_error(part, poles, delays, starts, random_starts=random_starts, seed=seed, known=known)
-            points, nested = [point_of(there.model.poles, there.delay, box)], False
+            points, nested = [_point(there.start, box)], False
         search = _with_known(search, poles, points, nested, known)
         return _least(search, poles, zeros, False)
     if part is not None:
@@ -125,24 +175,49 @@ def _with_known(
     zeros, box = free.problem.zeros, free.box
     search = StructureSearch(free.problem, box, known=known)
     if nested and known.all_poles:
-        points = [point_of(known.poles, 0.5 * sum(box.delays), box)]
+        points = [point_of(known.poles, box.middle, box)]
     elif nested:
         free.climb(poles, zeros)
         points += [local.point for local in free.minima(poles, zeros)] + free.from_below(poles, zeros)
         points += free.resonances(poles, zeros) + free.random_points(poles)
-    points = [point for point in (known.met(start, box) for start in points) if point is not None]
+    points = _met(points, box, known)
     if nested:
         points = search.along_delay(zeros, search.descent(zeros).sorted(points))
     search.refine(poles, zeros, points)
-    if not search.minima(poles, zeros):
-        given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
+    if nested:
+        search.refine(poles, zeros, search.close_delays(poles, zeros))
+    return search
+
+
+def _of_blocks(free: StructureSearch, points: list[Point], nested: bool, known: KnownCoefficients) -> Optimum:
+    """Return the least squared error of a sum of fractions with several denominators."""
+    problem, box = free.problem, free.box
+    if known is not NOTHING and known.all_poles:
+        box = widened(box, known.poles)
+    search = StructureSearch(problem, box, known=known)
+    poles, zeros = sum(problem.orders), problem.zeros
+    if nested or not points:
+        points = points + block_starts(problem, box, free.random_starts, free.seed)
+    if known.all_poles:
+        points = [point_of(known.poles, point.seconds, box) for point in points]
+    search.refine(poles, zeros, _met(points, box, known))
+    if nested:
+        around = search.along_delay(zeros, [search.best(poles, zeros)])[1:]
+        search.refine(poles, zeros, [*around, *_met(free.random_points(poles), box, known)])
+        search.refine(poles, zeros, search.close_delays(poles, zeros))
+    return _least(search, poles, zeros, False)
+
+
+def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Point]:
+    """Return points where the known coefficients have their values."""
+    found = [point for point in (known.met(start, box) for start in points) if point is not None]
+    if points and not found:
+        given = ", ".join(f"{name} = {known.denominator[place]:g}" for name, place in known.named_places)
         raise DataError(
             f"no model with the fixed {given} has all its poles where they are searched: "
             f"{box.sentence('s')}; change or drop the fixed value"
         )
-    if nested:
-        search.refine(poles, zeros, search.close_delays(poles, zeros))
-    return search
+    return found
 
 
 def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
@@ -165,11 +240,11 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     return _least(search, poles, zeros, True)
 
 
-def best_near(search: StructureSearch, zeros: int, denominator: Array, delay: float) -> Optimum:
-    """Return the least squared error in the basin of a denominator, without integrators, and a delay."""
-    poles = denominator.size - 1
-    search.refine(poles, zeros, [point_of(np.roots(denominator).astype(complex), delay, search.box)])
-    return _least(search, poles, zeros, False)
+def best_near(search: StructureSearch, zeros: int, start: Start) -> Optimum:
+    """Return the least squared error in the basin of denominators, without integrators, and delays."""
+    point = _point(start, search.box)
+    search.refine(point.poles.size, zeros, [point])
+    return _least(search, point.poles.size, zeros, False)
 
 
 def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
@@ -183,32 +258,43 @@ def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -
     ends = np.array(search.ends(poles - lost, zeros))
     level = max(min(errors), float(ends.min()))
     agree = int(np.count_nonzero(ends <= level * (1 + SAME) + search.descent(zeros).floor))
-    return _optimum(found[lost], lost, ends.size, agree, search)
+    return _optimum(found[lost], zeros, lost, ends.size, agree, search)
 
 
-def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
+def _optimum(best: Local, zeros: int, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
     """Return the model in coefficients of polynomials."""
     assert best.ending is not None
-    point, projected = best.point, best.projected
-    a, known, n = point.denominator, search.known, point.poles.size
-    over = numerators(*search.problem.sections(point.speed, point.damping))
-    held = best.held[:n]
-    b = projected.output @ over
-    if projected.direct:
-        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(search.problem.integrators))
+    point, projected, problem = best.point, best.projected, search.problem
+    known, n = search.known, point.poles.size
+    denominators = [polynomial(*sections) for sections in point.sections]
+    over = [numerators(*sections) for sections in problem.blocks(point.speed, point.damping)]
+    held, found, first = best.held[:n], [], 0
     slopes = point.denominator_slopes()[:, ~held]
     if known is not NOTHING:
         # The same up to rounding.
-        a[1:][known.places] = known.denominator[known.places]
-        given = np.isfinite(known.numerator)
-        b = b[b.size - given.size :]
-        b[given] = known.numerator[given]
+        exact = point.coefficients
+        exact[known.places] = known.denominator[known.places]
+        for a in denominators:
+            a[1:], exact = exact[: a.size - 1], exact[a.size - 1 :]
         slopes = slopes @ null_space(known.slopes(point, n)[:, ~held])
+    for channel, size, output, direct in zip(
+        problem.channels, search.descent(zeros).problem.sizes, projected.outputs, projected.directs, strict=True
+    ):
+        b, a = output @ over[channel.block], denominators[channel.block]
+        if direct:
+            b = np.concatenate(([0.0], b)) + direct * np.append(a, np.zeros(problem.each_integrators[channel.block]))
+        if known is not NOTHING:
+            values = known.numerator[first : first + size]
+            b, first = b[b.size - size :], first + size
+            b[np.isfinite(values)] = values[np.isfinite(values)]
+        found.append(np.trim_zeros(b, "f") if b.any() else np.zeros(1))
+    ends = np.cumsum([table.shape[0] for table in over])[:-1]
+    free = np.split(projected.free, ends, axis=1)
     return Optimum(
-        numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
-        denominator=a,
-        delay=point.delay.seconds,
-        free_responses=projected.free @ over,
+        numerators=tuple(found),
+        denominators=tuple(denominators),
+        delays=point.seconds,
+        free_responses=np.hstack([part @ table for part, table in zip(free, over, strict=True)]),
         trends=projected.trend,
         squared_error=best.squared_error,
         ending=best.ending,
@@ -216,13 +302,14 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
         poles_at_infinity=lost,
         pole_slopes=slopes,
         held_poles=point.poles[point.whole_sections(held)],
-        delay_at_bound=search.box.delay_free and bool(best.held[-1]) and not best.pinned,
+        delays_at_bound=best.delays_at_bound,
         pinned=best.pinned,
         tried=tried,
         agree=agree,
         evaluations=search.evaluations,
         box=search.box,
-        integrators=search.problem.integrators,
+        channels=problem.channels,
+        integrators=problem.each_integrators,
     )
 
 
@@ -266,4 +353,5 @@ def _cut(data: FilterData, part: slice, latest: float) -> FilterData:
     if part == slice(None):
         return data
     t, y, u = (values[part].copy() for values in (data.t, data.y, data.u))
-    return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u)
+    further = tuple(_cut(one, part, latest) for one in data.further)
+    return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u, further=further)

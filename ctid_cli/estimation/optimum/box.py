@@ -9,8 +9,9 @@ part has the logarithms of its real and imaginary part: in these coordinates the
 met.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from math import copysign, exp, sqrt
 from typing import NamedTuple
@@ -19,9 +20,12 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.estimation.optimum.chain import order_of, poles_of, polynomial, polynomial_slopes
-from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.projection import Problem, split_sections
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.frequency_lines import FrequencyLines
+
+#: Least and greatest delay [s], or those of each input.
+Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
 
 
 class Limit(NamedTuple):
@@ -102,7 +106,7 @@ class Box:
     fastest: float
     #: Greatest imaginary part [rad/s].
     imaginary: float = np.inf
-    delays: tuple[float, float] = (0.0, 0.0)
+    delays: Bounds = (0.0, 0.0)
     #: Sampling interval [s] where the cost has kinks at whole intervals of delay, else 0.
     cell: float = 0.0
     #: Delay [s] that counts as a step of one, a quarter period of what the output holds.
@@ -116,11 +120,33 @@ class Box:
     slowest_spread: float = 0.0
     least_damping_spread: float = 0.0
     highest: float = np.inf
+    #: Numbers of poles of several denominators; empty of one.
+    orders: tuple[int, ...] = ()
+
+    @cached_property
+    def each_delay(self) -> tuple[tuple[float, float], ...]:
+        """Bounds of the delay of each input."""
+        return each_bounds(self.delays)
+
+    @property
+    def several_delays(self) -> bool:
+        """Whether there are several inputs."""
+        return len(self.each_delay) > 1
+
+    @cached_property
+    def free_delays(self) -> tuple[int, ...]:
+        """Inputs whose delays are searched."""
+        return tuple(k for k, (low, high) in enumerate(self.each_delay) if low < high)
 
     @property
     def delay_free(self) -> bool:
-        """Whether the delay is searched."""
-        return self.delays[0] < self.delays[1]
+        """Whether a delay is searched."""
+        return bool(self.free_delays)
+
+    @property
+    def middle(self) -> tuple[float, ...]:
+        """The middle of the range of each delay."""
+        return tuple(0.5 * (low + high) for low, high in self.each_delay)
 
     @property
     def spread(self) -> tuple[float, float]:
@@ -151,6 +177,14 @@ class Box:
         return f"{poles}; pairs with a damping of at least {self.least_damping:g}"
 
 
+def each_bounds(delays: Bounds) -> tuple[tuple[float, float], ...]:
+    """Return the bounds of the delay of each input."""
+    low, high = delays[0], delays[-1]
+    if isinstance(low, tuple) or isinstance(high, tuple):
+        return tuple(pair for pair in delays if isinstance(pair, tuple))
+    return ((low, high),)
+
+
 def widened(box: Box, poles: ComplexArray) -> Box:
     """Return a box that holds given stable poles inside its bounds, too."""
     sizes, pairs, more = np.abs(poles), poles[poles.imag > 0], 1.0 + JUST_BEYOND
@@ -163,20 +197,38 @@ def widened(box: Box, poles: ComplexArray) -> Box:
     )
 
 
-#: No bounds at all.
-ANYWHERE = Box(0.0, np.inf, delays=(0.0, np.inf), least_damping=0.0)
+def anywhere(inputs: int, orders: tuple[int, ...]) -> Box:
+    """Return no bounds at all, for denominators of some orders."""
+    several = orders if len(orders) > 1 else ()
+    return Box(0.0, np.inf, delays=((0.0, np.inf),) * inputs, least_damping=0.0, orders=several)
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Sections, fastest first, and a delay."""
+    """Sections, fastest first in each denominator, and the delay of each input."""
 
     speed: Array
     #: Damping of a pair; -1 marks a real pole.
     damping: Array
     #: Whether the imaginary part of a pair is at its bound.
     edge: BoolArray
-    delay: Delay
+    delays: tuple[Delay, ...]
+    #: Numbers of poles of several denominators; empty of one.
+    orders: tuple[int, ...] = ()
+
+    @property
+    def delay(self) -> Delay:
+        """The delay of the first input."""
+        return self.delays[0]
+
+    @property
+    def seconds(self) -> tuple[float, ...]:
+        """The delay of each input [s]."""
+        return tuple(delay.seconds for delay in self.delays)
+
+    def with_delays(self, delays: Iterable[Delay]) -> "Point":
+        """Return the same poles at other delays."""
+        return replace(self, delays=tuple(delays))
 
     @property
     def poles(self) -> ComplexArray:
@@ -184,9 +236,19 @@ class Point:
         return np.array(poles_of(self.speed, self.damping), dtype=complex)
 
     @property
+    def sections(self) -> list[tuple[Array, Array]]:
+        """Speeds and dampings of each denominator."""
+        return split_sections(self.speed, self.damping, self.orders)
+
+    @property
     def denominator(self) -> Array:
-        """Monic polynomial, descending powers."""
-        return polynomial(self.speed, self.damping)
+        """Monic polynomial, descending powers; of several denominators the first."""
+        return polynomial(*self.sections[0])
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients ``a_1 ... a_n`` of each denominator in turn."""
+        return np.concatenate([polynomial(*sections)[1:] for sections in self.sections])
 
     def jacobian(self) -> Array:
         """Derivatives of ``ln w, ln zeta`` (or ln p) of all sections to the coordinates, block diagonal."""
@@ -199,8 +261,14 @@ class Point:
         return result
 
     def denominator_slopes(self) -> Array:
-        """Derivatives of ``a_1 ... a_n`` to the coordinates, shape (n, n)."""
-        return np.asarray(polynomial_slopes(self.speed, self.damping) @ self.jacobian())
+        """Derivatives of ``a_1 ... a_n`` of each denominator to the coordinates, shape (n, n)."""
+        jacobian, first = self.jacobian(), 0
+        slopes = np.zeros_like(jacobian)
+        for sections in self.sections:
+            own = polynomial_slopes(*sections)
+            slopes[first : first + len(own), first : first + len(own)] = own
+            first += len(own)
+        return np.asarray(slopes @ jacobian)
 
     def whole_sections(self, chosen: BoolArray) -> BoolArray:
         """All coordinates, or poles, of the sections of which one is chosen."""
@@ -229,7 +297,7 @@ class Point:
         return speed, damping
 
 
-def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
+def box_of(problem: Problem, delays: Bounds) -> Box:
     """Return the set that records, or a frequency response, admit."""
     if problem.lines is not None:
         return _box_of_lines(problem.lines, delays)
@@ -243,8 +311,9 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
         power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
         if power > 0:
             rate = max(rate, float(np.sqrt(np.sum(np.diff(data.y) ** 2 / steps) / power)))
-        cells.add(data.interval)
-    quarter = min(0.5 * np.pi / rate if rate > 0 else length, delays[1] - delays[0])
+        cells |= {one.interval for one in data.inputs}
+    widest = max(high - low for low, high in each_bounds(delays))
+    quarter = min(0.5 * np.pi / rate if rate > 0 else length, widest)
     state = "estimated" if problem.free_response else "periodic" if any(problem.periods) else "rest"
     bounds = {name: getattr(limit, state) for name, limit in LIMITS.items()}
     greatest = bounds["imaginary"] * np.pi / interval if min(cells) > 0 else np.inf
@@ -262,6 +331,7 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
         beyond,
         LIMITS["slowest"].estimated / length,
         LIMITS["least_damping"].estimated,
+        problem.orders,
     )
 
 
@@ -306,22 +376,35 @@ def admissible(pole: complex, box: Box) -> complex:
     return complex(-real, copysign(imaginary, pole.imag))
 
 
-def point_of(poles: ComplexArray, delay: float, box: Box, cell: int | None = None) -> Point:
-    """Admissible sections with given poles."""
-    moved = [admissible(pole, box) for pole in poles.tolist()]
-    units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in moved if p.imag > 0]
-    units += _real_sections(sorted(-p.real for p in moved if p.imag == 0), box)
-    units.sort(key=lambda unit: -unit[0])
-    low, high = box.delays
-    tau = min(max(float(delay), low), high)
-    if cell is None:
-        cell = int(np.floor(tau / box.cell)) if box.delay_free and box.cell > 0 else -1
+def point_of(
+    poles: ComplexArray, delays: float | Sequence[float], box: Box, cells: Sequence[int | None] | None = None
+) -> Point:
+    """Admissible sections with given poles, those of several denominators one after the other."""
+    moved, units, first = [admissible(pole, box) for pole in poles.tolist()], [], 0
+    for order in box.orders if len(box.orders) > 1 else (len(moved),):
+        units += _units(moved[first : first + order], box)
+        first += order
+    each = [delays] * len(box.each_delay) if isinstance(delays, float | int) else delays
+    placed = []
+    for (low, high), delay, cell in zip(box.each_delay, each, cells or [None] * len(each), strict=True):
+        tau = min(max(float(delay), low), high)
+        if cell is None:
+            cell = int(np.floor(tau / box.cell)) if low < high and box.cell > 0 else -1
+        placed.append(Delay(tau, cell))
     return Point(
         np.array([unit[0] for unit in units]),
         np.array([unit[1] for unit in units]),
         np.array([unit[2] for unit in units]),
-        Delay(tau, cell),
+        tuple(placed),
+        box.orders,
     )
+
+
+def _units(poles: list[complex], box: Box) -> list[tuple[float, float, bool]]:
+    """Sections of one denominator: speed, damping, and whether the imaginary part is at its bound."""
+    units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in poles if p.imag > 0]
+    units += _real_sections(sorted(-p.real for p in poles if p.imag == 0), box)
+    return sorted(units, key=lambda unit: -unit[0])
 
 
 def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, bool]]:
@@ -343,18 +426,21 @@ def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, boo
 
 
 def moved_by(point: Point, step: Array, box: Box) -> Point:
-    """The point a step away, the delay in quarter periods last, moved back to the set where it leaves it."""
+    """The point a step away, the free delays in quarter periods last, moved back to the set where it leaves it."""
     speed, damping = point.shifted(step)
-    poles = Point(speed, damping, point.edge, point.delay).poles
-    tau = point.delay.seconds + (step[-1] * box.quarter if box.delay_free else 0.0)
-    if point.delay.cell < 0:
-        return point_of(poles, tau, box)
-    # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
-    low, high = point.delay.cell * box.cell, (point.delay.cell + 1) * box.cell
-    for edge in (low, high):
-        if abs(tau - edge) < TOUCH * box.cell:
-            tau = edge
-    return point_of(poles, tau, box, point.delay.cell if low <= tau <= high else None)
+    poles = replace(point, speed=speed, damping=damping).poles
+    seconds, cells = list(point.seconds), [None if k in box.free_delays else -1 for k in range(len(point.delays))]
+    for place, k in enumerate(box.free_delays, start=poles.size):
+        seconds[k] += step[place] * box.quarter
+        if point.delays[k].cell < 0:
+            continue
+        # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
+        low, high = point.delays[k].cell * box.cell, (point.delays[k].cell + 1) * box.cell
+        for edge in (low, high):
+            if abs(seconds[k] - edge) < TOUCH * box.cell:
+                seconds[k] = edge
+        cells[k] = point.delays[k].cell if low <= seconds[k] <= high else None
+    return point_of(poles, seconds, box, cells)
 
 
 def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
@@ -364,7 +450,7 @@ def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
 
 
 def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
-    """Return which coordinates are at their lower and upper bound; for the delay the bounds of its cell count."""
+    """Return which coordinates are at their lower and upper bound; for a delay the bounds of its cell count."""
     at_low: list[bool] = []
     at_high: list[bool] = []
     for w, zeta, edge in zip(point.speed.tolist(), point.damping.tolist(), point.edge.tolist(), strict=True):
@@ -379,11 +465,11 @@ def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
         else:
             at_low += [slow, undamped]
             at_high += [fast, False]
-    if box.delay_free:
-        edges = box.delays
-        if point.delay.cell >= 0:
-            edges = max(edges[0], point.delay.cell * box.cell), min(edges[1], (point.delay.cell + 1) * box.cell)
+    for k in box.free_delays:
+        edges, delay = box.each_delay[k], point.delays[k]
+        if delay.cell >= 0:
+            edges = max(edges[0], delay.cell * box.cell), min(edges[1], (delay.cell + 1) * box.cell)
         slack = TOUCH * (edges[1] - edges[0])
-        at_low.append(point.delay.seconds <= edges[0] + slack)
-        at_high.append(point.delay.seconds >= edges[1] - slack)
+        at_low.append(delay.seconds <= edges[0] + slack)
+        at_high.append(delay.seconds >= edges[1] - slack)
     return np.array(at_low, dtype=bool), np.array(at_high, dtype=bool)

@@ -135,8 +135,7 @@ def form_of(speed: Array, damping: Array, length: float) -> "Form":
         worst = max(worst, product)
     if worst**2 < MODAL_CONDITION_LIMIT:
         return Modal.of(speed, damping, poles)
-    F, g = chain_dynamics(speed, damping)
-    return Chain(speed, damping, F, g, F, g)
+    return Chain.of(speed, damping)
 
 
 @lru_cache
@@ -284,6 +283,12 @@ class Chain:
     #: Those of the free response.
     free_dynamics: Array
     free_gain: Array
+
+    @classmethod
+    def of(cls, speed: Array, damping: Array) -> "Chain":
+        """Return the state space of sections."""
+        F, g = chain_dynamics(speed, damping)
+        return cls(speed, damping, F, g, F, g)
 
     @property
     def states(self) -> Array:

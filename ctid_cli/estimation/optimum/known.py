@@ -7,7 +7,7 @@ poles: they are eliminated with the others (:mod:`~ctid_cli.estimation.optimum.p
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -23,17 +23,24 @@ ZERO = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class KnownCoefficients:
-    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free."""
+    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free.
+
+    Those of several denominators, and of several numerators, stand one after the other.
+    """
 
     denominator: Array
     numerator: Array
+    #: Numbers of poles of several denominators; empty of one.
+    orders: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, poles: int, zeros: int, values: Mapping[int, float]) -> "KnownCoefficients":
+    def of(
+        cls, poles: int, zeros: int, values: Mapping[int, float], orders: tuple[int, ...] = ()
+    ) -> "KnownCoefficients":
         """Return them from values by places in ``a_1 ... a_n, b_0 ... b_m``."""
         theta = np.full(poles + zeros + 1, np.nan)
         theta[list(values)] = list(values.values())
-        return cls(theta[:poles], theta[poles:])
+        return cls(theta[:poles], theta[poles:], orders)
 
     @property
     def size(self) -> int:
@@ -51,13 +58,20 @@ class KnownCoefficients:
         return np.flatnonzero(np.isfinite(self.denominator))
 
     @property
+    def named_places(self) -> list[tuple[str, int]]:
+        """Names of the known coefficients of the denominators, and their places."""
+        names = [f"a{k}" for order in self.orders or (self.denominator.size,) for k in range(1, order + 1)]
+        return [(names[place], place) for place in self.places.tolist()]
+
+    @property
     def poles(self) -> ComplexArray:
-        """The poles, where all coefficients of the denominator are known."""
-        return np.roots(np.concatenate(([1.0], self.denominator))).astype(complex)
+        """The poles, where all coefficients of the denominators are known."""
+        parts = np.split(self.denominator, np.cumsum(self.orders)[:-1]) if self.orders else [self.denominator]
+        return np.concatenate([np.roots(np.concatenate(([1.0], part))) for part in parts]).astype(complex)
 
     @property
     def all_poles(self) -> bool:
-        """Whether there is but one denominator: its poles do not move, however ill-conditioned they are."""
+        """Whether all denominators are known: their poles do not move, however ill-conditioned they are."""
         return self.places.size == self.denominator.size > 0
 
     def slopes(self, point: Point, size: int) -> Array:
@@ -66,7 +80,7 @@ class KnownCoefficients:
         if self.all_poles:
             slopes[:, :n] = np.eye(n)
         elif self.places.size:
-            a = point.denominator[1:][self.places]
+            a = point.coefficients[self.places]
             slopes[:, :n] = point.denominator_slopes()[self.places] / a[:, None]
         return slopes
 
@@ -76,7 +90,7 @@ class KnownCoefficients:
             return point
         values, last = np.log(self.denominator[self.places]), np.inf
         for _ in range(MOST_STEPS):
-            error = np.log(point.denominator[1:][self.places]) - values
+            error = np.log(point.coefficients[self.places]) - values
             size = float(np.abs(error).max())
             if size <= MET or ROUNDED >= size >= last:
                 return point
@@ -84,8 +98,8 @@ class KnownCoefficients:
             if not step.any():
                 return None
             step /= max(1.0, float(np.abs(step).max()))
-            moved = moved_by(point, np.append(step, 0.0) if box.delay_free else step, box)
-            point, last = replace(moved, delay=point.delay), size
+            moved = moved_by(point, np.append(step, np.zeros(len(box.free_delays))), box)
+            point, last = moved.with_delays(point.delays), size
         return None
 
     def _least_step(self, point: Point, error: Array, box: Box) -> Array:

@@ -1,11 +1,12 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples, ``Z = Q R``: whatever is asked of
+With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples (z, w and u of each fraction where the
+model is a sum of several), ``Z = Q R``: whatever is asked of
 linear maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would
 square the condition; this costs little more, so that one route serves the search and its end.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,76 +37,132 @@ class Delay(NamedTuple):
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
 
 
-class Columns(NamedTuple):
-    """Where the rows of n states have what."""
+class Channel(NamedTuple):
+    """A fraction of the model: the input that drives it, and which denominator it has."""
 
-    n: int
-    #: Rows of w and of the free response that there are, and the powers of time beside them.
-    second: int
-    free: int
+    input: int = 0
+    block: int = 0
+    #: Zeros that its numerator has less than that of most.
+    fewer_zeros: int = 0
+
+
+#: The only fraction of a model with one input.
+SINGLE = (Channel(),)
+#: A delay, or one of each input.
+Delays = Delay | tuple[Delay, ...]
+
+
+def each_delay(delays: Delays) -> tuple[Delay, ...]:
+    """Return the delay of each input."""
+    return (delays,) if isinstance(delays, Delay) else delays
+
+
+class Columns(NamedTuple):
+    """Where the rows have what: z, w and u of each channel, y, free z and free w of each block, powers of time."""
+
+    #: Number of states of each channel, and of the free response of each block, where there are free responses.
+    orders: tuple[int, ...]
+    free: tuple[int, ...]
+    #: Whether there is w.
+    second: bool
     trend: tuple[int, ...]
 
     @classmethod
-    def of(cls, n: int, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
-        """Return the columns of rows with or without w and free response, and with powers of time."""
-        states = 2 * n if second else n
-        return cls(n, states - n, states if free else 0, trend)
+    def of(
+        cls,
+        orders: Sequence[int],
+        second: bool,
+        free: bool,
+        trend: tuple[int, ...],
+        channels: tuple[Channel, ...] = SINGLE,
+    ) -> "Columns":
+        """Return the columns of blocks of some orders, with or without w and free responses."""
+        each = tuple(orders[channel.block] for channel in channels)
+        return cls(each, tuple(orders) if free else (), second, trend)
+
+    def _first(self, k: int) -> int:
+        """First row of a channel."""
+        return (1 + self.second) * sum(self.orders[:k]) + k
+
+    def z(self, k: int = 0) -> slice:
+        """Z of a channel."""
+        return slice(self._first(k), self._first(k) + self.orders[k])
+
+    def states(self, k: int = 0) -> slice:
+        """Z and w of a channel."""
+        return slice(self._first(k), self.u(k))
+
+    def u(self, k: int = 0) -> int:
+        """The input of a channel."""
+        return self._first(k + 1) - 1
 
     @property
-    def u(self) -> int:
-        """The input."""
-        return self.n + self.second
+    def y(self) -> int:
+        """The output."""
+        return self._first(len(self.orders))
 
-    @property
-    def free_z(self) -> slice:
-        """Z of the free response."""
-        return slice(self.u + 2, self.u + 2 + self.n)
+    def free_z(self, block: int = 0) -> slice:
+        """Z of a free response."""
+        first = self.free_states(block).start
+        return slice(first, first + self.free[block])
 
-    @property
-    def free_states(self) -> slice:
-        """Z and w of the free response."""
-        return slice(self.u + 2, self.u + 2 + self.free)
-
-    @property
-    def size(self) -> int:
-        """Number of columns."""
-        return self.u + 2 + self.free + len(self.trend)
+    def free_states(self, block: int = 0) -> slice:
+        """Z and w of a free response."""
+        first = self.y + 1 + (1 + self.second) * sum(self.free[:block])
+        return slice(first, first + (1 + self.second) * self.free[block])
 
     @property
     def powers(self) -> slice:
         """Powers of the time since the first instant."""
-        return slice(self.u + 2 + self.free, self.size)
+        return slice(self.size - len(self.trend), self.size)
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return self.y + 1 + (1 + self.second) * sum(self.free) + len(self.trend)
 
 
 def rows_of(
-    form: Fractions | Chain,
+    forms: Sequence[Fractions | Chain],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
+    channels: tuple[Channel, ...] = SINGLE,
 ) -> Iterator[Array]:
-    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given."""
+    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given.
+
+    There is a form for each channel.
+    """
     if isinstance(data, FrequencyLines):
-        answers = form.at_lines(data, delay.place(data.interval), columns.second > 0)
+        answers = forms[0].at_lines(data, each_delay(delays)[0].place(data.interval), columns.second > 0)
         yield data.parts(np.column_stack((answers, data.response)))
         return
     whitener = None if noise is None else Whitener(noise.noise, columns.size)
-    second, done, record = columns.second > 0, 0, _record(delay, data, period)
+    second, done, each, inputs = columns.second, 0, each_delay(delays), data.inputs
     elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
-    for forced in form.forced(record, second):
-        if not len(forced):
+    forced = [
+        form.forced(_record(each[channel.input], inputs[channel.input], period), second)
+        for form, channel in zip(forms, channels, strict=True)
+    ]
+    free = [forms[[channel.block for channel in channels].index(block)] for block in range(len(columns.free))]
+    for parts in zip(*forced, strict=True):
+        count = len(parts[0])
+        if not count:
             # A piece without outputs.
             continue
-        rows = np.empty((columns.size, len(forced)))
-        rows[: columns.u + 2] = forced.T
-        if columns.free:
-            rows[columns.free_states] = form.free(elapsed[done : done + len(forced)] - elapsed[0], second)
+        rows = np.empty((columns.size, count))
+        for k, part in enumerate(parts):
+            rows[columns.states(k).start : columns.u(k) + 1] = part.T[:-1]
+        rows[columns.y] = parts[0][:, -1]
+        for block, form in enumerate(free):
+            rows[columns.free_states(block)] = form.free(elapsed[done : done + count] - elapsed[0], second)
         for row, power in zip(rows[columns.powers], columns.trend, strict=True):
-            row[:] = (elapsed[done : done + len(forced)] - data.t[0]) ** power if power else 1.0
+            row[:] = (elapsed[done : done + count] - data.t[0]) ** power if power else 1.0
         if noise is not None and whitener is not None:
-            whitener(rows, noise.steps[done : done + len(forced)])
-        done += len(forced)
+            whitener(rows, noise.steps[done : done + count])
+        done += count
         yield rows
 
 
@@ -122,17 +179,18 @@ def _reduced(triangle: Array | None, rows: Array) -> Array:
 
 
 def triangle_of(
-    form: Form,
+    forms: Sequence[Form],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
+    channels: tuple[Channel, ...] = SINGLE,
 ) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
     # Memory is that of one piece, however long the record.
     triangle: Array | None = None
-    for rows in rows_of(form, columns, delay, data, period, noise):
+    for rows in rows_of(forms, columns, delays, data, period, noise, channels):
         triangle = _reduced(triangle, rows)
     assert triangle is not None
     return triangle
@@ -141,26 +199,28 @@ def triangle_of(
 def triangles_of(
     forms: list[Modal],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
+    channels: tuple[Channel, ...] = SINGLE,
 ) -> Array:
-    """Return the triangles of several forms of one order without w, from one pass of all their modes: (K, q, q)."""
+    """Return the triangles of several forms of one block without w, from one pass of all their modes: (K, q, q)."""
     poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
     widths = np.where(poles.imag > 0.0, 2, 1)
     last = np.cumsum(widths)
     # Of each form the rows among those of all modes.
     each = [np.arange(last[place] - widths[place], last[place]) for place in places]
-    z, n = np.concatenate(each).reshape(len(forms), columns.n), int(last[-1])
-    whole = Columns.of(n, second=False, free=columns.free > 0, trend=columns.trend)
-    others = np.arange(whole.size)
-    chosen = [z, np.tile(others[n : n + 2], (len(forms), 1))]
-    chosen += [n + 2 + z] if columns.free else []
-    chosen += [np.tile(others[whole.powers], (len(forms), 1))]
-    rows_of_forms = np.hstack(chosen)
+    z = np.concatenate(each).reshape(len(forms), columns.orders[0])
+    whole = Columns.of((int(last[-1]),), False, bool(columns.free), columns.trend, channels)
+    everywhere = np.tile(np.arange(whole.size), (len(forms), 1))
+    chosen = [np.hstack((whole.z(k).start + z, everywhere[:, whole.u(k), None])) for k in range(len(channels))]
+    chosen += [everywhere[:, whole.y, None]]
+    chosen += [whole.free_z().start + z] if columns.free else []
+    rows_of_forms = np.hstack([*chosen, everywhere[:, whole.powers]])
     triangles: list[Array | None] = [None] * len(forms)
-    for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period, noise):
+    shared = [Fractions(Fractions.modes_of(poles))] * len(channels)
+    for rows in rows_of(shared, whole, delays, data, period, noise, channels):
         triangles = [_reduced(*pair) for pair in zip(triangles, rows[rows_of_forms], strict=True)]
     return np.array(triangles)
 

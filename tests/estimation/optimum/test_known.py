@@ -67,7 +67,7 @@ def test_points_move_to_where_the_denominator_has_its_values(seed):
     # Directions of the null space keep the values to first order.
     direction = null_space(known.slopes(point, n))[:, -1]
     speed, damping = point.shifted(1e-6 * direction)
-    moved = type(point)(speed, damping, point.edge, point.delay).denominator[1:][known.places]
+    moved = type(point)(speed, damping, point.edge, point.delays).denominator[1:][known.places]
     np.testing.assert_allclose(moved, known.denominator[known.places], rtol=1e-9)
 
 
