@@ -85,9 +85,7 @@ class StructureOptions:
 
     delays: Annotated[
         list[str] | None,
-        flag(
-            "--delay", "Range or value [time unit]; else chosen. INPUT=: of one of several.", "[INPUT=]LOW:HIGH|VALUE"
-        ),
+        flag("--delay", "Range or value [time unit]; else chosen. INPUT=: of one input.", "[INPUT=]LOW:HIGH|VALUE"),
     ] = None
     each_integrators: Annotated[
         list[str] | None,

@@ -132,6 +132,11 @@ class FitFigures:
         _draw_band(axes, [test.cross_correlation_band for test in tests], tests[0].level, "independent")
 
     @property
+    def delay(self) -> float:
+        """The estimated delay, of several inputs that of the first."""
+        return fractions_of(self.result.fit.model)[0].delay
+
+    @property
     def _inputs(self) -> int:
         return len(fractions_of(self.result.fit.model))
 
@@ -146,22 +151,22 @@ class FitFigures:
     def draw_profile(self, axes: Any) -> None:
         """The search over the delay."""
         fit, units = self.result.fit, self.units
-        profile, found = fit.profile, f"{fit.model.delay:.4g} {units.time}"
+        profile, found = fit.profile, f"{self.delay:.4g} {units.time}"
         if profile is None:
             low, high = self.result.options.delay_bounds
             label = plain(f"{'estimated' if low < high else 'known'} delay {found}")
-            axes.plot([fit.model.delay], [fit.cost], "o", color=DARK, label=label)
+            axes.plot([self.delay], [fit.cost], "o", color=DARK, label=label)
         else:
             whole = profile.samples >= fit.count
             part = "" if whole else f" of the most active {profile.samples} samples"
             part += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
             axes.plot(profile.delays, profile.costs, ".-", color=DARK, lw=0.8, ms=4, label=plain(f"profile{part}"))
             if profile.cutoff is None and whole and fit.noise is None:
-                axes.plot([fit.model.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
+                axes.plot([self.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
             else:
                 # The cost of the estimate is that of all frequencies and samples, or of the innovations.
                 what = "minimum at" if fit.noise is None else "estimate with the noise model:"
-                axes.axvline(fit.model.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
+                axes.axvline(self.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
         low, high = axes.get_ylim()
         if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
             # The least cost would lie on the axis of a straight scale, whatever the others around it are.

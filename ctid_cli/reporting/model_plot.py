@@ -130,7 +130,7 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
 
 def delay_drawing(figures: FitFigures, near: DelayCosts | None) -> Drawing:
     """The search over the delay, and beside it the cost so close to the estimate that its minimum is seen."""
-    delay, time = figures.result.fit.model.delay, figures.units.time
+    delay, time = figures.delay, figures.units.time
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 1 if near is None else 2, squeeze=False)[0]

@@ -300,7 +300,7 @@ class Point:
 def box_of(problem: Problem, delays: Bounds) -> Box:
     """Return the set that records, or a frequency response, admit."""
     if problem.lines is not None:
-        return _box_of_lines(problem.lines, delays)
+        return _box_of_lines(problem.lines, each_bounds(delays)[0])
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
     for data in problem.sampled:
         used, steps = data.t[data.use], np.diff(data.t)
@@ -331,7 +331,7 @@ def box_of(problem: Problem, delays: Bounds) -> Box:
         beyond,
         LIMITS["slowest"].estimated / length,
         LIMITS["least_damping"].estimated,
-        problem.orders,
+        orders=problem.orders,
     )
 
 

@@ -415,7 +415,7 @@ def _inputs_of(problem: Problem, block: int) -> list[int]:
 def _alone(problem: Problem, box: Box, block: int, others: Sequence[list[Array]]) -> tuple[Problem, Box]:
     """Return the problem of one denominator, its output without what the others explain, and its box."""
     inputs, records = _inputs_of(problem, block), []
-    for k, data in enumerate(problem.records):
+    for k, data in enumerate(problem.sampled):
         y, signals = data.y.copy(), [data.inputs[i] for i in inputs]
         y[data.use] -= np.sum([part[k] for part in others], axis=0) if others else 0.0
         first, *further = [one._replace(y=y, use=data.use, further=()) for one in signals]
