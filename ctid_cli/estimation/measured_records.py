@@ -350,11 +350,11 @@ class MeasuredRecords:
     def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-        Of a sum a start has the poles of its submodels, and if nested sums grow term by term. A profile under an
+        Of a sum a start has the poles of its submodels, and sums grow term by term in any case. A profile under an
         unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
         if self.problem.terms:
-            return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=nested, known=self.known)
+            return best_sum(self.problem, self.treatment.delay_bounds, starts, known=self.known)
         return best_output_error(
             self.problem,
             self.structure.poles - self.problem.integrators,

@@ -14,20 +14,18 @@ from ctid_cli.estimation.common import Fixed, Start, StartFrom, checked_bounds, 
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Begin, poles_of_submodels
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimation.robust_fit import robust_fit
 from ctid_cli.estimators.additive_srivc import check_submodels, check_terms
 from ctid_cli.estimators.delay_profile import (
     MeasuredFit,
     RecordsEstimator,
     check_clocks,
+    check_positive,
     check_treatment,
-    fitted,
-    with_noise,
 )
 from ctid_cli.estimators.measured_submodels import SubmodelsFit, sampling_margin
 from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
-from ctid_cli.models.additive import AdditiveModel, Term, names_of
+from ctid_cli.models.additive import AdditiveModel, Term, degrees_of, names_of
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset
 
@@ -94,8 +92,6 @@ class AdditiveOutputError(RecordsEstimator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.terms:
-            raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
         check_terms(self.terms)
         if not any(term.poles for term in self.terms):
             raise OptionError("terms", "terms must have a pole to search; integrators and gains alone have none")
@@ -106,20 +102,18 @@ class AdditiveOutputError(RecordsEstimator):
             raise OptionError("terms", "terms must have fewer zeros than poles while the delay is estimated")
         names = names_of(self.terms)
         for place, value in places_of(self.fixed, names).items():
-            if "_a" in names[place] and not value > 0.0:
-                raise OptionError(
-                    "fixed", f"fixed {names[place]} must be above zero, as in every stable model; got {value:g}"
-                )
+            if "_a" in names[place]:
+                check_positive(names[place], value)
 
     @property
     def poles(self) -> int:
         """Number of poles, integrators included."""
-        return sum(term.order for term in self.terms)
+        return degrees_of(self.terms)[0]
 
     @property
     def zeros(self) -> int:
         """Degree of the numerator of the sum."""
-        return max(self.poles - term.order + term.zeros for term in self.terms)
+        return degrees_of(self.terms)[1]
 
     @property
     def integrators(self) -> int:  # type: ignore[override]
@@ -160,14 +154,7 @@ class AdditiveOutputError(RecordsEstimator):
             low, high = self.delay_bounds
             delay = 0.5 * (low + high) if start.delay is None else start.delay
             starts, method = [(poles_of_submodels(start.model), delay)], GIVEN
-        if self.loss == "squares":
-            found = measured.best(starts, True)
-            fit = fitted(measured, found, None, None)
-            if self.noise_model != "white":
-                fit = with_noise(measured, fit, found, self.noise_model, starts)
-        else:
-            robust = robust_fit(measured, self.loss, starts, True)
-            fit = fitted(measured, robust.found, None, robust)
+        fit = self._least(measured, starts)
         return self._of_submodels(measured, fit, method)._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     def _of_submodels(self, measured: MeasuredRecords, fit: MeasuredFit, method: str) -> SubmodelsFit:

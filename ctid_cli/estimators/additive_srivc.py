@@ -181,8 +181,6 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.terms:
-            raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
         check_terms(self.terms)
         places_of(self.fixed, names_of(self.terms))
         check_closed_loop(self.instruments, self.variant)
@@ -260,7 +258,9 @@ class Submodels:
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:
-    """Check that a sum of terms determines its parameters."""
+    """Check that a sum has terms, and determines its parameters."""
+    if not terms:
+        raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
     if sum(term.integrators > 0 for term in terms) > 1:
         raise OptionError("terms", "terms may have integrators in one submodel only: others could not be told apart")
     if sum(term.zeros == term.order for term in terms) > 1:

@@ -231,6 +231,24 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
     noise_model: str
     integrators: int
 
+    def _least(
+        self,
+        measured: MeasuredRecords,
+        starts: Sequence[Begin],
+        profile: Profile | None = None,
+        *,
+        nested: bool = False,
+    ) -> MeasuredFit:
+        """Return the least output error from starts, robust or with a noise model as asked; without a covariance."""
+        if self.loss != "squares":
+            robust = robust_fit(measured, self.loss, starts, nested)
+            return fitted(measured, robust.found, profile, robust)
+        found = measured.best(starts, nested)
+        fit = fitted(measured, found, profile, None)
+        if self.noise_model == "white":
+            return fit
+        return with_noise(measured, fit, found, self.noise_model, starts, nested=nested)
+
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
         """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
         layout = measured.layout_of(fit.model.order, measured.structure.delay)
@@ -390,14 +408,7 @@ class DelayProfile(RecordsEstimator):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
                 starts = [(each, minimum.delay) for each, minimum in zip(a, minima, strict=True)]
-                if self.loss == "squares":
-                    found = measured.best(starts, self.nested)
-                    fit = fitted(measured, found, profile, None)
-                    if self.noise_model != "white":
-                        fit = with_noise(measured, fit, found, self.noise_model, starts, nested=self.nested)
-                else:
-                    robust = robust_fit(measured, self.loss, starts, self.nested)
-                    fit = fitted(measured, robust.found, profile, robust)
+                fit = self._least(measured, starts, profile, nested=self.nested)
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
@@ -570,13 +581,17 @@ def check_clocks(records: Sequence[Record]) -> None:
             )
 
 
+def check_positive(name: str, value: float) -> None:
+    """Refuse a coefficient of a denominator that no stable model has."""
+    if not value > 0:
+        raise OptionError("fixed", f"fixed {name} must be above zero, as in every stable model; got {value:g}")
+
+
 def check_stable(known: Mapping[int, float], poles: int) -> None:
     """Refuse denominators that no stable model has."""
     for place, value in known.items():
-        if place < poles and not value > 0:
-            raise OptionError(
-                "fixed", f"fixed a{place + 1} must be above zero, as in every stable model; got {value:g}"
-            )
+        if place < poles:
+            check_positive(f"a{place + 1}", value)
     if set(range(poles)) <= set(known):
         roots = np.roots([1.0, *(known[place] for place in range(poles))])
         unstable = [f"{root:.4g}" for root in roots.tolist() if root.real >= 0]

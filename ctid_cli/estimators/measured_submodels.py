@@ -20,7 +20,7 @@ from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
-from ctid_cli.models.additive import AdditiveModel, Submodel, Term
+from ctid_cli.models.additive import AdditiveModel, Submodel, Term, degrees_of
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
@@ -180,12 +180,12 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     @property
     def poles(self) -> int:
         """Number of poles, integrators included."""
-        return sum(term.order for term in self.terms)
+        return degrees_of(self.terms)[0]
 
     @property
     def zeros(self) -> int:
         """Degree of the numerator of the sum."""
-        return max(self.poles - term.order + term.zeros for term in self.terms)
+        return degrees_of(self.terms)[1]
 
     @property
     def delay_bounds(self) -> tuple[float, float]:

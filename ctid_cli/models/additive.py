@@ -331,6 +331,13 @@ def names_of(terms: Iterable[Term]) -> tuple[str, ...]:
     return tuple(names)
 
 
+def degrees_of(terms: Iterable[Term]) -> tuple[int, int]:
+    """Degrees of denominator, integrators included, and numerator of a sum of terms as one transfer function."""
+    terms = tuple(terms)
+    order = sum(term.order for term in terms)
+    return order, max(order - term.order + term.zeros for term in terms)
+
+
 def same_pole(one: ArrayLike, other: ArrayLike) -> BoolArray:
     """Whether two poles are too close to be told apart in double precision."""
     p, q = np.asarray(one, dtype=complex), np.asarray(other, dtype=complex)

@@ -166,11 +166,8 @@ class FitResult(PagedResult):
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
-        hold, (low, high) = first.record.input.hold, options.delay_bounds
-        searched = f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
-        yield "model", f"{spelled(options)}; delay {searched}"
-        if options.fixed:
-            yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
+        hold = first.record.input.hold
+        yield from self.structure()
         yield from _loop(options, first)
         if isinstance(fit, SubmodelsFit):
             yield "start", fit.start_method
@@ -182,6 +179,15 @@ class FitResult(PagedResult):
         yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
+
+    def structure(self) -> Iterator[tuple[str, str]]:
+        """Return the structure of the model, and what of it was known."""
+        options, time = self.fitted.options, self.units.time
+        low, high = options.delay_bounds
+        searched = f"searched from {low:g} to {high:g} {time}" if low < high else f"known, {low:g} {time}"
+        yield "model", f"{spelled(options)}; delay {searched}"
+        if options.fixed:
+            yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
     def quality(self) -> Iterator[tuple[str, str]]:
         """Return what tells how good the fit is."""

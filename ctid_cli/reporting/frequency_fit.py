@@ -21,7 +21,7 @@ from ctid_cli.reporting.fit_content import fit_content, parameters_of
 from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.frf_plot import decibels, name_response
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.model_plot import bode_drawing, poles_drawing, step_drawing
+from ctid_cli.reporting.model_plot import bode_drawing, poles_chapter, step_drawing
 from ctid_cli.reporting.pages.page import Chapter
 from ctid_cli.reporting.records import Records
 from ctid_cli.text import count
@@ -72,12 +72,8 @@ class FrequencyFitResult(FitResult):
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the data were taken."""
-        options, data, time = self.fitted.options, self.fit.data, self.units.time
-        low, high = options.delay_bounds
-        searched = f"searched from {low:g} to {high:g} {time}" if low < high else f"known, {low:g} {time}"
-        yield "model", f"{spelled(options)}; delay {searched}"
-        if options.fixed:
-            yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
+        data, time = self.fit.data, self.units.time
+        yield from self.structure()
         sampled = f"those of samples at intervals of {data.interval:g} {time}, input constant between them"
         yield "values", sampled if data.interval else "G(jw)"
         if data.standard_error is None:
@@ -140,12 +136,11 @@ class FrequencyFitResult(FitResult):
         found, units = self.fitted, self.units
         bode = bode_drawing(found.frequency_response(), None, units)
         bands = "of the model, with pointwise 95 % bands."
-        poles = poles_drawing(found.poles(), self.fit.model.zeros, units)
         yield from self.chapters_of_numbers()
         yield Chapter("Values and model", [Section(drawing=self.drawing(), caption="Values, model and residuals.")])
         step = Section(drawing=step_drawing(found.step_response(), units), caption=f"Response to a unit step {bands}")
         yield Chapter("Responses", [Section(drawing=bode, caption=f"Frequency response {bands}"), step])
-        yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
+        yield poles_chapter(found, units)
 
     def content(self) -> dict[str, Any]:
         """Return the fit for ``fit.json`` and ``ctid fit --json``."""

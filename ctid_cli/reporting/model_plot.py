@@ -9,7 +9,7 @@ import numpy as np
 
 from ctid_cli.arrays import ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.identification import DelayCosts, Validation, costs_about_delay
+from ctid_cli.estimators.identification import DelayCosts, Identification, Validation, costs_about_delay
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.inference.units import Units
@@ -158,12 +158,17 @@ def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iter
     notes = Section(notes=[test.sentence for test in result.tests])
     yield Chapter("Residuals", [Section(drawing=figures.residuals(), caption="Residuals."), *correlations, notes])
     yield Chapter("Responses", _responses(figures))
-    poles = poles_drawing(result.poles(), result.fit.model.zeros, units)
-    yield Chapter("Poles", [Section(drawing=poles, caption="Poles with their regions, and zeros.")])
+    yield poles_chapter(result, units)
     if result.fit.profile is not None:
         near = costs_about_delay(result)
         caption = "The search over the whole range" + (", and the cost about the estimate." if near else ".")
         yield Chapter("Delay", [Section(drawing=delay_drawing(figures, near), caption=caption)])
+
+
+def poles_chapter(result: Identification, units: Units) -> Chapter:
+    """Return the figure of the poles."""
+    drawing = poles_drawing(result.poles(), result.fit.model.zeros, units)
+    return Chapter("Poles", [Section(drawing=drawing, caption="Poles with their regions, and zeros.")])
 
 
 def _responses(figures: FitFigures) -> list[Section]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.errors import DataError
-from ctid_cli.models.additive import Term
+from ctid_cli.models.additive import degrees_of
 from ctid_cli.models.controller import Relay
 from ctid_cli.signals.noise import stream
 from ctid_cli.specification.joint_checks import MAX_TRIALS, cases_of
@@ -131,9 +131,7 @@ def _degrees(model: Any) -> Sequence[int]:
     if hasattr(model, "relative_degree"):
         return model.order, model.order - model.relative_degree
     if hasattr(model, "terms"):
-        terms: Sequence[Term] = model.terms
-        order = sum(term.order for term in terms)
-        return order, max(order - term.order + term.zeros for term in terms)
+        return degrees_of(model.terms)
     return (model.poles + getattr(model, "integrators", 0), model.zeros) if hasattr(model, "zeros") else ()
 
 

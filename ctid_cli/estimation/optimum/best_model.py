@@ -154,10 +154,7 @@ def _with_known(
     search.refine(poles, zeros, points)
     if not search.minima(poles, zeros):
         given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
-        raise DataError(
-            f"no model with the fixed {given} has all its poles where they are searched: "
-            f"{box.sentence('s')}; change or drop the fixed value"
-        )
+        raise _none_admissible(given, box, "the")
     if nested:
         search.refine(poles, zeros, search.close_delays(poles, zeros))
     return search
@@ -181,6 +178,12 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     """Return the least squared error of one of many structures, which share a search, and of those in its closure."""
     search.climb(poles, zeros)
     return _least(search, poles, zeros, True)
+
+
+def _none_admissible(fixed: str, box: Box, which: str) -> DataError:
+    """Return what is said where known coefficients leave no model in the box."""
+    what = f"no model with the fixed {fixed} has all its poles where they are searched"
+    return DataError(f"{what}: {box.sentence('s')}; change or drop {which} fixed value")
 
 
 def best_sum(
@@ -208,10 +211,7 @@ def best_sum(
             points += SumGrowth(part, box_of(part, delays)).points()
     met = [point for point in (known.met(start, box) for start in points) if point is not None]
     if not met:
-        raise DataError(
-            "no model with the fixed coefficients has all its poles where they are searched: "
-            f"{box.sentence('s')}; change or drop a fixed value"
-        )
+        raise _none_admissible("coefficients", box, "a")
     search.refine(order, problem.zeros, met)
     if grown:
         search.refine(order, problem.zeros, search.close_delays(order, problem.zeros))
