@@ -30,7 +30,7 @@ from ctid_cli.cli._common import (
     printable,
     require_within,
 )
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.cli._progress import Reporter
 from ctid_cli.errors import ExitCode, Problem, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import seconds
@@ -53,9 +53,7 @@ _STOPPED = {
 
 Dask = Annotated[
     str | None,
-    typer.Option(
-        "--dask", metavar="ADDRESS", help="Compute with the workers of the dask scheduler at tcp://host:port."
-    ),
+    flag("--dask", "Compute with the workers of the dask scheduler at tcp://host:port.", "ADDRESS"),
 ]
 
 
@@ -109,11 +107,11 @@ class PlaceOptions:
     out: Out = Path("results")
     fresh: Fresh = False
     keep_readable: Annotated[
-        bool, typer.Option("--keep-readable", help="With --fresh: keep what can be read of damaged results.")
+        bool, flag("--keep-readable", "With --fresh: keep what can be read of damaged results.")
     ] = False
     allow_mixed: AllowMixed = False
     retry: Annotated[
-        list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
+        list[Failure] | None, flag("--retry", "Compute stored failures of this kind again; repeatable.")
     ] = None
 
     @property
@@ -127,12 +125,10 @@ class PlaceOptions:
 class EndOptions:
     """What ends a run early."""
 
-    max_failures: Annotated[
-        int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
-    ] = None
+    max_failures: Annotated[int | None, flag("--max-failures", "Stop when N estimates have failed.", "N", min=1)] = None
     time_budget: Annotated[
         float | None,
-        typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
+        flag("--time-budget", "Stop after e.g. 90s, 30m or 1h30m.", "TIME", parser=duration),
     ] = None
 
 
@@ -146,12 +142,10 @@ def run(
     runs: Runs = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
+        flag("--shard", "Only the K-th of N equal parts; ctid merge joins them.", "K/N"),
     ] = None,
     dask: Dask = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be computed, without computing it.")
-    ] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "Print what would be computed, without computing it.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> None:
     """Run experiments; the same command again resumes.
@@ -271,7 +265,7 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
 @guarded
 def schema(
     section: Annotated[str | None, typer.Argument(metavar="SECTION", help="A section or kind, with --text.")] = None,
-    as_text: Annotated[bool, typer.Option("--text", help="Write a readable reference instead of JSON.")] = False,
+    as_text: Annotated[bool, flag("--text", "Write a readable reference instead of JSON.")] = False,
 ) -> None:
     """Print the JSON Schema of experiment files, or a reference.
 

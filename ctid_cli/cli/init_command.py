@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from ctid_cli.cli._common import guarded, write_files
+from ctid_cli.cli._options import flag
 from ctid_cli.errors import RefusedError, UsageError
 from ctid_cli.text import did_you_mean, listed
 
@@ -26,7 +27,7 @@ def init(
     kinds: Annotated[
         list[str] | None, typer.Argument(metavar="KIND", help=f"{', '.join(TEMPLATES)}; all by default.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite files that exist.")] = False,
+    force: Annotated[bool, flag("--force", "Overwrite files that exist.")] = False,
 ) -> None:
     """Write commented experiment files to begin with.
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from ctid_cli.cli._common import Out, emit, guarded, write_files
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Format, Tool
 
@@ -53,11 +53,11 @@ def table(
     ] = None,
     measure: Annotated[
         str | None,
-        typer.Option("--measure", metavar="NAMES", help="Measures of an experiment, such as bias,rmse,coverage."),
+        flag("--measure", "Measures of an experiment, such as bias,rmse,coverage.", "NAMES"),
     ] = None,
     compare: Annotated[
         str | None,
-        typer.Option("--compare", metavar="A,B", help="Differences of two estimators on the same data sets."),
+        flag("--compare", "Differences of two estimators on the same data sets.", "A,B"),
     ] = None,
     out: Out = Path("results"),
 ) -> None:
@@ -98,21 +98,13 @@ def export(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Experiment (quickstart), or a fit (fit.json).")
     ] = None,
-    id: Annotated[
-        str | None, typer.Option("--id", metavar="ID", help="One estimate in full, by the first letters of its id.")
-    ] = None,
-    format: Annotated[
-        Format | None, typer.Option("--format", help="Output format: csv or json; of one estimate any.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
-    tool: Annotated[Tool | None, typer.Option("--as", help="Tool for which the model of a fit is written.")] = None,
-    pade: Annotated[
-        int | None, typer.Option("--pade", metavar="ORDER", help="With --as control: approximate the delay.")
-    ] = None,
+    id: Annotated[str | None, flag("--id", "One estimate in full, by the first letters of its id.", "ID")] = None,
+    format: Annotated[Format | None, flag("--format", "Output format: csv or json; of one estimate any.")] = None,
+    json: Annotated[bool, flag("--json", "Short for --format json.")] = False,
+    tool: Annotated[Tool | None, flag("--as", "Tool for which the model of a fit is written.")] = None,
+    pade: Annotated[int | None, flag("--pade", "With --as control: approximate the delay.", "ORDER")] = None,
     out: Out = Path("results"),
-    file: Annotated[
-        Path | None, typer.Option("--file", metavar="FILE", help="Write to this file, not to stdout.")
-    ] = None,
+    file: Annotated[Path | None, flag("--file", "Write to this file, not to stdout.", "FILE")] = None,
 ) -> None:
     """Write the estimates of an experiment, or a fit as code.
 

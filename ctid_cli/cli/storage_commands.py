@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from ctid_cli.cli._common import AllowMixed, Out, emit, guarded
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.errors import MismatchError, UsageError
 
 
@@ -18,7 +18,7 @@ def merge(
     ],
     out: Out = Path("results"),
     allow_mixed: AllowMixed = False,
-    partial: Annotated[bool, typer.Option("--partial", help="Merge although some estimates are missing.")] = False,
+    partial: Annotated[bool, flag("--partial", "Merge although some estimates are missing.")] = False,
 ) -> None:
     """Merge the shards of experiments into one folder of results.
 
