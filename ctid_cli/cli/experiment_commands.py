@@ -1,4 +1,4 @@
-"""The commands that take experiment files: ``ctid run``, ``validate`` and ``schema``."""
+"""The commands about experiment files: ``ctid init``, ``validate``, ``accuracy``, ``run`` and ``schema``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from ctid_cli.cli._common import (
     AllowCode,
     AllowMixed,
     AllowOutside,
+    Config,
     Configs,
     Fresh,
     Jobs,
@@ -29,12 +31,13 @@ from ctid_cli.cli._common import (
     guarded,
     printable,
     require_within,
+    write_files,
 )
 from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.cli._progress import Reporter
-from ctid_cli.errors import ExitCode, Problem, SpecError, TooManyFailuresError, UsageError
+from ctid_cli.errors import ExitCode, Problem, RefusedError, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import seconds
-from ctid_cli.text import count
+from ctid_cli.text import count, did_you_mean, listed
 
 if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary
@@ -278,3 +281,66 @@ def schema(
     if section is not None and not as_text:
         raise UsageError(f"a part of the schema is there as text only; write: ctid schema --text {section}")
     typer.echo(reference_text(section) if as_text else json.dumps(json_schema(), indent=2))
+
+
+@guarded
+def accuracy(
+    config: Config,
+    spec: SpecOptions,
+    form: FormatOptions,
+    out: Out = Path("results"),
+) -> None:
+    """Compute the standard errors to expect of an experiment.
+
+    No data are needed.
+
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
+    formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
+    the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
+    unexpected about them comes last.
+    """
+    from ctid_cli.reporting.accuracy_result import AccuracyResult
+    from ctid_cli.reporting.results import find_results
+
+    ((_, plan),) = spec.plans([config])
+    emit(AccuracyResult.of(plan, find_results(out, plan.experiment)), form.form)
+
+
+#: Kinds of experiment files to begin with, each with what it is about and its files in the folder ``templates``; the
+#: first file is the specification, and its experiment has the name of the kind.
+TEMPLATES = {
+    "open-loop": ("a system and its delay, found from noisy data", ["open-loop.yaml"]),
+    "closed-loop": ("a system under a controller, with coloured noise", ["closed-loop.yaml"]),
+    "modes": ("a sum of submodels, or one transfer function?", ["modes.yaml"]),
+    "frequencies": ("frequencies of a signal that step", ["frequencies.yaml"]),
+    "measured": ("models of a measured record", ["measured.yaml", "measured-example.csv"]),
+}
+
+
+@guarded
+def init(
+    kinds: Annotated[
+        list[str] | None, typer.Argument(metavar="KIND", help=f"{', '.join(TEMPLATES)}; all by default.")
+    ] = None,
+    force: Annotated[bool, flag("--force", "Overwrite files that exist.")] = False,
+) -> None:
+    """Write commented experiment files to begin with.
+
+    They go into the current folder. Each runs as it is, in seconds, and says what every line of it means.
+    """
+    wanted = kinds or list(TEMPLATES)
+    for kind in wanted:
+        if kind not in TEMPLATES:
+            near = did_you_mean(kind, TEMPLATES) or "."
+            raise UsageError(f"there is no kind {kind!r}{near} Kinds: {', '.join(TEMPLATES)}")
+    folder = resources.files("ctid_cli") / "templates"
+    files = {Path(name): (folder / name).read_bytes() for kind in wanted for name in TEMPLATES[kind][1]}
+    taken = [path for path in files if path.exists()]
+    if taken and not force:
+        there = f"{listed(taken)} {'are' if len(taken) > 1 else 'is'} here already"
+        raise RefusedError(f"{there}, so that nothing was written; work in another folder, or add --force to overwrite")
+    write_files(files)
+    for kind in wanted:
+        about, names = TEMPLATES[kind]
+        typer.echo(f"{names[0]:20}  {about}{''.join(f' (with {name})' for name in names[1:])}")
+    typer.echo(f"next: ctid run {TEMPLATES[wanted[0]][1][0]}, then ctid table {wanted[0]}")
