@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting import markup
-from ctid_cli.reporting.layout import latex, markdown_table, picked
+from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked
 from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
@@ -273,9 +272,9 @@ def render_html(sections: Iterable[Section]) -> str:
     blocks: list[str] = []
     for section in sections:
         blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
-        blocks.append(markup.paragraphs([*section.sentences, *section.lines]))
-        blocks += [markup.table(*aligned_lines(section))] if section.frame is not None else []
-        blocks.append(markup.paragraphs(section.notes))
+        blocks.append(html_paragraphs([*section.sentences, *section.lines]))
+        blocks += [html_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks.append(html_paragraphs(section.notes))
     return "\n".join(filter(None, blocks))
 
 
