@@ -101,7 +101,7 @@ def fit(
     offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
     writes, needs --poles.
     """
-    asked = Asked(model, treatment, loop.use)
+    asked = Asked(model, treatment, loop.use, columns.names)
     if frequency_files(files):
         result: FitResult = frequency_fit(files, asked, loop, columns, asdict(judging))
     else:

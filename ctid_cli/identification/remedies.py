@@ -159,7 +159,7 @@ def tried_remedies(
     # A record in a loop cannot be cut.
     most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
     part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
-    base = Trial("structure", options, records[0].input.hold, part, fit)
+    base = Trial("structure", options, records[0].hold, part, fit)
     found = Trials([], [])
     try:
         if isinstance(options, DelayProfile) and any(map(is_not, part, records)):

@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from ctid_cli.estimation.optimum import chain
+from ctid_cli.estimation.optimum.arrangement import with_one_denominator
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form_of, numerators, poles_of
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
@@ -64,7 +65,7 @@ def test_gradient_is_that_of_differences(case, treatment):
         damping[1] *= np.exp(step[2])
         return project(problem, speed, damping, Delay(0.37 + step[4], -1)).squared_error
 
-    found = slopes(problem, SPEED, DAMPING, delay, project(problem, SPEED, DAMPING, delay), True)
+    found = slopes(problem, SPEED, DAMPING, delay, project(problem, SPEED, DAMPING, delay), (0,))
     steps = 1e-5 * np.eye(5)
     differences = [(value(step) - value(-step)) / 4e-5 for step in steps]
     np.testing.assert_allclose(found.gradient, differences, rtol=0, atol=1e-7 * np.abs(found.gradient).max())
@@ -81,11 +82,9 @@ def test_curvature_is_that_of_the_gradient_where_residuals_vanish():
     def gradient(step):
         speed, damping = point.shifted(step)
         here = project(problem, speed, damping, delay)
-        return slopes(problem, speed, damping, delay, here, False).gradient
+        return slopes(problem, speed, damping, delay, here).gradient
 
-    curvature = slopes(
-        problem, point.speed, point.damping, delay, project(problem, point.speed, point.damping, delay), False
-    )
+    curvature = slopes(problem, point.speed, point.damping, delay, project(problem, point.speed, point.damping, delay))
     differences = np.array([(gradient(step) - gradient(-step)) / 2e-4 for step in 1e-4 * np.eye(3)])
     np.testing.assert_allclose(curvature.curvature, differences, rtol=0, atol=1e-6 * curvature.curvature.max())
 
@@ -100,7 +99,7 @@ def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
     assert here.squared_error == pytest.approx(project(problem, SPEED, DAMPING, Delay(2.0, -1)).squared_error)
     beyond = [project(problem, SPEED, DAMPING, Delay(2.0 + side * step, -1)).squared_error for step in (1e-5, 2e-5)]
     slope = side * (4 * beyond[0] - beyond[1] - 3 * here.squared_error) / 4e-5
-    assert slopes(problem, SPEED, DAMPING, at, here, True).gradient[-1] == pytest.approx(slope, rel=1e-5)
+    assert slopes(problem, SPEED, DAMPING, at, here, (0,)).gradient[-1] == pytest.approx(slope, rel=1e-5)
 
 
 def test_masked_samples_do_not_count():
@@ -123,7 +122,7 @@ def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_re
     phi = np.hstack((np.vstack([shared for shared, _ in parts]), block_diag(*[own for _, own in parts])))
     left = left_over(phi, np.concatenate([record.y for record in records]))
     assert found.squared_error == pytest.approx(left @ left, rel=1e-8)
-    found_slopes = slopes(problem, SPEED, DAMPING, delay, found, True)
+    found_slopes = slopes(problem, SPEED, DAMPING, delay, found, (0,))
     ends = [project(problem, SPEED, DAMPING, Delay(0.37 + step, -1)).squared_error for step in (-1e-5, 1e-5)]
     assert found_slopes.gradient[-1] == pytest.approx((ends[1] - ends[0]) / 4e-5, rel=1e-6)
 
@@ -180,10 +179,10 @@ def test_poles_of_a_section_meet_and_part():
 def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping):
     data = filter_data(record_of(MODEL, np.random.default_rng(3), samples=400, regular=regular))
     form = form_of([(np.array([2.0]), np.array([damping]))], 100.0)
-    columns = Columns.of(2, False, True, (0,))
-    (whole,) = rows_of(form, columns, Delay(0.8, -1), data, 0.0)
+    columns = Columns.of(with_one_denominator(2, 0, 0, (0,)), False, True, (0,))
+    (whole,) = rows_of([form], columns, Delay(0.8, -1), data, 0.0)
     monkeypatch.setattr(chain, "PIECE", 37)
-    found = np.hstack(list(rows_of(form, columns, Delay(0.8, -1), data, 0.0)))
+    found = np.hstack(list(rows_of([form], columns, Delay(0.8, -1), data, 0.0)))
     np.testing.assert_allclose(found, whole, atol=1e-12)
-    triangle = triangle_of(form, columns, Delay(0.8, -1), data, 0.0)
+    triangle = triangle_of([form], columns, Delay(0.8, -1), data, 0.0)
     np.testing.assert_allclose(triangle.T @ triangle, whole @ whole.T, rtol=1e-10, atol=1e-12)
