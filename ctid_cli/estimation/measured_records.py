@@ -76,7 +76,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequen
     for k, channel in enumerate(arrangement.channels):
         rows, powers, outputs, direct, first = [], list[Array](), [], np.zeros(len(channel.terms)), 0
         states, driven = monic[columns.z(k)], monic[columns.states(k)][channel.order :]
-        alone = free[columns.free_states(columns.free.index(k))] if k in columns.free else np.zeros((0, total))
+        alone = free[columns.free_states(columns.free.index(k))] if k in columns.free else np.zeros_like(free)
         for place, term in enumerate(channel.terms):
             (b, a), fractions = fractions[0], fractions[1:]
             order, m = a.size - 1, b.size - 1
