@@ -148,6 +148,11 @@ class Box:
         """Inputs whose delays are searched."""
         return tuple(k for k, (low, high) in enumerate(self.each_delay) if low < high)
 
+    @cached_property
+    def delay_places(self) -> dict[int, int]:
+        """Places of the free delays among the coordinates, counted from the end, by their inputs."""
+        return {k: place - len(self.free_delays) for place, k in enumerate(self.free_delays)}
+
     @property
     def delay_free(self) -> bool:
         """Whether a delay is searched."""
@@ -234,6 +239,11 @@ class Point:
     def seconds(self) -> tuple[float, ...]:
         """The delay of each input [s]."""
         return tuple(delay.seconds for delay in self.delays)
+
+    @cached_property
+    def cells(self) -> tuple[int, ...]:
+        """The cell of each delay."""
+        return tuple(delay.cell for delay in self.delays)
 
     def with_delays(self, delays: Iterable[Delay]) -> "Point":
         """Return the same poles at other delays."""
@@ -449,9 +459,9 @@ def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, boo
 def moved_by(point: Point, step: Array, box: Box) -> Point:
     """The point a step away, the free delays in quarter periods last, moved back to the set where it leaves it."""
     speed, damping = point.shifted(step)
-    poles = replace(point, speed=speed, damping=damping).poles
+    poles = np.array(poles_of(speed, damping), dtype=complex)
     seconds, cells = list(point.seconds), [None if k in box.free_delays else -1 for k in range(len(point.delays))]
-    for place, k in enumerate(box.free_delays, start=poles.size):
+    for k, place in box.delay_places.items():
         seconds[k] += step[place] * box.quarter
         if point.delays[k].cell < 0:
             continue

@@ -17,6 +17,7 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -295,7 +296,7 @@ def project(problem: Problem, speed: Array, damping: Array, delays: Delays, *, s
 def responses(problem: Problem, projected: Projected) -> list[Array]:
     """Return the response to all inputs, without free responses and trends, at the used samples of each record."""
     triangles, found = projected.span.triangles, list[Array]()
-    columns = triangles.columns._replace(free=(), second=False, trend=())
+    columns = replace(triangles.columns, free=(), second=False, trend=())
     for data, period, _ in problem.laid_out:
         parts = []
         for rows in rows_of(triangles.forms, columns, triangles.delays, data, period):
@@ -385,8 +386,8 @@ def slopes(
             psi[:, :, place] -= rows[:, :, columns.z(k)] @ of_z + of_u * rows[:, :, columns.u(k)]
     for number, k in enumerate(columns.free):
         channel, form = channels[k], forms_used[k]
-        each_free = [form.slopes(free[channel.states], 0.0 * of_direct[k]) for free in projected.free]
-        maps = np.stack([one[:, channel.searched] for one in each_free])
+        none = 0.0 * of_direct[k]
+        maps = np.stack([form.slopes(free[channel.states], none)[:, channel.searched] for free in projected.free])
         psi[:, :, channel.poles] += rows[:, :, columns.free_states(number)] @ maps
     psi = psi.reshape(span.residual.size, -1)
     # (I - P): what the eliminated coefficients would follow is no effect of the poles.

@@ -21,7 +21,6 @@ from ctid_cli.estimation.optimum.box import (
     point_of,
     widened,
 )
-from ctid_cli.estimation.optimum.chain import order_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
 from ctid_cli.estimation.optimum.triangle import Delay
@@ -157,29 +156,26 @@ class Descent:
         )
         found = slopes(self.problem, point.speed, point.damping, delays, projected, free)
         inner = self.box.quarter * np.eye(found.gradient.size)
-        n = order_of(point.damping)
+        n = found.gradient.size - len(free)
         inner[:n, :n] = point.jacobian()
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
 
     def at_its_delay(self, point: Point) -> Point:
         """Return a point after one Gauss-Newton step of everything but its delays."""
         here = self.local(point)
-        ways = self._freedom(here, _lengths(here), kinked=self._delay_places(here.point))
+        ways = self._freedom(here, _lengths(here), kinked=self.box.delay_places)
         scaled, slope = ways.reduced(here.gradient, here.curvature)
         step = ways.whole(-np.linalg.lstsq(scaled, slope, rcond=FLAT)[0])
         step /= max(1.0, float(np.abs(step).max()))
         moved = self._moved(here.point, step)
         return point if moved is None else moved
 
-    def _delay_places(self, point: Point) -> dict[int, int]:
-        """Places of the free delays among the coordinates, by their inputs."""
-        return {k: place for place, k in enumerate(self.box.free_delays, start=order_of(point.damping))}
-
     def _freedom(self, here: Local, lengths: Array, kinked: Mapping[int, int] = NO_DELAYS) -> Freedom:
         """Return where a search can go, coordinates measured in given lengths; not along delays in a kink."""
         slopes = self.known.slopes(here.point, lengths.size)
         free = ~self.known.held(here.gradient / lengths, slopes / lengths, *at_bounds(here.point, self.box))
-        free[list(kinked.values())] = False
+        if kinked:
+            free[list(kinked.values())] = False
         return Freedom(free, lengths[free], null_space(slopes[:, free] / lengths[free]))
 
     def _moved(self, point: Point, step: Array) -> Point | None:
@@ -190,7 +186,7 @@ class Descent:
         """Where a delay is at a sample, the side of it that goes downhill, if any."""
         if not self.box.cell:
             return here
-        for k, place in self._delay_places(here.point).items():
+        for k, place in self.box.delay_places.items():
             here = self._one_faced(here, k, place)
         return here
 
@@ -277,7 +273,7 @@ class Descent:
         forces = self._forces(here)
         steps = np.full(size, DIFFERENCE)
         if self.box.cell > 0:
-            steps[order_of(here.point.damping) :] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
+            steps[size - len(self.box.free_delays) :] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
         rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
         for side in (1.0, -1.0):
             for i in range(size):
@@ -366,7 +362,7 @@ class Descent:
     def _whole_and_to_edge(self, point: Point, step: Array) -> list[Array]:
         """A step, and where it crosses a sample its part up to there: a minimum may be in the kink itself."""
         parts = []
-        for k, place in self._delay_places(point).items():
+        for k, place in self.box.delay_places.items():
             delay, cell = point.delays[k], self.box.cell
             if delay.cell >= 0 and step[place] != 0.0:
                 way = (delay.cell + (step[place] > 0)) * cell - delay.seconds
@@ -375,7 +371,7 @@ class Descent:
 
     def _in_kink(self, here: Local, step: Array, free: BoolArray) -> tuple[Local, int, int] | None:
         """The nearest kink along a delay, on a clock where any delay may be one, its input, and its coordinate."""
-        for k, place in self._delay_places(here.point).items():
+        for k, place in self.box.delay_places.items():
             if free[place]:
                 found = self._in_kink_along(here, k, place, float(abs(step[place])))
                 if found is not None:
@@ -416,7 +412,7 @@ class Descent:
     def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
         pinned, bound, at_bound = False, held.copy(), []
-        for k, place in self._delay_places(here.point).items():
+        for k, place in self.box.delay_places.items():
             low, high = self.box.each_delay[k]
             if held[place] and low < here.point.seconds[k] < high:
                 pinned, bound[place] = True, False
@@ -487,16 +483,13 @@ def _same(one: Point, other: Point) -> bool:
 
 def _alike(here: Local, other: Local, box: Box) -> bool:
     """Whether two places are so close that one minimum must be meant."""
-    near = here.squared_error < (1 + CLOSE) * other.squared_error
-    pairs = list(zip(here.point.delays, other.point.delays, strict=True))
-    if (
-        not near
-        or any(one.cell != two.cell for one, two in pairs)
-        or not np.array_equal(here.point.damping < 0, other.point.damping < 0)
-    ):
+    if here.squared_error >= (1 + CLOSE) * other.squared_error:
+        return False
+    if here.point.cells != other.point.cells or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
-    later = max(abs(one.seconds - two.seconds) for one, two in pairs) / box.quarter
+    each = zip(here.point.seconds, other.point.seconds, strict=True)
+    later = max(abs(one - two) for one, two in each) / box.quarter
     # On an irregular clock minima lie closer along the delay.
     nearest = CLOSE if box.cell > 0 else CLOSE_BETWEEN_KINKS
     return bool(np.abs(away).max(initial=0.0) < CLOSE and later < nearest)
@@ -537,7 +530,7 @@ def _unbounded(point: Point, step: Array, box: Box) -> Point | None:
     """The point a small step away, in the same coordinates, admissible or not; none across a sample."""
     speed, damping = point.shifted(step)
     delays = list(point.delays)
-    for place, k in enumerate(box.free_delays, start=order_of(point.damping)):
+    for k, place in box.delay_places.items():
         if step[place]:
             tau, cell = delays[k].seconds + step[place] * box.quarter, delays[k].cell
             if tau < 0 or (cell >= 0 and not cell * box.cell <= tau <= (cell + 1) * box.cell):

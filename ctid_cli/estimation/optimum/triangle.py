@@ -7,6 +7,9 @@ the search and its end.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +50,8 @@ def each_delay(delays: Delays) -> tuple[Delay, ...]:
     return (delays,) if isinstance(delays, Delay) else delays
 
 
-class Columns(NamedTuple):
+@dataclass(frozen=True)
+class Columns:
     """Where the rows have what: z, w and u of each channel, y, z and w of each free response, powers of time."""
 
     #: Number of states of each channel, and which input drives it.
@@ -59,54 +63,60 @@ class Columns(NamedTuple):
     second: bool
     trend: tuple[int, ...]
 
-    @classmethod
-    def of(cls, arrangement: Arrangement, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
+    @staticmethod
+    @lru_cache(maxsize=1024)
+    def of(arrangement: Arrangement, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
         """Return the columns of the channels of a model, with or without w and free responses."""
         channels = arrangement.channels
         orders, inputs = (tuple(each) for each in zip(*((one.order, one.input) for one in channels), strict=True))
-        return cls(orders, inputs, arrangement.owners if free else (), second, trend)
+        return Columns(orders, inputs, arrangement.owners if free else (), second, trend)
 
-    def _first(self, k: int) -> int:
-        """First row of a channel."""
-        return (1 + self.second) * sum(self.orders[:k]) + k
+    @cached_property
+    def _first(self) -> list[int]:
+        """First row of each channel, and the row of the output behind them."""
+        return list(accumulate(((1 + self.second) * order + 1 for order in self.orders), initial=0))
+
+    @cached_property
+    def _first_free(self) -> list[int]:
+        """First row of each free response, and what comes behind them."""
+        widths = ((1 + self.second) * self.orders[k] for k in self.free)
+        return list(accumulate(widths, initial=self.y + 1))
 
     def z(self, k: int = 0) -> slice:
         """Z of a channel."""
-        return slice(self._first(k), self._first(k) + self.orders[k])
+        return slice(self._first[k], self._first[k] + self.orders[k])
 
     def states(self, k: int = 0) -> slice:
         """Z and w of a channel."""
-        return slice(self._first(k), self.u(k))
+        return slice(self._first[k], self._first[k + 1] - 1)
 
     def u(self, k: int = 0) -> int:
         """The input of a channel."""
-        return self._first(k + 1) - 1
+        return self._first[k + 1] - 1
 
     @property
     def y(self) -> int:
         """The output."""
-        return self._first(len(self.orders))
+        return self._first[-1]
 
     def free_states(self, place: int = 0) -> slice:
         """Z and w of a free response."""
-        width = 1 + self.second
-        first = self.y + 1 + width * sum(self.orders[k] for k in self.free[:place])
-        return slice(first, first + width * self.orders[self.free[place]])
+        return slice(self._first_free[place], self._first_free[place + 1])
 
     def free_z(self, place: int = 0) -> slice:
         """Z of a free response."""
-        first = self.free_states(place).start
+        first = self._first_free[place]
         return slice(first, first + self.orders[self.free[place]])
 
     @property
     def powers(self) -> slice:
         """Powers of the time since the first instant."""
-        return slice(self.size - len(self.trend), self.size)
+        return slice(self._first_free[-1], self.size)
 
     @property
     def size(self) -> int:
         """Number of columns."""
-        return self.y + 1 + (1 + self.second) * sum(self.orders[k] for k in self.free) + len(self.trend)
+        return self._first_free[-1] + len(self.trend)
 
 
 def rows_of(
@@ -200,7 +210,7 @@ def triangles_of(
         each = [np.arange(last[place] - widths[place], last[place]) for place in places]
         shared.append(Fractions(Fractions.modes_of(poles)))
         chosen.append(np.concatenate(each).reshape(count, -1) if each else np.zeros((count, 0), dtype=np.int64))
-    whole = columns._replace(orders=tuple(int(np.where(one.modes.poles.imag > 0, 2, 1).sum()) for one in shared))
+    whole = replace(columns, orders=tuple(int(np.where(one.modes.poles.imag > 0, 2, 1).sum()) for one in shared))
     everywhere = np.tile(np.arange(whole.size), (count, 1))
     wanted = [np.hstack((whole.z(k).start + z, everywhere[:, whole.u(k), None])) for k, z in enumerate(chosen)]
     wanted.append(everywhere[:, whole.y, None])
