@@ -16,7 +16,6 @@ from .signals.noise import ArmaNoise as ArmaNoise, WhiteNoise as WhiteNoise
 
 # Models
 from .models.transfer_function import TransferFunction as TransferFunction
-from .models.several_inputs import MultiInputModel as MultiInputModel
 from .models.additive import AdditiveModel as AdditiveModel, Submodel as Submodel, Term as Term
 from .models.controller import ContinuousController as ContinuousController
 from .models.controller import DiscreteController as DiscreteController
@@ -54,7 +53,6 @@ from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand 
 from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
 from .estimators.delay_profile import MeasuredFit as MeasuredFit, MultiInputFit as MultiInputFit
-from .inference.of_input import InputFit as InputFit
 from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.frequency_domain import FrequencyDomainFit as FrequencyDomainFit

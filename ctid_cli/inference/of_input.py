@@ -16,42 +16,17 @@ _OWN = re.compile(r"[ab]\d+|delay")
 
 @dataclass(frozen=True, eq=False)
 class InputFit(FittedModel):
-    """What a fit with several inputs says of one of them.
-
-    Parameters
-    ----------
-    model : TransferFunction
-        The transfer function from this input to the output.
-    parameter_names : tuple of str
-        Names of all parameters of the fit; those that this transfer function does not have begin with "other".
-    law : Uncertainty
-        Covariance of all parameters.
-    """
+    """What a fit with several inputs says of one of them."""
 
     model: TransferFunction
+    #: Names of all parameters of the fit; those that this transfer function does not have begin with "other".
     parameter_names: tuple[str, ...]
+    #: Covariance of all of them.
     law: Uncertainty
 
     @classmethod
     def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
-        """Return the transfer function of an input; a common denominator has names without one.
-
-        Parameters
-        ----------
-        name : str
-            Name of the input.
-        model : TransferFunction
-            Its transfer function.
-        names : tuple of str
-            Names of all parameters of the fit.
-        law : Uncertainty
-            Covariance of all parameters.
-
-        Returns
-        -------
-        InputFit
-            The transfer function with its law.
-        """
+        """Return the transfer function of an input; parameters of a common denominator have names without one."""
         own = [(each.removeprefix(f"{name}_"), each) for each in names]
         return cls(model, tuple(bare if _OWN.fullmatch(bare) else f"other {each}" for bare, each in own), law)
 

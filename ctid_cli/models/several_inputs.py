@@ -12,17 +12,11 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 @dataclass(frozen=True, eq=False)
 class MultiInputModel:
-    """The sum of the responses to several inputs.
+    """The sum of the responses to several inputs."""
 
-    Parameters
-    ----------
-    parts : mapping of str to TransferFunction
-        The transfer function of each input, with its delay [s].
-    common : bool
-        Whether all have one denominator.
-    """
-
+    #: The transfer function of each input, with its delay [s].
     parts: Mapping[str, TransferFunction]
+    #: Whether all have one denominator.
     common: bool
 
     @property

@@ -146,10 +146,11 @@ def read_measurement(
         span = f"from {t[used.start]:.6g} to {t[used.stop - 1]:.6g} {columns.unit('time') or 's'}"
         part = f"Only the {count} of {t.size} samples {span} are used; the input before them is not."
         notes = (*notes, part)
-    y, names = columns.output(used), [input_name(columns.names[role]) for role in roles]
+    names = [input_name(columns.names[role]) for role in roles]
     inputs = {
         name: HeldSignal(t[used], columns.input(used, role), hold) for name, role in zip(names, roles, strict=True)
     }
+    y = columns.output(used)
     if len(inputs) < len(names):
         raise DataError(f"{columns.file}: each input needs a name of its own; these are {', '.join(names)}")
     r = None if reference is None else columns.input(used, "reference")
