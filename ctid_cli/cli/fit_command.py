@@ -124,7 +124,7 @@ def _fit_of_records(
     options = options_of(asked)
     if asked.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
-    hold = "zoh" if asked.treatment.hold == "auto" else asked.treatment.hold
+    hold = "zoh" if asked.hold == "auto" else asked.hold
     records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
     judging.check(asked.treatment.noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:

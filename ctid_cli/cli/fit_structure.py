@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar, cast, get_args
 
 from ctid_cli.cli._common import span
 from ctid_cli.cli._options import flag
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset, Weight
+from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset, Weight
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
@@ -78,6 +78,15 @@ def delay_range(text: str) -> tuple[float, float]:
         return bounds
     allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
     raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
+
+
+def read_hold(text: str) -> AskedHold:
+    """Read how an input behaves between its samples."""
+    found = next((hold for hold in get_args(AskedHold) if hold == text), None)
+    if found is None:
+        allowed = f"{', '.join(get_args(AskedHold))}, or INPUT=HOLD for one of several inputs"
+        raise UsageError(f"--hold must be one of {allowed}; got {text!r}")
+    return cast(AskedHold, found)
 
 
 @dataclass(frozen=True)
@@ -245,7 +254,10 @@ class FitOptions(TreatmentOptions):
 
     loss: Annotated[LossKind, flag("--loss", "Loss function of the output errors.")] = "squares"
     noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
-    hold: HoldOption = "auto"
+    each_hold: Annotated[
+        list[str] | None,
+        flag("--hold", "Input between its samples; else chosen.", "[INPUT=]auto|zoh|foh|band-limited"),
+    ] = None
     weight: Annotated[Weight | None, flag("--weight", "Weights of a frequency response without standard errors.")] = (
         None
     )
@@ -264,6 +276,18 @@ class Asked:
     loop: LoopUse = "none"
     #: Names of several inputs, else empty.
     inputs: tuple[str, ...] = ()
+
+    @property
+    def hold(self) -> AskedHold | tuple[Hold, ...]:
+        """How the inputs behave between their samples; where one is given by itself, that of each."""
+        given = per_input("--hold", self.treatment.each_hold, read_hold)
+        if not given.own:
+            return given.shared or "auto"
+        each = [given.own.get(name, given.shared or "zoh") for name in self.inputs]
+        found = tuple(hold for hold in each if hold != "auto")
+        if len(found) < len(each):
+            raise UsageError("--hold auto chooses one for all inputs; give INPUT=zoh, foh or band-limited")
+        return found
 
     @property
     def simulated(self) -> bool:
@@ -350,11 +374,11 @@ def _given(asked: Asked) -> Given:
             raise UsageError(f"--poles is missing: with {option} it must be given")
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if model.zeros is None and (model.fix or own_poles or own_zeros) else model.zeros
-    given = replace(given_of(model, treatment, treatment.hold), poles=poles, zeros=zeros, fixed=model.fixed)
+    given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed)
     return replace(given, loss=treatment.loss, noise_model=treatment.noise, inputs=inputs)
 
 
-def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold) -> Given:
+def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold | tuple[Hold, ...]) -> Given:
     """Return what is given of the choice."""
     from ctid_cli.identification.choice import Given
 
@@ -399,6 +423,7 @@ def _refuse_inputs(asked: Asked) -> None:
         ("--zeros", model.each_zeros),
         ("--delay", model.delays),
         ("--integrators", model.each_integrators),
+        ("--hold", asked.treatment.each_hold),
     ):
         for text in texts or ():
             name, equals, _ = text.rpartition("=")
@@ -453,7 +478,7 @@ def _what(asked: Asked) -> str:
 def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     """Yield what submodels and simulated loops cannot do: whether it is asked for, the option, and a remedy."""
     model, treatment = asked.model, asked.treatment
-    state, offset, hold = treatment.initial_state, treatment.offset, treatment.hold
+    state, offset, hold = treatment.initial_state, treatment.offset, asked.hold
     low, high = model.bounds or (0.0, 0.0)
     yield treatment.input_before is not None, "--input-before", "use --initial-state estimate"
     yield treatment.loss != "squares", f"--loss {treatment.loss}", "drop --loss"

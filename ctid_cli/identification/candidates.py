@@ -16,7 +16,7 @@ from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, penal
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
-from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
+from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
 MOST_POLES = 12
@@ -36,7 +36,7 @@ SAMPLES_PER_PARAMETER = 3
 class Setting(NamedTuple):
     """How records are taken."""
 
-    hold: Hold
+    hold: Holds
     initial_state: InitialState
     input_before: InputBefore
     offset: Offset
@@ -86,12 +86,13 @@ class Span(NamedTuple):
         return small or [each for _, each in found[:1]]
 
 
-def with_hold(record: Record, hold: Hold) -> Record:
+def with_hold(record: Record, hold: Holds) -> Record:
     """Return a record with another hold of its inputs."""
-    inputs = record.held
-    if all(signal.hold == hold for signal in inputs.values()):
+    if record.hold == hold:
         return record
-    return replace(record, inputs={name: HeldSignal(one.t, one.values, hold) for name, one in inputs.items()})
+    holds = [hold] * len(record.held) if isinstance(hold, str) else hold
+    each = zip(record.held.items(), holds, strict=True)
+    return replace(record, inputs={name: HeldSignal(one.t, one.values, own) for (name, one), own in each})
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +100,7 @@ class Structures:
     """Structures with one number of integrators, in one setting of the records."""
 
     records: Sequence[Record]
-    hold: Hold
+    hold: Holds
     options: DelayProfile
     measured: MeasuredRecords
     search: StructureSearch

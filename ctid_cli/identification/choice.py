@@ -9,7 +9,7 @@ from ctid_cli.identification.candidates import MOST_POLES, Span
 from ctid_cli.identification.criterion import Ranking
 from ctid_cli.inference.response_test import AnswerTest
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Given:
         Offset of the output.
     input_before : float or "first", optional
         Input before the first sample of a record that begins at rest [input unit].
-    hold : {"auto", "zoh", "foh", "band-limited"}, default "auto"
-        The input between its samples.
+    hold : {"auto", "zoh", "foh", "band-limited"} or tuple of these but "auto", default "auto"
+        The input between its samples; a tuple has the hold of each of several inputs.
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count in the fit; the choice is made with their squares.
     fixed : tuple of Fixed, optional
@@ -49,7 +49,7 @@ class Given:
     initial_state: InitialState | None = None
     offset: Offset | None = None
     input_before: InputBefore = None
-    hold: AskedHold = "auto"
+    hold: AskedHold | tuple[Hold, ...] = "auto"
     loss: LossKind = "squares"
     fixed: tuple[Fixed, ...] | None = None
     noise_model: str = "white"
@@ -169,4 +169,4 @@ class Choice:
         if options.initial_state == "rest" and options.offset != "remove":
             before = options.input_before
             found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
-        return [*found, "--hold", self.records[0].hold]
+        return [*found, *(word for text in self.records[0].hold_options for word in ("--hold", text))]

@@ -32,6 +32,7 @@ from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Holds
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
@@ -91,7 +92,7 @@ class _Choosing:
         self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
         self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
-        self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
+        self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.said: list[str] = []
 
     def choice(self) -> Choice:
@@ -241,7 +242,7 @@ class _Choosing:
         determined = excited_after(self.few, latest)
         return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
 
-    def _holds(self) -> list[Hold]:
+    def _holds(self) -> list[Holds]:
         """Return the holds to compare: an input that jumps between levels shows that it is held, as in most loops."""
         if self.given.hold != "auto" or self._moves != {"continuous"}:
             return [self.first_hold]

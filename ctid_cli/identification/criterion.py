@@ -24,7 +24,7 @@ from ctid_cli.inference.criteria import (
     squared_innovations,
 )
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.signals.treatment import Hold
+from ctid_cli.signals.treatment import Holds
 
 #: What a parameter counts over its share in BIC. Of 134 simulated records of known structure, models so chosen had at
 #: most 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
@@ -54,7 +54,7 @@ class Candidate:
     """
 
     options: DelayProfile
-    hold: Hold
+    hold: Holds
     fit: MeasuredFit
     size: int
     criterion: float = float("nan")

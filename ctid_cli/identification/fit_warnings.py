@@ -107,7 +107,7 @@ def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
     if remedy.kind == "loss":
         return _outliers(found, time_unit)
     if remedy.kind == "hold":
-        return f"The input is taken with --hold {found.records[0].hold}"
+        return f"The input is taken with --hold {' --hold '.join(found.records[0].hold_options)}"
     if remedy.kind == "treatment":
         return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
     low, high = options.delay_bounds

@@ -35,6 +35,7 @@ from ctid_cli.reporting.pages.page import Chapter, PagedResult
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Hold
@@ -171,7 +172,6 @@ class FitResult(PagedResult):
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
-        hold = first.hold
         yield from self.structure()
         yield from _loop(options, first)
         if isinstance(fit, SubmodelsFit):
@@ -181,7 +181,11 @@ class FitResult(PagedResult):
             f"{TREATMENTS[options.initial_state]}{_before(self.fitted, options.initial_state)}",
         )
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
-        yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
+        holds = [first.hold] if isinstance(first.hold, str) else first.hold
+        signals = list(first.record.held.values())
+        for hold, text, signal in zip(holds, first.record.hold_options, signals, strict=False):
+            of, _, _ = text.rpartition("=")
+            yield f"input {of}".strip(), f"{HOLDS[hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
@@ -272,9 +276,8 @@ class FitResult(PagedResult):
         return fit_content(self.fitted, self.records, self.predicted)
 
 
-def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
+def _unknown_ends(signal: HeldSignal, options: Options, units: Units) -> str:
     """What is not known of a band-limited input for want of the samples beyond the ends."""
-    signal = next(iter(measurement.record.held.values()))
     if signal.hold != "band-limited" or options.initial_state == "periodic":
         return ""
     doubt = band_limited_doubt(signal.t, signal.values)

@@ -16,6 +16,7 @@ from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.table import ROLES, Table, split_header
 from ctid_cli.signals.text_file import read_text_table
+from ctid_cli.signals.treatment import Holds
 
 Offset = Literal["none", "remove"]
 #: What stands between the units of several inputs.
@@ -62,8 +63,8 @@ class Measurement:
         return list(self.inputs) or self.input
 
     @property
-    def hold(self) -> Hold:
-        """The hold of the inputs."""
+    def hold(self) -> Holds:
+        """The hold of the inputs, or that of each where they differ."""
         return self.record.hold
 
 
@@ -122,7 +123,7 @@ def read_measurement(
     time: str | None = None,
     input: str | Sequence[str] | None = None,
     output: str | None = None,
-    hold: Hold = "zoh",
+    hold: Hold | Sequence[Hold] = "zoh",
     start: float | None = None,
     stop: float | None = None,
     reference: str | None = None,
@@ -132,10 +133,13 @@ def read_measurement(
 
     A window is read as if the file had no other lines: the input before it is not used, since the state that it
     left behind is estimated with the model where that is asked for. Where times must be in seconds, a column that is
-    labelled with another unit is refused unless it is named with that unit. Several inputs are named by their columns.
+    labelled with another unit is refused unless it is named with that unit. Several inputs are named by their
+    columns, and may have a hold each.
     """
-    require_choice("hold", hold, get_args(Hold))
     first, *others = [input] if input is None or isinstance(input, str) else input
+    holds = [hold] * (1 + len(others)) if isinstance(hold, str) else hold
+    for one in holds:
+        require_choice("hold", one, get_args(Hold))
     roles = ["input", *(f"input {k}" for k in range(2, len(others) + 2))]
     asked = {"time": time, "input": first, "output": output, "reference": reference}
     asked |= dict(zip(roles[1:], others, strict=True))
@@ -147,9 +151,8 @@ def read_measurement(
         part = f"Only the {count} of {t.size} samples {span} are used; the input before them is not."
         notes = (*notes, part)
     names = [input_name(columns.names[role]) for role in roles]
-    inputs = {
-        name: HeldSignal(t[used], columns.input(used, role), hold) for name, role in zip(names, roles, strict=True)
-    }
+    each = zip(names, roles, holds, strict=True)
+    inputs = {name: HeldSignal(t[used], columns.input(used, role), own) for name, role, own in each}
     y = columns.output(used)
     if len(inputs) < len(names):
         raise DataError(f"{columns.file}: each input needs a name of its own; these are {', '.join(names)}")

@@ -14,6 +14,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
 from ctid_cli.signals.held import REGULARITY, HeldSignal, Hold, regular_interval
+from ctid_cli.signals.treatment import Holds
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
@@ -224,9 +225,17 @@ class Record:
         return next(iter(self.held.values()))
 
     @property
-    def hold(self) -> Hold:
-        """How the inputs behave between their samples; that of the first one where they differ."""
-        return next(iter(self.held.values())).hold
+    def hold(self) -> Holds:
+        """How the inputs behave between their samples; that of each where they differ."""
+        each = tuple(signal.hold for signal in self.held.values())
+        return each[0] if len(set(each)) == 1 else each
+
+    @property
+    def hold_options(self) -> list[str]:
+        """The hold as it is written behind ``--hold``."""
+        if isinstance(self.hold, str):
+            return [self.hold]
+        return [f"{name}={signal.hold}" for name, signal in self.held.items()]
 
     @property
     def each_input(self) -> list[Record]:

@@ -250,6 +250,7 @@ def _require_sources(content: Mapping[str, Any]) -> None:
             require("columns", texts(each["columns"][role] for role in ROLES if role != "input"))
             inputs = each["columns"]["input"]
             require("columns", isinstance(inputs, str) or (isinstance(inputs, list) and texts(inputs)))
-            require("hold", each["hold"] in get_args(Hold))
+            holds = each["hold"] if isinstance(each["hold"], list) else [each["hold"]]
+            require("hold", bool(holds) and all(hold in get_args(Hold) for hold in holds))
             ends = [each[word] for word in ("from", "to")]
             require("from and to", all(end is None or isinstance(end, int | float) for end in ends))
