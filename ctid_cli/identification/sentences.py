@@ -85,7 +85,7 @@ def of_offset(models: Ranking) -> str:
 def of_hold(models: Ranking) -> str:
     """Return the hold."""
     other = models.runner_up("hold")
-    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else f"{other.hold}")}."
+    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else str(other.hold))}."
 
 
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
