@@ -27,7 +27,7 @@ def record(tmp_path_factory):
 
 def test_a_model_is_fitted_written_compared_and_exported(ctid, record, tmp_path):
     options = ("--poles", "u1=2", "--poles", "u2=1", "--delay", 0, "--fix", "u1_delay=0.7")
-    options += ("--initial-state", "rest", "--offset", "none", "--hold", "zoh", "--validate", record)
+    options += ("--initial-state", "rest", "--offset", "none", "--hold", "u1=zoh", "--hold", "u2=foh", "--validate", record)
     written = ("--json", "--report", "--csv", tmp_path, "--export", "control", "--out", tmp_path)
     content = json.loads(ctid("fit", record, *BOTH, *options, *written).stdout)
     model = content["model"]
@@ -39,6 +39,7 @@ def test_a_model_is_fitted_written_compared_and_exported(ctid, record, tmp_path)
     assert units["u2_b0"] == ("m/A/s", "free")
     assert units["u1_delay"] == ("s", "fixed")
     assert content["records"][0]["columns"]["input"] == ["u1 [V]", "u2 [A]"]
+    assert content["settings"]["hold"] == content["records"][0]["hold"] == ["zoh", "foh"]
     assert len(content["residual_tests"]) == 2
     assert {path.name for path in tmp_path.iterdir()} >= {"step_u1.csv", "bode_u2.csv", "fit.html", "G_control.py"}
     assert "Response to u2" in (tmp_path / "fit.html").read_text(encoding="utf-8")
@@ -58,6 +59,8 @@ def test_a_model_is_fitted_written_compared_and_exported(ctid, record, tmp_path)
         ((*BOTH, "--poles", 1, "--poles", 2), "--poles is given twice"),
         ((*BOTH, "--poles", "one"), "--poles must be a whole number, or INPUT=NUMBER"),
         ((*BOTH, "--poles", "u1=2", "--poles", "u2=1", "--zeros", "u1=3"), "input u1: zeros must be at most 1"),
+        ((*BOTH, "--poles", 1, "--hold", "u3=foh"), "the inputs are u1, u2"),
+        ((*BOTH, "--poles", 1, "--hold", "u1=auto"), "--hold auto chooses one for all inputs"),
         (("--input", "u1", "--poles", "u1=1"), "name several with --input"),
         (("--input", "u1", "--input", "u3", "--poles", 1, "--delay", 0), "u1 and u3 are collinear"),
         (("--input", "u1", "--input", "u1"), "cannot be both the input and the input 2"),

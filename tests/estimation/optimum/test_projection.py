@@ -11,6 +11,7 @@ from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.models.additive import Term
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
@@ -186,3 +187,17 @@ def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping)
     np.testing.assert_allclose(found, whole, atol=1e-12)
     triangle = triangle_of([form], columns, Delay(0.8, -1), data, 0.0)
     np.testing.assert_allclose(triangle.T @ triangle, whole @ whole.T, rtol=1e-10, atol=1e-12)
+
+
+def test_two_submodels_of_one_input_are_fractions_of_two_inputs_that_are_the_same():
+    record = record_of(MODEL, np.random.default_rng(11), noise=0.1)
+    speed, damping, delay = np.array([3.0, 1.5, 0.5, 0.2]), np.array([0.4, -1.0, -1.0, -1.0]), Delay(0.37, -1)
+    one = problem_of(record, 0, True, True)._replace(terms=(Term(2, 1), Term(3, 0, 1)))
+    data = filter_data(record)
+    two = one._replace(records=(data._replace(further=(data,)),), inputs=(0, 1))
+    here, there = project(one, speed, damping, delay), project(two, speed, damping, (delay, delay))
+    assert there.squared_error == pytest.approx(here.squared_error, rel=1e-10)
+    single = slopes(one, speed, damping, delay, here, (0,))
+    each = slopes(two, speed, damping, (delay, delay), there, (0, 1))
+    np.testing.assert_allclose(each.gradient[:-2], single.gradient[:-1], rtol=1e-6)
+    assert each.gradient[-2:].sum() == pytest.approx(single.gradient[-1], rel=1e-6)
