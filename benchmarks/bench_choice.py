@@ -143,7 +143,7 @@ class Case:
         for draw in range(1 + REDRAWS):
             record = self.record(draw)
             signal = HeldSignal(record.input.t, record.input.values, self.hold)
-            fit = replace(options, **structure).fit(replace(record, input=signal), None)
+            fit = replace(options, **structure).fit(replace(record, inputs=signal), None)
             errors.append(self.error(fit.model, self.hold))
         return max(errors[0], float(np.sqrt(np.mean(np.square(errors[1:])))))
 

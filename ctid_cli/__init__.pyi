@@ -32,7 +32,7 @@ from .estimators.rivc import Rivc as Rivc
 from .estimators.srivc import Srivc as Srivc
 from .estimators.td_srivc import TdSrivc as TdSrivc
 from .estimators.useful_redundancy import UsefulRedundancy as UsefulRedundancy
-from .estimators.delay_profile import DelayProfile as DelayProfile
+from .estimators.delay_profile import DelayProfile as DelayProfile, InputModel as InputModel
 from .estimators.additive_output_error import AdditiveOutputError as AdditiveOutputError
 from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.loop_output_error import LoopOutputError as LoopOutputError
@@ -52,7 +52,7 @@ from .inference.fitted_model import FittedModel as FittedModel
 from .inference.model_responses import FrequencyBand as FrequencyBand, PoleBand as PoleBand
 from .inference.model_responses import ResponseBand as ResponseBand
 from .estimators.additive_srivc import AdditiveFit as AdditiveFit
-from .estimators.delay_profile import MeasuredFit as MeasuredFit
+from .estimators.delay_profile import MeasuredFit as MeasuredFit, MultiInputFit as MultiInputFit
 from .estimators.loop_output_error import LoopFit as LoopFit
 from .estimators.measured_submodels import SubmodelsFit as SubmodelsFit
 from .estimators.frequency_domain import FrequencyDomainFit as FrequencyDomainFit

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Format
 
 if TYPE_CHECKING:
@@ -91,10 +92,18 @@ class RecordOptions:
     """Which columns and which part of measured records are used."""
 
     time: TimeColumn = None
-    input: Annotated[str | None, flag("--input", "Column of the input.", "NAME")] = None
-    output: Annotated[str | None, flag("--output", "Column of the output.", "NAME")] = None
+    input: Annotated[list[str] | None, flag("--input", "Column of the input; repeatable.", "NAME")] = None
+    output: Annotated[list[str] | None, flag("--output", "Column of the output.", "NAME")] = None
     start: From = None
     stop: To = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of several inputs, else none."""
+        from ctid_cli.signals.measurement import input_name
+
+        several = self.input if self.input and len(self.input) > 1 else ()
+        return tuple(input_name(name) for name in several)
 
     def read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         """Read a record, between the instants that are given."""
@@ -103,7 +112,12 @@ class RecordOptions:
     def _read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         from ctid_cli.signals.measurement import read_measurement
 
-        return read_measurement(file, time=self.time, input=self.input, output=self.output, hold=hold, **others)
+        if self.output and len(self.output) > 1:
+            raise UsageError(
+                f"--output is given {len(self.output)} times, and models have one output: fit one --output at a time"
+            )
+        output = self.output[0] if self.output else None
+        return read_measurement(file, time=self.time, input=self.input or None, output=output, hold=hold, **others)
 
     def read_all(self, files: Sequence[Path], validate: Path | None, hold: Any, **others: Any) -> MeasuredRecords:
         """Read records, and one for validation from its beginning to its end; a DataError where their units differ."""

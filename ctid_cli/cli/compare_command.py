@@ -55,8 +55,10 @@ def _record(fit: StoredFit, file: Path, columns: RecordOptions, hold: Hold | Non
     from ctid_cli.signals.measurement import open_table
 
     own = fit.content["records"][0]["columns"]
-    if not (columns.time or columns.input or columns.output) and set(own.values()) <= set(open_table(file).names):
-        columns = replace(columns, time=own["time"], input=own["input"], output=own["output"])
+    inputs = own["input"] if isinstance(own["input"], list) else [own["input"]]
+    names = {own["time"], *inputs, own["output"]}
+    if not (columns.time or columns.input or columns.output) and names <= set(open_table(file).names):
+        columns = replace(columns, time=own["time"], input=inputs, output=[own["output"]])
     found = columns.read(file, hold or fit.content["settings"]["hold"])
     units = {"time": found.time_unit, "input": found.input_unit, "output": found.output_unit}
     fit.units.require_same(found.record.name, units)

@@ -101,7 +101,7 @@ def fit(
     offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
     writes, needs --poles.
     """
-    asked = Asked(model, treatment, loop.use)
+    asked = Asked(model, treatment, loop.use, columns.names)
     read = [*files, *([judging.validate] if judging.validate else [])]
     refuse_overwriting(read, [writing.out / "fit.json", *([writing.csv / "step.csv"] if writing.csv else [])])
     if frequency_files(files):
@@ -126,7 +126,7 @@ def _fit_of_records(
     options = options_of(asked)
     if asked.single and len(files) > 1:
         raise UsageError(f"{len(files)} files are given, and a record in a loop is fitted alone; give one file")
-    hold = "zoh" if asked.treatment.hold == "auto" else asked.treatment.hold
+    hold = "zoh" if asked.hold == "auto" else asked.hold
     records = columns.read_all(files, judging.validate, hold, reference=loop.reference).treated(loop.applied)
     judging.check(asked.treatment.noise, {record.name: record.n_samples for record in records.all})
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)) as progress:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar, cast, get_args
 
 from ctid_cli.cli._common import span
 from ctid_cli.cli._options import flag
 from ctid_cli.errors import UsageError
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset, Weight
+from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset, Weight
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
     from ctid_cli.estimation.common import Fixed
     from ctid_cli.estimators.additive_output_error import AdditiveOutputError
+    from ctid_cli.estimators.delay_profile import InputModel
     from ctid_cli.estimators.loop_output_error import LoopOutputError
     from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
     from ctid_cli.identification.choice import Given
@@ -35,6 +36,7 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
+T = TypeVar("T")
 HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; else chosen.")]
 
 
@@ -42,24 +44,73 @@ HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; els
 
 
 @dataclass(frozen=True)
+class PerInput(Generic[T]):
+    """What an option says of all inputs, and of single ones."""
+
+    shared: T | None
+    own: dict[str, T]
+
+
+def per_input(option: str, given: Sequence[str] | None, read: Callable[[str], T]) -> PerInput[T]:
+    """Read an option that is given for all inputs, or as INPUT=VALUE for single ones."""
+    shared: T | None = None
+    own: dict[str, T] = {}
+    for text in given or ():
+        name, equals, value = (part.strip() for part in text.rpartition("="))
+        try:
+            found = read(value)
+        except ValueError:
+            what = f"{option} must be a whole number, or INPUT=NUMBER for one of several inputs"
+            raise UsageError(f"{what}; got {text!r}") from None
+        if (equals and name in own) or (not equals and shared is not None):
+            raise UsageError(f"{option} is given twice{f' for {name}' * bool(equals)}; give it once")
+        if equals:
+            own[name] = found
+        else:
+            shared = found
+    return PerInput(shared, own)
+
+
+def delay_range(text: str) -> tuple[float, float]:
+    """Read a range of the delay; a known one is one value, which is both ends."""
+    bounds = span(text, float)
+    if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
+        return bounds
+    allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
+    raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {text!r}")
+
+
+def read_hold(text: str) -> AskedHold:
+    """Read how an input behaves between its samples."""
+    found = next((hold for hold in get_args(AskedHold) if hold == text), None)
+    if found is None:
+        allowed = f"{', '.join(get_args(AskedHold))}, or INPUT=HOLD for one of several inputs"
+        raise UsageError(f"--hold must be one of {allowed}; got {text!r}")
+    return cast(AskedHold, found)
+
+
+@dataclass(frozen=True)
 class StructureOptions:
     """Range of the delay, and poles at the origin."""
 
-    delay: Annotated[str | None, flag("--delay", "Range or value [time unit]; else chosen.", "LOW:HIGH|VALUE")] = None
-    integrators: Annotated[
-        int | None, flag("--integrators", "Additional poles at the origin (of a sum: in its first submodel).")
+    delays: Annotated[
+        list[str] | None,
+        flag("--delay", "Range or value [time unit]; else chosen. INPUT=: of one input.", "[INPUT=]LOW:HIGH|VALUE"),
+    ] = None
+    each_integrators: Annotated[
+        list[str] | None,
+        flag("--integrators", "Additional poles at the origin (of a sum: in its first submodel).", "[INPUT=]N"),
     ] = None
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Range of the delay, a known one twice; None where it is not given."""
-        if self.delay is None:
-            return None
-        bounds = span(self.delay, float)
-        if bounds is not None and 0 <= bounds[0] <= bounds[1] < float("inf"):
-            return bounds
-        allowed = "LOW:HIGH, a range to search, or one known VALUE, in the record's unit of time and not negative"
-        raise UsageError(f"--delay must be {allowed}, for example 0:2 or 0.3; got {self.delay!r}")
+        """Range of the delay, a known one twice; None where it is not given for all inputs."""
+        return per_input("--delay", self.delays, delay_range).shared
+
+    @property
+    def integrators(self) -> int | None:
+        """Poles at the origin; None where they are not given for all inputs."""
+        return per_input("--integrators", self.each_integrators, int).shared
 
 
 @dataclass(frozen=True)
@@ -89,8 +140,17 @@ class TreatmentOptions:
 class ModelOptions(StructureOptions):
     """What the model is: one transfer function or a sum of submodels, its degrees, delay, and known parameters."""
 
-    poles: Annotated[int | None, flag("--poles", "Poles, 1 to 12 (0 with --integrators); else chosen.")] = None
-    zeros: Annotated[int | None, flag("--zeros", "Zeros, fewer than poles; else chosen.")] = None
+    each_poles: Annotated[
+        list[str] | None,
+        flag(
+            "--poles",
+            "Poles, 1 to 12 (0 with --integrators); else chosen. INPUT=N: denominators of their own.",
+            "[INPUT=]N",
+        ),
+    ] = None
+    each_zeros: Annotated[list[str] | None, flag("--zeros", "Zeros, fewer than poles; else chosen.", "[INPUT=]N")] = (
+        None
+    )
     model: Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")] = "fraction"
     terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel.", "P/Z,P/Z,...")] = None
     fix: Annotated[list[str] | None, flag("--fix", "Hold a parameter; repeatable.", "NAME=VALUE")] = None
@@ -126,6 +186,16 @@ class ModelOptions(StructureOptions):
                 raise UsageError(f"--terms must be {allowed}; got {parts!r}")
             found.append(Term(int(degrees[1]), int(degrees[2] or 0), 0 if found else self.integrators or 0))
         return tuple(found)
+
+    @property
+    def poles(self) -> int | None:
+        """Number of poles; None where it is not given for all inputs."""
+        return per_input("--poles", self.each_poles, int).shared
+
+    @property
+    def zeros(self) -> int | None:
+        """Number of zeros; None where it is not given for all inputs."""
+        return per_input("--zeros", self.each_zeros, int).shared
 
 
 @dataclass(frozen=True)
@@ -184,7 +254,10 @@ class FitOptions(TreatmentOptions):
 
     loss: Annotated[LossKind, flag("--loss", "Loss function of the output errors.")] = "squares"
     noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
-    hold: HoldOption = "auto"
+    each_hold: Annotated[
+        list[str] | None,
+        flag("--hold", "Input between its samples; else chosen.", "[INPUT=]auto|zoh|foh|band-limited"),
+    ] = None
     weight: Annotated[Weight | None, flag("--weight", "Weights of a frequency response without standard errors.")] = (
         None
     )
@@ -201,6 +274,20 @@ class Asked:
     treatment: FitOptions
     #: What of the loop that the record was taken in counts.
     loop: LoopUse = "none"
+    #: Names of several inputs, else empty.
+    inputs: tuple[str, ...] = ()
+
+    @property
+    def hold(self) -> AskedHold | tuple[Hold, ...]:
+        """How the inputs behave between their samples; where one is given by itself, that of each."""
+        given = per_input("--hold", self.treatment.each_hold, read_hold)
+        if not given.own:
+            return given.shared or "auto"
+        each = [given.own.get(name, given.shared or "zoh") for name in self.inputs]
+        found = tuple(hold for hold in each if hold != "auto")
+        if len(found) < len(each):
+            raise UsageError("--hold auto chooses one for all inputs; give INPUT=zoh, foh or band-limited")
+        return found
 
     @property
     def simulated(self) -> bool:
@@ -237,10 +324,11 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
     if treatment.weight is not None:
         raise UsageError("--weight is for a frequency response; the samples of a record weigh the same, drop --weight")
     _refuse_other_form(asked)
+    _refuse_inputs(asked)
     for wrong, option, remedy in _unavailable(asked) if asked.single else ():
         if wrong:
             raise UsageError(f"{option} is not available for {_what(asked)}; {remedy}")
-    needing = [("--loop", asked.simulated), ("--reference", asked.iterated), ("--fix", bool(model.fix))]
+    needing = [("--loop", asked.simulated), ("--reference", asked.iterated)]
     for option in [name for name, given in needing if given][:1] if model.terms is None and model.poles is None else ():
         raise UsageError(f"--poles is missing: with {option} it must be given")
     state: Any = treatment.initial_state or "rest"
@@ -264,13 +352,33 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
         if model.model == "additive":
             known: Any = {"fixed": model.fixed, "input_before": treatment.level, "noise_model": treatment.noise}
             return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss, **known)
+    return _given(asked)
+
+
+def _given(asked: Asked) -> Given:
+    """Return what is given of the choice, and of each of several inputs; its delay may be known by ``--fix`` too."""
+    model, treatment = asked.model, asked.treatment
+    delays = tuple(f"{name}_delay=" for name in asked.inputs)
+    known = [text for text in model.fix or () if delays and text.startswith(delays)]
+    model = replace(
+        model,
+        fix=[text for text in model.fix or () if text not in known] or None,
+        delays=[*(model.delays or ()), *(text.replace("_delay=", "=", 1) for text in known)] or None,
+    )
+    inputs = inputs_of(model, asked.inputs)
+    own_poles = [one.poles for one in inputs or () if one.poles is not None]
+    own_zeros = any(one.zeros is not None for one in inputs or ())
+    poles = model.poles if model.poles is not None else max(own_poles, default=None)
+    for option, needed in {"--fix": bool(model.fix), "the zeros of single inputs": own_zeros}.items():
+        if needed and poles is None:
+            raise UsageError(f"--poles is missing: with {option} it must be given")
     # The names of known parameters are those of a number of zeros.
-    zeros = 0 if model.fix and model.zeros is None else model.zeros
-    given = replace(given_of(model, treatment, treatment.hold), poles=model.poles, zeros=zeros, fixed=model.fixed)
-    return replace(given, loss=treatment.loss, noise_model=treatment.noise)
+    zeros = 0 if model.zeros is None and (model.fix or own_poles or own_zeros) else model.zeros
+    given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed)
+    return replace(given, loss=treatment.loss, noise_model=treatment.noise, inputs=inputs)
 
 
-def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold) -> Given:
+def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: AskedHold | tuple[Hold, ...]) -> Given:
     """Return what is given of the choice."""
     from ctid_cli.identification.choice import Given
 
@@ -284,6 +392,50 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
         input_before=treatment.level,
         hold=hold,
     )
+
+
+def inputs_of(model: ModelOptions, names: Sequence[str]) -> tuple[InputModel, ...] | None:
+    """Return what is given of each of several inputs."""
+    from ctid_cli.estimators.delay_profile import InputModel
+
+    each: dict[str, PerInput[Any]] = {
+        "poles": per_input("--poles", model.each_poles, int),
+        "zeros": per_input("--zeros", model.each_zeros, int),
+        "delay_bounds": per_input("--delay", model.delays, delay_range),
+        "integrators": per_input("--integrators", model.each_integrators, int),
+    }
+    if not names:
+        return None
+    poles = each["poles"]
+    missing = [name for name in names if name not in poles.own]
+    if poles.own and poles.shared is None and missing:
+        raise UsageError(f"--poles is given for {', '.join(poles.own)} and not for {', '.join(missing)}")
+    return tuple(
+        InputModel(name, **{field: one.own[name] for field, one in each.items() if name in one.own}) for name in names
+    )
+
+
+def _refuse_inputs(asked: Asked) -> None:
+    """Options of single inputs that the record does not have, and what is not available for several."""
+    model = asked.model
+    for option, texts in (
+        ("--poles", model.each_poles),
+        ("--zeros", model.each_zeros),
+        ("--delay", model.delays),
+        ("--integrators", model.each_integrators),
+        ("--hold", asked.treatment.each_hold),
+    ):
+        for text in texts or ():
+            name, equals, _ = text.rpartition("=")
+            if equals and name not in asked.inputs:
+                named = f"the inputs are {', '.join(asked.inputs)}" if asked.inputs else "name several with --input"
+                raise UsageError(f"{option} {text} is for an input {name!r}; {named}")
+    if len(asked.inputs) > 1 and asked.model.model == "additive":
+        raise UsageError("--model additive has one input; give one --input, or drop --model")
+    if len(asked.inputs) > 1 and asked.loop != "none":
+        raise UsageError(
+            "a record in a loop is fitted with one input; give one --input, or drop --loop and --reference"
+        )
 
 
 def check_integrators(integrators: int, offset: Offset, instead: str = "--offset") -> None:
@@ -326,7 +478,7 @@ def _what(asked: Asked) -> str:
 def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     """Yield what submodels and simulated loops cannot do: whether it is asked for, the option, and a remedy."""
     model, treatment = asked.model, asked.treatment
-    state, offset, hold = treatment.initial_state, treatment.offset, treatment.hold
+    state, offset, hold = treatment.initial_state, treatment.offset, asked.hold
     low, high = model.bounds or (0.0, 0.0)
     yield treatment.input_before is not None, "--input-before", "use --initial-state estimate"
     yield treatment.loss != "squares", f"--loss {treatment.loss}", "drop --loss"
@@ -341,6 +493,6 @@ def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
         return
     controller = "; with the controller (--loop FILE) it can be searched" * (asked.loop == "reference")
     one_value = f"the delay must be known: give one value, --delay VALUE{controller}"
-    yield low < high, f"a search of the delay (--delay {model.delay})", one_value
+    yield low < high, f"a search of the delay (--delay {low:g}:{high:g})", one_value
     yield offset in ("estimate", "drift"), f"--offset {offset}", "use --offset remove"
     yield hold not in ("auto", "zoh"), f"--hold {hold}", "a discrete controller holds its input: use zoh"

@@ -76,7 +76,7 @@ def _of_records(
         "--offset": (treatment.offset, "an offset is a line at frequency 0; leave that line out"),
         "--loss": (treatment.loss != "squares" or None, "lines are fitted by weighted squares"),
         "--noise": (treatment.noise != "white" or None, noise),
-        "--hold": (treatment.hold != "auto" or None, "the file says it, in a comment '# hold: zoh'"),
+        "--hold": (treatment.each_hold, "the file says it, in a comment '# hold: zoh'"),
         "--loop": (loop.loop, "a response that was measured in a loop is taken as it is"),
         "--reference": (loop.reference, "a response that was measured in a loop is taken as it is"),
         "--direct": (loop.direct or None, "a response that was measured in a loop is taken as it is"),

@@ -235,17 +235,19 @@ def check_record(record: Record, data: FilterData, parameters: int, free_respons
     if data.count <= parameters:
         what = f"{named(record)}{data.count} usable samples are too few for {parameters} parameters"
         raise DataError(f"{what}; take a longer record, a smaller model, or a smaller largest delay")
-    if np.ptp(record.input.values) == 0.0:
+    signals = record.held.values()
+    if not any(np.ptp(signal.values) for signal in signals):
         if free_response:
             return
-        raise DataError(f"{named(record)}the input is constant ({record.input.values[0]:g}): it excites nothing")
+        first = next(iter(signals)).values[0]
+        raise DataError(f"{named(record)}the input is constant ({first:g}): it excites nothing")
     if np.ptp(data.y_used) == 0.0:
         raise DataError(f"{named(record)}the output is constant ({data.y_used[0]:g}) over the usable samples")
 
 
 def check_greatest_delay(record: Record, greatest: float) -> None:
     """Refuse a delay that may last as long as the record."""
-    duration = record.t[-1] - record.input.t[0]
+    duration = record.t[-1] - max(signal.t[0] for signal in record.held.values())
     if greatest >= duration:
         delay = f"{named(record)}the greatest delay, {greatest:g} s,"
         raise DataError(f"{delay} is not shorter than the record, {duration:g} s")

@@ -4,9 +4,10 @@ import numpy as np
 
 from ctid_cli.arrays import BoolArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.measured_records import Layout, MeasuredRecords, Treatment
+from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.frequency_data import FrequencyData
@@ -26,9 +27,9 @@ class MeasuredLines(MeasuredRecords):
         integrators: int = 0,
         known: KnownCoefficients = NOTHING,
     ) -> None:
-        self.source, self.structure, self.known = source, structure, known
-        self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=integrators)
-        self.layout = Layout(structure, integrators=integrators)
+        self.source, self.known = source, known
+        self.treatment = Treatment(delay_bounds, "rest", "none", "foh", integrators=(integrators,))
+        self.layout = Layout(Degrees.of(structure, integrators))
         self.records, self.input_offsets, self.offsets = [], [0.0], [0.0]
         self.lines = lines_of(source)
         self.outputs = [self.lines.y_used]
@@ -43,7 +44,7 @@ class MeasuredLines(MeasuredRecords):
                 f"{what}{count} real equations are too few for {size} parameters; give more frequencies, or fit a "
                 "smaller model"
             )
-        if self.treatment.integrators and self.lines.frequencies[0] == 0.0:
+        if any(self.treatment.integrators) and self.lines.frequencies[0] == 0.0:
             raise DataError(
                 f"{what}a system with integrators has no value at frequency 0; leave that line out, or fit without "
                 "integrators"

@@ -27,150 +27,120 @@ from ctid_cli.estimation.optimum.best_model import (
     most_active_parts,
     poles_of_submodels,
 )
-from ctid_cli.estimation.optimum.box import ANYWHERE, point_of
-from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, chains_dynamics, numerators
+from ctid_cli.estimation.optimum.box import ANYWHERE, Bounds, each_bounds, point_of
+from ctid_cli.estimation.optimum.chain import Chain, block_diagonal, numerators
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.search import local_minimum
-from ctid_cli.estimation.optimum.triangle import Columns, rows_of
+from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of
+from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
 from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
-from ctid_cli.inference.sensitivities import Model, Structure, SumStructure
+from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.inference.signal_features import outliers
 from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.several_inputs import AnyModel, delays_of, fractions_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
-#: Parameters of the powers of time that the output has beside the response.
-TREND_NAMES = ("offset", "drift", "drift2", "drift3")
 #: Random starts, this number and as many again for each pole.
 RANDOM_STARTS = 2
+#: Inputs are collinear if a combination of them, each of length one, is shorter than this; those with more than so
+#: large a share in it are named.
+COLLINEAR, INVOLVED = 1e-6, 1e-3
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Which numbers stand where in the parameter vector: coefficients, delay, then each experiment's own."""
-
-    structure: Structure | SumStructure
-    experiments: int = 1
-    initial_state: bool = False
-    #: Powers of time.
-    trend: tuple[int, ...] = ()
-    #: Poles at the origin: that many of the last coefficients of the denominator are zero.
-    integrators: int = 0
-
-    @property
-    def own(self) -> int:
-        """Number of parameters that belong to one experiment."""
-        return self.structure.poles * self.initial_state + len(self.trend)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.structure.size + self.experiments * self.own
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Parameter names; those of an experiment end in its number where there are several."""
-        names = list(self.structure.names)
-        for k in range(self.experiments):
-            tail = f"_{k + 1}" if self.experiments > 1 else ""
-            names += [f"x{i}{tail}" for i in range(1, self.structure.poles + 1)] * self.initial_state
-            names += [f"{TREND_NAMES[power]}{tail}" for power in self.trend]
-        return tuple(names)
-
-    def theta(self, model: Model) -> Array:
-        """The parameters of a model of this structure, and zeros for what belongs to the experiments."""
-        return np.concatenate((self.structure.theta_of(model), np.zeros(self.experiments * self.own)))
-
-    def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
-        """Initial state and offset of one experiment."""
-        first = self.first(experiment)
-        own = theta[first : first + self.own]
-        states = self.structure.poles * self.initial_state
-        return own[:states], float(own[states]) if self.trend[:1] == (0,) else 0.0
-
-    def first(self, experiment: int) -> int:
-        """Where the parameters of an experiment begin."""
-        return self.structure.size + experiment * self.own
-
-
-def sensitivities(problem: Problem, layout: Layout, theta: Array, delay: float) -> list[tuple[Array, Array]]:
+def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]) -> list[tuple[Array, Array]]:
     """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
 
-    The delay is that of theta where it is a parameter. The last coefficients of the denominator are zero where the
+    The delays are those of theta where they are parameters. The last coefficients of a denominator are zero where the
     problem has integrators.
     """
-    structure, n = layout.structure, layout.structure.poles
-    fractions, chain_rule = structure.fractions_of(theta)
-    shared = len(chain_rule)
-    delay = theta[structure.size - 1] if structure.delay else delay
-    terms, rows, powers, outputs, direct = problem.submodels(n).terms, [], [], [], np.zeros(len(fractions))
-    for k, ((b, a), term) in enumerate(zip(fractions, terms, strict=True)):
-        stable = np.roots(a[: term.poles + 1]).astype(complex)
-        point = point_of(stable, delay, ANYWHERE)
-        (sections,) = problem._replace(terms=(), integrators=term.integrators).rows(point.speed, point.damping)
-        rows.append(sections)
-        # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
-        powers.append(np.asarray(np.linalg.inv(numerators(*sections)), dtype=float))
-        if b.size == a.size:
-            direct[k], b = b[0], (b - b[0] * a)[1:]
-        outputs.append(np.concatenate((np.zeros(a.size - 1 - b.size), b)) @ powers[-1])
-    (F, g), output, free_powers = chains_dynamics(rows), np.concatenate(outputs), block_diagonal(powers)
-    columns = Columns.of(n, second=True, free=layout.initial_state, trend=layout.trend)
-    # Columns of the rows that are wanted, each a combination of the states, the input and what else stands there: first
-    # the derivatives to the coefficients of all monic fractions.
-    monic, by_a, first, column = np.zeros((columns.size, shared)), np.zeros((n, shared)), 0, 0
-    for (b, a), own in zip(fractions, powers, strict=True):
-        order, m = a.size - 1, b.size - 1
-        states = slice(first, first + order)
-        by_a[states, column : column + order] = -own.T
-        coefficients = np.column_stack((-own.T @ a[1:], own.T))[:, order - m :]
-        monic[states, column + order : column + order + m + 1] = coefficients
-        if m == order:
-            monic[columns.u, column + order] = 1.0
-        first, column = first + order, column + order + m + 1
-    monic[n : 2 * n] = by_a
-    count = chain_rule.shape[1]
-    common = np.zeros((columns.size, layout.size + 1))
-    common[:, :count] = monic @ chain_rule
-    if structure.delay:
-        common[:n, count], common[columns.u, count] = -(output @ F), -(output @ g)
-    common[:n, -1], common[columns.u, -1], common[columns.u + 1, -1] = -output, -direct.sum(), 1.0
+    degrees = layout.degrees
+    fractions, chain_rule = degrees.fractions_of(theta)
+    total, count = chain_rule.shape
+    places = [degrees.delay(k) for k in range(len(delays))]
+    seconds = [given if place is None else theta[place] for given, place in zip(delays, places, strict=True)]
+    arrangement = problem.arranged(degrees.poles - sum(problem.each_integrators))
+    columns = Columns.of(arrangement, True, layout.initial_state, layout.trend)
+    # Columns of the rows that are wanted, each a combination of the states, the inputs and what else stands there:
+    # first the derivatives to the coefficients of all monic fractions.
+    monic = np.zeros((columns.size, total))
+    common, free = np.zeros((columns.size, layout.size + 1)), np.zeros((columns.size, total))
+    forms, to_powers, column = list[tuple[Chain, Array, Array]](), np.zeros((arrangement.order,) * 2), 0
+    for k, channel in enumerate(arrangement.channels):
+        rows, powers, outputs, direct, first = [], list[Array](), [], np.zeros(len(channel.terms)), 0
+        states, driven = monic[columns.z(k)], monic[columns.states(k)][channel.order :]
+        alone = free[columns.free_states(columns.free.index(k))] if k in columns.free else np.zeros_like(free)
+        for place, term in enumerate(channel.terms):
+            (b, a), fractions = fractions[0], fractions[1:]
+            order, m = a.size - 1, b.size - 1
+            own, at = slice(first, first + order), slice(column, column + order)
+            rows.append(_sections_of(a, term.integrators, problem))
+            # From the states to p^(n-1)/A ... 1/A. With n zeros B/A = b0 + B'/A, and p^n/A u = u - sum a_i p^(n-i)/A u.
+            powers.append(np.asarray(np.linalg.inv(numerators(*rows[-1])), dtype=float))
+            turned = powers[-1].T
+            driven[own, at] = -turned
+            alone[channel.order :][own, at] = -turned
+            states[own, at.stop : at.stop + m + 1] = np.column_stack((-turned @ a[1:], turned))[:, order - m :]
+            if m == order:
+                monic[columns.u(k), at.stop] = 1.0
+                direct[place], b = b[0], (b - b[0] * a)[1:]
+            outputs.append(np.concatenate((np.zeros(order - b.size), b)) @ powers[-1])
+            first, column = first + order, at.stop + m + 1
+        form, output = Chain.of(rows), np.concatenate(outputs)
+        forms.append((form, output, direct))
+        to_powers[channel.states, channel.states] = block_diagonal(powers)
+        if (delay := places[channel.input]) is not None:
+            common[columns.z(k), delay] = -(output @ form.dynamics)
+            common[columns.u(k), delay] = -(output @ form.gain)
+        common[columns.z(k), -1], common[columns.u(k), -1] = -output, -direct.sum()
+    common[:, :count] += (monic + free) @ chain_rule
+    common[columns.y, -1] = 1.0
     result = []
-    for k, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
-        first = layout.first(k)
-        own = theta[first : first + layout.own]
-        state = own[:n] if layout.initial_state else np.zeros(n)
-        form = Chain(rows, F, g, F, g).driving(output, direct, state @ free_powers)
+    for record, (data, period) in enumerate(zip(problem.records, problem.periods, strict=True)):
+        first = layout.first(record)
+        own_values = theta[first : first + layout.own]
+        n = arrangement.order
+        state = (own_values[:n] if layout.initial_state else np.zeros(n)) @ to_powers
+        each = zip(forms, arrangement.channels, strict=True)
+        driving = [form.driving(output, direct, state[one.states]) for (form, output, direct), one in each]
         wanted = common.copy()
-        if layout.initial_state:
-            alone, driven_alone = wanted[columns.free_states][:n], wanted[columns.free_states][n:]
-            driven_alone[:, :count] = by_a @ chain_rule
-            alone[:, first : first + n] = free_powers.T
+        for number, k in enumerate(columns.free):
+            own = arrangement.channels[k].states
+            wanted[columns.free_z(number), first + own.start : first + own.stop] = to_powers[own, own].T
         wanted[columns.powers, first + layout.own - len(layout.trend) : first + layout.own] = np.eye(len(layout.trend))
-        wanted[:, -1] -= wanted[:, first : first + layout.own] @ own
-        found = np.vstack([part.T @ wanted for part in rows_of(form, columns, point.delay, data, period)])
+        wanted[:, -1] -= wanted[:, first : first + layout.own] @ own_values
+        parts = rows_of(driving, columns, tuple(Delay(float(tau), -1) for tau in seconds), data, period)
+        found = np.vstack([part.T @ wanted for part in parts])
         result.append((found[:, :-1], found[:, -1].copy()))
     return result
+
+
+def _sections_of(denominator: Array, integrators: int, problem: Problem) -> tuple[Array, Array]:
+    """Return the sections of a denominator, whose last coefficients are zero where it has integrators."""
+    stable = np.roots(denominator[: denominator.size - integrators]).astype(complex)
+    point = point_of(stable, 0.0, ANYWHERE)
+    (sections,) = problem._replace(terms=(), integrators=integrators).rows(point.speed, point.damping)
+    return sections
 
 
 class Treatment(NamedTuple):
     """How records are laid out."""
 
-    delay_bounds: tuple[float, float]
+    delay_bounds: Bounds
     initial_state: InitialState
     offset: Offset
     hold_output: OutputHold
     #: Whether samples far from their neighbours are bridged while the search looks for starts.
     bridge: bool = False
-    #: Poles at the origin, counted among those of the structure.
-    integrators: int = 0
+    #: Poles at the origin, counted among those of the structure; of each denominator.
+    integrators: tuple[int, ...] = (0,)
     #: Input before the first sample of a record that begins at rest [input unit].
     input_before: InputBefore = None
 
@@ -196,19 +166,19 @@ class MeasuredRecords:
     def __init__(
         self,
         records: Sequence[Record],
-        structure: Structure | SumStructure,
+        structure: Structure | Degrees | SumDegrees,
         treatment: Treatment,
         known: KnownCoefficients = NOTHING,
     ) -> None:
         if not records:
             raise DataError("there is no record to estimate from")
-        self.structure = structure
         self.treatment, self.known = treatment, known
-        free_state, integrators = treatment.initial_state == "estimate", treatment.integrators
+        free_state, integrators = treatment.initial_state == "estimate", max(treatment.integrators)
+        degrees = Degrees.of(structure, integrators) if isinstance(structure, Structure) else structure
         # Integrators make powers of time of an offset of their input; the lower ones are their free responses.
         highest = {"estimate": integrators, "drift": 1}.get(treatment.offset, -1)
         trend = tuple(range(integrators if free_state else 0, highest + 1))
-        self.layout = Layout(structure, len(records), free_state, trend, integrators)
+        self.layout = Layout(degrees, len(records), free_state, trend)
         for record in records:
             self._check_input(record)
         removed = treatment.offset == "remove"
@@ -216,8 +186,10 @@ class MeasuredRecords:
         level = treatment.input_before
         centred = [without_means(record) if removed else above_level(record, level) for record in bridged]
         self.records = [one for one, _, _ in centred]
-        self.input_offsets = [u0 for _, u0, _ in centred]
+        self.input_offsets = [u0 for _, levels, _ in centred for u0 in levels]
         self.offsets = [y0 for _, _, y0 in centred]
+        for record in self.records if degrees.several else ():
+            refuse_collinear(record)
         self.data = [self._lay_out(record) for record in self.records]
         for record, data in zip(self.records, self.data, strict=True):
             may_be_constant = self.layout.initial_state or treatment.input_before is not None
@@ -231,44 +203,72 @@ class MeasuredRecords:
         """Highest frequency that matters in an output [rad/s]."""
         return max(output_bandwidth(record) for record in self.records)
 
-    def with_structure(self, structure: Structure) -> "MeasuredRecords":
-        """The same records for another model."""
+    @property
+    def degrees(self) -> Degrees | SumDegrees:
+        """Degrees of the model."""
+        return self.layout.degrees
+
+    @property
+    def structure(self) -> Structure | SumStructure:
+        """Degrees of a sum, or of the transfer function of the first input."""
+        return self.degrees.structure
+
+    def with_degrees(self, poles: int, zeros: Sequence[int]) -> "MeasuredRecords":
+        """The same records for a common denominator, integrators among its poles, and numerators of other degrees."""
         other = copy(self)
-        other.structure = structure
-        other.layout = replace(self.layout, structure=structure)
-        other.problem = self.problem._replace(zeros=structure.zeros)
+        assert isinstance(self.degrees, Degrees)
+        degrees = replace(self.degrees, orders=(poles,), zeros=tuple(zeros))
+        other.layout = replace(self.layout, degrees=degrees)
+        other.problem = self.problem._replace(**degrees.asked)
         return other
 
     @property
     def plain(self) -> bool:
         """Whether there is but one record and nothing of its own to be estimated."""
-        treatment = self.treatment
-        if isinstance(self.structure, SumStructure):
+        treatment, degrees = self.treatment, self.degrees
+        if isinstance(degrees, SumDegrees):
             return False
-        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not treatment.integrators
-        return from_rest and len(self.data) == 1 and self.structure.zeros < self.structure.poles
+        from_rest = self.layout.own == 0 and treatment.initial_state != "periodic" and not any(treatment.integrators)
+        single = len(self.data) == 1 and not degrees.several
+        return from_rest and single and max(degrees.zeros) < degrees.poles
 
     def _check_input(self, record: Record) -> None:
         """Refuse what an input cannot tell."""
-        low, high = self.treatment.delay_bounds
-        if high > 0:
-            check_greatest_delay(record, high)
-        first, before = float(record.input.values[0]), self.treatment.input_before
-        if np.ptp(record.input.values) > 0.0 or before not in (None, "first", first):
-            return
-        if low < high or self.treatment.initial_state != "estimate":
+        if tuple(record.held) != self.degrees.inputs and self.degrees.several:
             raise DataError(
-                f"{named(record)}the input is constant ({first:g}) over the whole record; if the record begins with "
-                "its step, give the level of the input before it: input_before (--input-before VALUE)"
+                f"{named(record)}the inputs are {', '.join(record.held)}, and those of the model are "
+                f"{', '.join(self.degrees.inputs)}"
             )
+        if record.several and (record.loop is not None or record.feedback):
+            raise DataError(f"{named(record)}a record in a loop is fitted with one input; give one")
+        before = self.treatment.input_before
+        for (name, signal), (low, high) in zip(
+            record.held.items(), each_bounds(self.treatment.delay_bounds), strict=True
+        ):
+            if high > 0:
+                check_greatest_delay(record, high)
+            first = float(signal.values[0])
+            if np.ptp(signal.values) > 0.0 or before not in (None, "first", first):
+                continue
+            if low < high or self.treatment.initial_state != "estimate":
+                raise DataError(
+                    f"{named(record)}the input {f'{name} ' * record.several}is constant ({first:g}) over the whole "
+                    "record; if the record begins with its step, give the level of the input before it: input_before "
+                    "(--input-before VALUE)"
+                )
 
     def _lay_out(self, record: Record) -> FilterData:
         # At rest the input before the record is known to be zero, whatever the delay, and that of a periodic record is
         # known too; otherwise it is not known.
         treatment = self.treatment
-        known_after = treatment.delay_bounds[1] if treatment.initial_state == "estimate" else 0.0
+        known_after = self.greatest_delay if treatment.initial_state == "estimate" else 0.0
         periodic = treatment.initial_state == "periodic"
         return filter_data(record, known_after, treatment.hold_output, periodic=periodic)
+
+    @property
+    def greatest_delay(self) -> float:
+        """The greatest delay of all inputs [s]."""
+        return max(high for _, high in each_bounds(self.treatment.delay_bounds))
 
     @cached_property
     def problem(self) -> Problem:
@@ -278,22 +278,20 @@ class MeasuredRecords:
             data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
         else:
             periods, data = (0.0,) * len(self.data), tuple(self.data)
-        layout, integrators = self.layout, self.treatment.integrators
-        terms = self.structure.terms if isinstance(self.structure, SumStructure) else ()
-        free, trend = layout.initial_state, layout.trend
-        return Problem(data, self.structure.zeros, free, trend, periods, integrators=integrators, terms=terms)
+        layout, asked = self.layout, dict(self.degrees.asked)
+        return Problem(data, asked.pop("zeros"), layout.initial_state, layout.trend, periods, **asked)
 
     def part(self) -> "MeasuredRecords | None":
         """The most active parts of long records, each from a state of its own; None where they tell too little."""
         treatment = self.treatment
-        parts = most_active_parts(self.data, treatment.delay_bounds[1])
+        parts = most_active_parts(self.data, self.greatest_delay)
         if parts is None or treatment.initial_state == "periodic":
             return None
         offset: Offset = "none" if treatment.offset == "remove" else treatment.offset
         cut = [_cut(record, part) for record, part in zip(self.records, parts, strict=True)]
         with suppress(DataError):
             own = treatment._replace(initial_state="estimate", offset=offset, bridge=False, input_before=None)
-            return MeasuredRecords(cut, self.structure, own)
+            return MeasuredRecords(cut, self.degrees, own)
         return None
 
     @cached_property
@@ -350,19 +348,21 @@ class MeasuredRecords:
     def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
         """The least output error from denominators and delays, and if nested of smaller models and at random too.
 
-        Of a sum a start has the poles of its submodels, and sums grow term by term in any case. A profile under an
+        Of several denominators a start has the poles, and sums grow term by term in any case. A profile under an
         unknown initial state, an offset or a period has too few basins: smaller models help then.
         """
+        random_starts = RANDOM_STARTS if nested or self.plain else 0
         if self.problem.terms:
-            return best_sum(self.problem, self.treatment.delay_bounds, starts, known=self.known)
+            bounds, known = self.treatment.delay_bounds, self.known
+            return best_sum(self.problem, bounds, starts, known=known, random_starts=random_starts)
         return best_output_error(
             self.problem,
-            self.structure.poles - self.problem.integrators,
+            self.degrees.poles - self.problem.integrators,
             self.treatment.delay_bounds,
             starts,
             nested=nested or not self.plain or self.known is not NOTHING,
             fewer_poles=nested,
-            random_starts=RANDOM_STARTS if nested or self.plain else 0,
+            random_starts=random_starts,
             known=self.known,
         )
 
@@ -373,10 +373,14 @@ class MeasuredRecords:
         poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
         return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
 
+    def model(self, found: Optimum) -> AnyModel:
+        """The model of an optimum; a sum as one transfer function."""
+        return self.degrees.model(found)
+
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
         """Which numbers an optimum has, and what they are."""
-        layout = self.layout_of(found.model.order, self.structure.delay)
-        theta = layout.theta(found.additive or found.model)
+        layout = self.layout_of(self.model(found))
+        theta = layout.theta(found.additive or self.model(found))
         for k in range(layout.experiments):
             state, first = found.free_responses[k] if layout.initial_state else (), layout.first(k)
             theta[first : first + layout.own] = [*state, *found.trends[k]]
@@ -384,20 +388,25 @@ class MeasuredRecords:
 
     def simulated(self, found: Optimum) -> list[Array]:
         """Outputs of an optimum at the used samples of each record."""
-        parts = sensitivities(self.problem, *self.parameters(found), found.model.delay)
+        parts = sensitivities(self.problem, *self.parameters(found), found.delays)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
-    def squared_error_at(self, model: Model, delay: float) -> float:
-        """Least sum of squared output errors at a given delay, in the basin of a model."""
-        return local_minimum(
-            self.problem, self.free_poles(model), delay, (delay, delay), known=self.known
-        ).squared_error
+    def squared_error_at(self, model: AnyModel | AdditiveModel, delay: float, k: int = 0) -> float:
+        """Least sum of squared output errors at a given delay of an input, in the basin of a model."""
+        delays = delays_of(model)
+        delays[k] = delay
+        bounds = tuple(
+            (delay, delay) if i == k else pair for i, pair in enumerate(each_bounds(self.treatment.delay_bounds))
+        )
+        poles = self.free_poles(model)
+        return local_minimum(self.problem, poles, delays, bounds, known=self.known).squared_error
 
-    def errors_of(self, model: Model) -> AppliedModel:
+    def errors_of(self, model: AnyModel | AdditiveModel) -> AppliedModel:
         """Errors of a given model on these records, each with its own best initial state and offset."""
-        layout = self.layout_of(model.order, delay=True)
+        free = [True] * len(delays_of(model))
+        layout = replace(self.layout, degrees=self.degrees.with_orders(model, free))
         theta, residuals = layout.theta(model), []
-        found = sensitivities(self.problem, layout, theta, model.delay)
+        found = sensitivities(self.problem, layout, theta, delays_of(model))
         for k, (psi, eps) in enumerate(found):
             own = slice(layout.first(k), layout.first(k) + layout.own)
             noises = self.problem.noises
@@ -408,34 +417,23 @@ class MeasuredRecords:
         slopes = tuple(psi for psi, _ in found)
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
-    def free_poles(self, model: Model) -> ComplexArray:
+    def free_poles(self, model: AnyModel | AdditiveModel) -> ComplexArray:
         """The poles of a model but its integrators."""
         if isinstance(model, AdditiveModel):
             return poles_of_submodels(model)
-        return np.roots(model.denominator[: model.denominator.size - self.problem.integrators]).astype(complex)
+        each = zip(fractions_of(model), self.problem.each_integrators, strict=False)
+        return np.concatenate(
+            [np.roots(one.denominator[: one.denominator.size - count]) for one, count in each]
+        ).astype(complex)
 
     @property
     def given(self) -> BoolArray:
-        """Which of the coefficients of the structure are known, those that integrators make zero among them."""
-        if isinstance(self.structure, SumStructure):
-            found = np.zeros(self.structure.size - int(self.structure.delay), dtype=bool)
-            if self.known is not NOTHING:
-                found[self.structure.denominators] = np.isfinite(self.known.denominator)
-                found[self.structure.numerators] = np.isfinite(self.known.numerator)
-            return found
-        zeros = self.structure.zeros + 1
-        if self.known is NOTHING:
-            free = self.structure.poles - self.problem.integrators
-            of_a, of_b = np.zeros(free, dtype=bool), np.zeros(zeros, dtype=bool)
-        else:
-            of_a, of_b = np.isfinite(self.known.denominator), np.isfinite(self.known.numerator)
-        return np.concatenate((of_a, np.ones(self.problem.integrators, dtype=bool), of_b))
+        """Which of the coefficients are known, those that integrators make zero among them."""
+        return self.degrees.given(self.known)
 
-    def layout_of(self, poles: int, delay: bool) -> Layout:
-        """Layout of the parameters for a number of poles, integrators among them; a sum has its own."""
-        if isinstance(self.structure, SumStructure):
-            return replace(self.layout, structure=replace(self.structure, delay=delay))
-        return replace(self.layout, structure=Structure(poles, self.structure.zeros, delay))
+    def layout_of(self, model: AnyModel | AdditiveModel) -> Layout:
+        """Layout of the parameters of a model, some of whose poles may be missing."""
+        return replace(self.layout, degrees=self.degrees.with_orders(model, self.degrees.delays))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
         """Initial states and offsets of the experiments, means that were subtracted included."""
@@ -456,27 +454,50 @@ def _bridged(record: Record) -> Record:
 
 def _cut(record: Record, part: slice) -> Record:
     """Some samples of a record whose input is known at them."""
-    t, signal = record.t[part], record.input
-    return Record(t, record.y[part], HeldSignal(t, signal.values[part], signal.hold), name=record.name)
+    t = record.t[part]
+    inputs = {name: HeldSignal(t, signal.values[part], signal.hold) for name, signal in record.held.items()}
+    return Record(t, record.y[part], inputs, name=record.name)
 
 
-def above_level(record: Record, before: InputBefore) -> tuple[Record, float, float]:
-    """Record whose input counts from the level before its first sample, that level, and zero for its output."""
-    signal = record.input
-    level = float(signal.values[0]) if before == "first" else float(before or 0.0)
-    if not level:
-        return record, 0.0, 0.0
-    return replace(record, input=HeldSignal(signal.t, signal.values - level, signal.hold)), level, 0.0
+def above_level(record: Record, before: InputBefore) -> tuple[Record, list[float], float]:
+    """Record whose inputs count from the levels before its first sample, these levels, and zero for its output."""
+    firsts = [float(signal.values[0]) for signal in record.held.values()]
+    levels = firsts if before == "first" else [float(before or 0.0)] * len(firsts)
+    return _lowered(record, levels), levels, 0.0
 
 
-def without_means(record: Record) -> tuple[Record, float, float]:
-    """Record less the mean of its output samples and the time average of its input."""
+def without_means(record: Record) -> tuple[Record, list[float], float]:
+    """Record less the mean of its output samples and the time averages of its inputs."""
     y0 = float(np.nanmean(record.y))
-    signal = record.input
-    u0 = float(np.mean(signal.at(record.t)))
-    centred = HeldSignal(signal.t, signal.values - u0, signal.hold)
+    means = [float(np.mean(signal.at(record.t))) for signal in record.held.values()]
     loop = record.loop and replace(record.loop, reference=record.loop.reference - record.loop.reference.mean())
-    return Record(record.t, record.y - y0, centred, name=record.name, loop=loop), u0, y0
+    return Record(record.t, record.y - y0, _lowered(record, means).inputs, name=record.name, loop=loop), means, y0
+
+
+def _lowered(record: Record, levels: Sequence[float]) -> Record:
+    """Record whose inputs are less by some levels."""
+    if not any(levels):
+        return record
+    pairs = zip(record.held.items(), levels, strict=True)
+    return replace(
+        record, inputs={name: HeldSignal(one.t, one.values - level, one.hold) for (name, one), level in pairs}
+    )
+
+
+def refuse_collinear(record: Record) -> None:
+    """Refuse inputs of which one is a combination of the others: nothing tells their responses apart."""
+    u = np.column_stack([signal.at(record.t) for signal in record.held.values()])
+    u = u - u.mean(axis=0)
+    lengths = np.linalg.norm(u, axis=0)
+    if not lengths.all():
+        return
+    _, values, right = np.linalg.svd(u / lengths, full_matrices=False)
+    if values[-1] < COLLINEAR * values[0]:
+        alike = [name for name, weight in zip(record.held, right[-1], strict=True) if abs(weight) > INVOLVED]
+        raise DataError(
+            f"{named(record)}the inputs {' and '.join(alike)} are collinear: one is a linear function of the others, "
+            "and their responses cannot be told apart; drop one, or record them moving independently"
+        )
 
 
 def _period(record: Record) -> float:
@@ -486,7 +507,10 @@ def _period(record: Record) -> float:
 
 def _one_period(data: FilterData, period: float) -> FilterData:
     """Return the record with the breaks of its input within one period."""
-    within = data.tu < data.tu[0] + period * (1 - 1e-9)
+    within, data = (
+        data.tu < data.tu[0] + period * (1 - 1e-9),
+        data._replace(further=tuple(_one_period(one, period) for one in data.further)),
+    )
     if within.all():
         return data
     # A regular pass takes a break for each sample.

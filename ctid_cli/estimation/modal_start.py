@@ -139,7 +139,7 @@ class _Search:
 
     def point(self, poles: Sequence[complex] | ComplexArray) -> Point:
         """Poles with their conjugates, moved into the set that is searched."""
-        return point_of(np.array(poles, dtype=complex), self.box.delays[0], self.box)
+        return point_of(np.array(poles, dtype=complex), self.box.middle, self.box)
 
     def found(self) -> ComplexArray:
         """As many poles as the sum has."""

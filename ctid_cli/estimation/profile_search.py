@@ -10,6 +10,7 @@ from ctid_cli.estimation.delay_search import Minimum, lowest_minima, quarter_per
 from ctid_cli.estimation.filtered_costs import HIGHEST, filtered_costs
 from ctid_cli.estimation.iteration import GUARDED, Steps
 from ctid_cli.estimation.measured_records import MeasuredRecords
+from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.sampled_problem import CUTOFFS, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
@@ -63,7 +64,7 @@ class RecordsCost:
         self.measured = measured
         self.bandwidth = bandwidth
         self.cutoffs = cutoffs
-        self.integrators = measured.treatment.integrators
+        self.integrators = measured.treatment.integrators[0]
         self.coefficients = Structure(measured.structure.poles - self.integrators, measured.structure.zeros)
 
     def starts(self, delay: float) -> list[Array]:
@@ -111,7 +112,7 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
     at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset not in ("estimate", "drift")
     # With integrators they leave the mean out, and nothing is known at rest.
     if (
-        (at_rest or (treatment.integrators and not any(measured.layout.trend)))
+        (at_rest or (any(treatment.integrators) and not any(measured.layout.trend)))
         and len(measured.records) == 1
         and measured.structure.delay
     ):
@@ -122,7 +123,7 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
 def _search_levels(cost: RecordsCost) -> Found:
     """Search behind low-pass filters."""
     measured, bandwidth = cost.measured, cost.bandwidth
-    bounds = measured.treatment.delay_bounds
+    (bounds,) = each_bounds(measured.treatment.delay_bounds)
     record, cutoffs = measured.records[0], _cutoffs(bounds, bandwidth)
     present = record.t[record.valid]
     # Two real equations for every frequency of the observed window that passes.
@@ -164,7 +165,7 @@ def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> Array:
 def _search_samples(cost: RecordsCost) -> Found:
     """Search on every sample."""
     measured = cost.measured
-    low, high = measured.treatment.delay_bounds
+    ((low, high),) = each_bounds(measured.treatment.delay_bounds)
     delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
     found = scan([cost] * delays.size, delays.tolist())
     count = sum(data.count for data in measured.data)
@@ -182,7 +183,7 @@ def _search_samples(cost: RecordsCost) -> Found:
 
 def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, parts: int, most: int) -> list[Minimum]:
     """The lowest minima on fine grids of all samples around given ones."""
-    low, high = cost.measured.treatment.delay_bounds
+    ((low, high),) = each_bounds(cost.measured.treatment.delay_bounds)
     fine: list[Minimum] = []
     for centre in centres:
         for side in (-1, 1):

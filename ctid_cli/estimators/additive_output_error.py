@@ -14,6 +14,7 @@ from ctid_cli.estimation.common import Fixed, Start, StartFrom, checked_bounds, 
 from ctid_cli.estimation.measured_records import MeasuredRecords, Treatment
 from ctid_cli.estimation.optimum.best_model import Begin, poles_of_submodels
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimation.parameter_layout import SumDegrees
 from ctid_cli.estimators.additive_srivc import check_submodels, check_terms
 from ctid_cli.estimators.delay_profile import (
     MeasuredFit,
@@ -133,14 +134,14 @@ class AdditiveOutputError(RecordsEstimator):
         known = places_of(self.fixed, names_of(self.terms))
         return MeasuredRecords(
             several,
-            SumStructure(self.terms, delay=low < high),
+            SumDegrees(SumStructure(self.terms, delay=low < high)),
             Treatment(
                 self.delay_bounds,
                 self.initial_state,
                 self.offset,
                 "foh",
                 bridge=self.loss != "squares",
-                integrators=self.integrators,
+                integrators=(self.integrators,),
                 input_before=self.input_before,
             ),
             KnownCoefficients.of_sum(self.terms, known) if known else NOTHING,

@@ -8,23 +8,25 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
-from ctid_cli.errors import DataError, OptionError
+from ctid_cli.errors import DataError, OptionError, UsageError
 from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
-from ctid_cli.estimation.measured_records import AppliedModel, Layout, MeasuredRecords, Treatment, sensitivities
+from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.inference.fit import DeferredFields, Fit, Status
+from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
+from ctid_cli.inference.of_input import InputFit
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
-from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
@@ -199,6 +201,53 @@ class MeasuredFit(DeferredFields, Fit):
         return dict(zip(self.parameter_names, self.theta.tolist(), strict=True))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class MultiInputFit(MeasuredFit):
+    """A fit to records with several inputs, whose model has a transfer function for each.
+
+    Parameters
+    ----------
+    model : MultiInputModel
+        The transfer functions of the inputs.
+    parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history, law
+        As in :class:`MeasuredFit`.
+    in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
+        As in :class:`MeasuredFit`; of the levels of the inputs those of all inputs of one record after the other.
+    poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
+        As in :class:`MeasuredFit`.
+    """
+
+    model: MultiInputModel  # type: ignore[assignment]  # what asks for one transfer function asks for that of an input
+
+    def of_input(self, name: str) -> InputFit:
+        """Return the transfer function of an input, with its responses.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        InputFit
+            The model from this input to the output.
+
+        Raises
+        ------
+        DataError
+            If there is no such input.
+        """
+        if name not in self.model.parts:
+            raise DataError(f"there is no input {name!r}; there are {', '.join(self.model.parts)}")
+        law = self.law or Uncertainty.known(self.covariance)
+        return InputFit.of(name, self.model.parts[name], self.parameter_names, law)
+
+    def _estimated(self) -> Estimated:
+        """Refuse what asks for one transfer function."""
+        inputs = ", ".join(self.model.parts)
+        raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
+
+
 class FittedSamples(NamedTuple):
     """What a fit says of each used sample of each record."""
 
@@ -251,8 +300,7 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
         """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
-        layout = measured.layout_of(fit.model.order, measured.structure.delay)
-        parts = sensitivities(measured.problem, layout, fit.theta, fit.model.delay)
+        parts = sensitivities(measured.problem, measured.layout_of(fit.model), fit.theta, delays_of(fit.model))
         return [data.y_used - eps for data, (_, eps) in zip(measured.problem.records, parts, strict=True)]
 
     # --- what a fit is judged by -----------------------------------------------------------------------
@@ -267,9 +315,39 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
 
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
         """The model on another record."""
+        inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
+        if list(measured.degrees.inputs) != inputs:
+            given = ", ".join(filter(None, measured.degrees.inputs)) or "one input"
+            wanted = ", ".join(filter(None, inputs)) or "one input"
+            raise DataError(f"{named(measured.records[0])}the record has {given}, and the model has {wanted}")
         weighed = measured if fit.arma is None else measured.whitened_by(fit.arma)
         found: AppliedModel = weighed.errors_of(fit.parametrised)
         return found
+
+
+@dataclass(frozen=True)
+class InputModel:
+    """What the transfer function of one of several inputs has of its own; None is as the estimator has it for all.
+
+    Parameters
+    ----------
+    name : str
+        Name of the input.
+    poles : int, optional
+        Poles of a denominator of its own; where one input has these, none share a denominator.
+    zeros : int, optional
+        Degree of its numerator.
+    delay_bounds : tuple of float, optional
+        Least and greatest delay [s]; two equal numbers are a known delay.
+    integrators : int, optional
+        Poles at the origin of a denominator of its own.
+    """
+
+    name: str
+    poles: int | None = None
+    zeros: int | None = None
+    delay_bounds: tuple[float, float] | None = None
+    integrators: int | None = None
 
 
 @dataclass(frozen=True)
@@ -320,6 +398,10 @@ class DelayProfile(RecordsEstimator):
     noise_model : str, default "white"
         ``arma:P,Q``, or ``auto`` for the orders up to 3 of least BIC, estimates the output noise ``C(q)/D(q) e`` with
         P coefficients of D and Q of C together with the plant, by maximum likelihood; all records share it.
+    inputs : tuple of InputModel, optional
+        What differs between the inputs of records that have several. They share the denominator unless these have poles
+        of their own, and poles, zeros, range of the delay and integrators unless these say otherwise. Parameters are
+        named ``u1_b0``, ``u1_delay`` and, of own denominators, ``u1_a1``, for an input u1.
 
     Raises
     ------
@@ -364,19 +446,75 @@ class DelayProfile(RecordsEstimator):
     integrators: int = 0
     input_before: InputBefore = None
     noise_model: str = "white"
+    inputs: tuple[InputModel, ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_treatment(self)
         low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
         object.__setattr__(self, "delay_bounds", bounds)
-        allowed = self.order if low == high else self.order - 1
-        if self.zeros > allowed:
-            reason = "" if low == high else " while the delay is estimated"
-            given = f"got {self.zeros} zeros and {self.order} poles" + ", integrators included" * (self.integrators > 0)
+        names = [one.name for one in self.inputs or ()]
+        if len(set(names)) < len(names):
+            raise OptionError("inputs", f"each input must be given once; got {', '.join(names)}")
+        for one in self.inputs or ():
+            # Each number by itself, as if it were that of the only input.
+            self._alone(one)
+        if not self.inputs:
+            self._check_zeros(self.zeros, self.order, low == high)
+        # Names are made of degrees that make sense only; of several inputs once these are known.
+        if self.fixed and not self.inputs and not any("_" in one.name for one in self.fixed):
+            self._known(("",))
+
+    def _alone(self, one: InputModel) -> "DelayProfile":
+        """Return the estimator of one of several inputs by itself."""
+        own = {name: value for name, value in vars(one).items() if name != "name" and value is not None}
+        try:
+            return replace(self, inputs=None, fixed=None, **own)
+        except OptionError as error:
+            raise OptionError(error.field, f"input {one.name}: {error}") from None
+
+    def _check_zeros(self, zeros: int, order: int, known: bool) -> None:
+        """Refuse numerators of too high a degree."""
+        allowed = order if known else order - 1
+        if zeros > allowed:
+            reason = "" if known else " while the delay is estimated"
+            given = f"got {zeros} zeros and {order} poles" + ", integrators included" * (self.integrators > 0)
             raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
-        # Names are made of degrees that make sense only.
-        check_stable(places_of(self.fixed, Structure(self.poles, self.zeros).names), self.poles)
+
+    def _each(self, names: Sequence[str]) -> list["DelayProfile"]:
+        """Return the estimator of each input by itself."""
+        own = {one.name: one for one in self.inputs or ()}
+        unknown = [name for name in own if name not in names]
+        if unknown:
+            raise OptionError(
+                "inputs",
+                f"there is no input {unknown[0]!r}; the record has {', '.join(names) if any(names) else 'one'}",
+            )
+        return [self._alone(own[name]) if name in own else replace(self, inputs=None, fixed=None) for name in names]
+
+    def _known(self, names: tuple[str, ...]) -> dict[int, float]:
+        """Return the values of the fixed parameters by their places, for inputs of some names."""
+        degrees = self._degrees(names, free=False)
+        known = places_of(self.fixed, degrees.names)
+        check_stable(known, degrees)
+        return known
+
+    @property
+    def common(self) -> bool:
+        """Whether several inputs share a denominator."""
+        return all(one.poles is None and one.integrators is None for one in self.inputs or ())
+
+    def _degrees(self, names: tuple[str, ...], *, free: bool = True) -> Degrees:
+        """Return the degrees for inputs of some names; if not free, without integrators and delays."""
+        each = self._each(names)
+        blocks = each[:1] if self.common else each
+        return Degrees(
+            tuple(one.order if free else one.poles for one in blocks),
+            tuple(one.zeros for one in each),
+            tuple(free and one.delay_bounds[0] < one.delay_bounds[1] for one in each),
+            names,
+            tuple(one.integrators for one in blocks),
+        )
 
     @property
     def order(self) -> int:
@@ -384,26 +522,33 @@ class DelayProfile(RecordsEstimator):
         return self.poles + self.integrators
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
-        low, high = self.delay_bounds
+        several = [records] if isinstance(records, Record) else list(records)
         if self.noise_model != "white":
-            check_clocks([records] if isinstance(records, Record) else records)
-        known = places_of(self.fixed, Structure(self.poles, self.zeros).names)
+            check_clocks(several)
+        names = tuple(several[0].held) if several and several[0].several else ("",)
+        coefficients, known = self._degrees(names, free=False), self._known(names)
+        degrees, bounds = self._degrees(names), tuple(one.delay_bounds for one in self._each(names))
+        orders = coefficients.orders if not coefficients.common else ()
         return MeasuredRecords(
-            [records] if isinstance(records, Record) else list(records),
-            Structure(self.order, self.zeros, delay=low < high),
+            several,
+            degrees,
             Treatment(
-                self.delay_bounds,
+                bounds,
                 self.initial_state,
                 self.offset,
                 self.hold_output,
                 bridge=self.loss != "squares",
-                integrators=self.integrators,
+                integrators=degrees.integrators,
                 input_before=self.input_before,
             ),
-            KnownCoefficients.of(self.poles, self.zeros, known) if known else NOTHING,
+            KnownCoefficients.of(coefficients.poles, coefficients.numerators - 1, known, orders) if known else NOTHING,
         )
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        if measured.degrees.several:
+            # Several inputs are searched by themselves first.
+            fit = self._least(measured, [], nested=True)
+            return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         for minima, profile in search_delay(measured, self.svf_cutoff, self.nested):
             if minima:
                 a = [np.concatenate(([1.0], minimum.theta[: self.poles])) for minimum in minima]
@@ -412,7 +557,7 @@ class DelayProfile(RecordsEstimator):
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
 
-    def _refine(self, records: Sequence[Record], *near: tuple[Array, float]) -> MeasuredFit:
+    def _refine(self, records: Sequence[Record], *near: Begin) -> MeasuredFit:
         """Return the least output error in the basins of denominators, without their integrators, and delays.
 
         It has no covariance.
@@ -433,7 +578,8 @@ def fitted(
 ) -> MeasuredFit:
     """The result of a refinement, but for its covariance."""
     layout, theta = measured.parameters(found)
-    samples = samples_at(measured, found.model, theta, None if robust is None else robust.losses)
+    model = measured.model(found)
+    samples = samples_at(measured, model, theta, None if robust is None else robust.losses)
     residuals, law = samples.residuals, samples.linear
     hessian = np.sum([psi.T @ psi for psi in law.sensitivities], axis=0)
     each = zip(law.sensitivities, law.residuals, strict=True)
@@ -445,11 +591,12 @@ def fitted(
         values["cost"] = robust.cost(robust.losses) / count
     states, offsets = measured.own(layout, theta)
     given = _given(layout, measured)
-    return MeasuredFit(
-        model=found.model,
+    kind: Any = MultiInputFit if isinstance(model, MultiInputModel) else MeasuredFit
+    fit: MeasuredFit = kind(
+        model=model,
         parameter_names=layout.names,
         covariance=np.full((layout.size, layout.size), np.nan),
-        status=Status.DELAY_AT_BOUND if found.delay_at_bound else Status[found.ending.name],
+        status=Status.DELAY_AT_BOUND if found.delays_at_bound else Status[found.ending.name],
         iterations=found.evaluations,
         theta=theta,
         initial_states=states,
@@ -469,6 +616,7 @@ def fitted(
         regular=measured.regular,
         **values,
     )
+    return fit
 
 
 def with_noise(
@@ -499,7 +647,7 @@ def with_noise(
     )
     fit = replace(fit, noise=estimate)
     efficient = fit.uncertainty("white").covariance
-    shared = measured.layout_of(fit.model.order, measured.structure.delay).structure.size
+    shared = measured.layout_of(fit.model).degrees.size
     own = (np.arange(fit.theta.size) < shared) & (errors > 0) & (np.diag(efficient) > 0)
     pair = robust[np.ix_(own, own)], efficient[np.ix_(own, own)]
     test = hausman((beside.theta - fit.theta)[own], *pair, law.degrees_of_freedom)
@@ -507,11 +655,11 @@ def with_noise(
 
 
 def samples_at(
-    measured: MeasuredRecords, model: TransferFunction, theta: Array, losses: Sequence[Loss] | None
+    measured: MeasuredRecords, model: AnyModel, theta: Array, losses: Sequence[Loss] | None
 ) -> FittedSamples:
     """The samples of the records at an estimate, whose losses are those of squares where none are given."""
-    layout = measured.layout_of(model.order, measured.structure.delay)
-    psi, errors = zip(*sensitivities(measured.problem, layout, theta, model.delay), strict=True)
+    layout = measured.layout_of(model)
+    psi, errors = zip(*sensitivities(measured.problem, layout, theta, delays_of(model)), strict=True)
     used = measured.used()
     if losses is None:
         return FittedSamples(errors, psi, used, None)
@@ -525,22 +673,21 @@ def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
     """Which parameters are known."""
     fixed = np.zeros(layout.size, dtype=bool)
     # Poles that have run to infinity are missing among the first coefficients.
-    given = measured.given[measured.structure.poles - layout.structure.poles :]
+    given = measured.given[measured.degrees.poles - layout.degrees.poles :]
     fixed[: given.size] = given
     return fixed
 
 
 def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
     """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
-    delay, fixed = layout.structure.size - 1, fixed.copy()
-    if found.delay_at_bound:
-        fixed[delay] = True
+    degrees, fixed = layout.degrees, fixed.copy()
+    for k in found.delays_at_bound:
+        fixed[degrees.delay(k)] = True
     if not found.held_poles.size:
         return np.eye(layout.size)[:, ~fixed]
-    places = layout.structure.denominators
     moving = np.zeros((layout.size, found.pole_slopes.shape[1]))
-    moving[places[: len(found.pole_slopes)]] = found.pole_slopes
-    fixed[places] = True
+    moving[degrees.denominators] = found.pole_slopes
+    fixed[degrees.denominators] = True
     return np.column_stack((moving, np.eye(layout.size)[:, ~fixed]))
 
 
@@ -587,13 +734,16 @@ def check_positive(name: str, value: float) -> None:
         raise OptionError("fixed", f"fixed {name} must be above zero, as in every stable model; got {value:g}")
 
 
-def check_stable(known: Mapping[int, float], poles: int) -> None:
+def check_stable(known: Mapping[int, float], degrees: Degrees) -> None:
     """Refuse denominators that no stable model has."""
     for place, value in known.items():
-        if place < poles:
-            check_positive(f"a{place + 1}", value)
-    if set(range(poles)) <= set(known):
-        roots = np.roots([1.0, *(known[place] for place in range(poles))])
-        unstable = [f"{root:.4g}" for root in roots.tolist() if root.real >= 0]
-        if unstable:
-            raise OptionError("fixed", f"fixed denominator is not stable: it has poles at {', '.join(unstable)} rad/s")
+        if place < degrees.poles:
+            check_positive(degrees.names[place], value)
+    for block in degrees.a:
+        places = range(block.start, block.stop)
+        if set(places) <= set(known):
+            roots = np.roots([1.0, *(known[place] for place in places)])
+            unstable = [f"{root:.4g}" for root in roots.tolist() if root.real >= 0]
+            if unstable:
+                where = f"has poles at {', '.join(unstable)} rad/s"
+                raise OptionError("fixed", f"fixed denominator is not stable: it {where}")

@@ -27,7 +27,7 @@ MISFIT = 0.01
 #: Share of the weighted values' squares below which residuals are rounding.
 ROUNDING = 1e-14
 #: Options of a record in time.
-OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model")
+OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model", "inputs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,7 +166,7 @@ class FrequencyDomain(DelayProfile):
         As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
     delay_bounds : tuple of float, default (0.0, 0.0)
         Least and greatest delay [s]; two equal numbers are a known delay.
-    initial_state, offset, loss, input_before, noise_model
+    initial_state, offset, loss, input_before, noise_model, inputs
         Of records in time: for a frequency response they keep their defaults.
     svf_cutoff, nested, hold_output, covariance, bootstrap_draws
         Not used: smaller models are always fitted too, and standard errors are those of the lines.

@@ -1,18 +1,19 @@
 """A fit to measured records with everything that tells whether to believe it."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, IndexArray
+from ctid_cli.arrays import Array, BoolArray, IndexArray
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords
+from ctid_cli.estimation.optimum.box import each_bounds
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
 from ctid_cli.estimators.frequency_domain import FrequencyDomain, FrequencyDomainFit
 from ctid_cli.estimators.loop_output_error import LaidOutLoop, LoopFit, LoopOutputError
 from ctid_cli.estimators.measured_submodels import LaidOutSubmodels, MeasuredSubmodels, SubmodelsFit
@@ -21,16 +22,18 @@ from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.derived import derived_parameters
-from ctid_cli.inference.fit import DeferredFields, Status
+from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
+from ctid_cli.inference.of_input import InputFit
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.response_test import AnswerTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
+from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record
 from ctid_cli.text import Shown
@@ -76,7 +79,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     ----------
     options : DelayProfile, AdditiveOutputError, MeasuredSubmodels, LoopOutputError or FrequencyDomain
         What was asked for.
-    fit : MeasuredFit, SubmodelsFit, LoopFit or FrequencyDomainFit
+    fit : MeasuredFit, MultiInputFit, SubmodelsFit, LoopFit or FrequencyDomainFit
         The estimate.
     answer : AnswerTest
         Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
@@ -105,7 +108,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     deferred: ClassVar[tuple[str, ...]] = ("records",)
 
     options: Options
-    fit: MeasuredFit | SubmodelsFit | LoopFit | FrequencyDomainFit
+    fit: MeasuredFit | MultiInputFit | SubmodelsFit | LoopFit | FrequencyDomainFit
     answer: AnswerTest
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -191,8 +194,33 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     def _estimated(self) -> Estimated:
         """The model with what its reported errors and intervals are from."""
+        if isinstance(self.fit, MultiInputFit):
+            return self.fit._estimated()
         law = self.uncertainty if self._determined else self.uncertainty.undefined
         return Estimated(Parametric(self.fit.parametrised, self.fit.parameter_names), law)
+
+    def of_input(self, name: str) -> InputFit:
+        """Return the transfer function of one of several inputs, with its responses.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        InputFit
+            The model from this input to the output.
+
+        Raises
+        ------
+        DataError
+            If there is no such input, or the model has one input only.
+        """
+        if not isinstance(self.fit, MultiInputFit):
+            raise DataError("the model has one input; its responses are those of the fit")
+        found = self.fit.of_input(name)
+        return found if self._determined else replace(found, law=self.uncertainty.undefined)
 
     @property
     def _determined(self) -> bool:
@@ -228,7 +256,7 @@ def identify(
     residuals = np.concatenate(fit.residuals)
     output = np.concatenate([record.y[use] for record, use in zip(records, fit.used, strict=True)])
     answering = [options._acting(record) for record in prepared.laid_out.records]
-    answer = response_test(answering, fit.used, options.delay_bounds, options.initial_state)
+    answer = answer_of(options, answering, fit.used)
     squared_error = float(residuals @ residuals) if fit.weighting is None else fit.cost * fit.count
     size = fit.theta.size - len(fit.known)
     if fit.noise is not None:
@@ -273,11 +301,15 @@ def parameters_told(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid
     }
     if not seen:
         unclear |= {name for name in fit.parameter_names if not name.startswith("offset")}
-    interval = None
-    if isinstance(laid_out, MeasuredRecords) and "delay" in fit.parameter_names and "delay" not in unclear:
-        interval = None if biased else _delay_interval(laid_out, linear, uncertainty)
+    intervals: dict[str, DelayInterval] = {}
+    for name in delay_names(fit):
+        if isinstance(laid_out, MeasuredRecords) and not biased and name in {*fit.parameter_names} - unclear:
+            interval = _delay_interval(laid_out, linear, uncertainty, name)
+            intervals |= {} if interval is None else {name: interval}
     return Told(
-        _estimates(fit, uncertainty, unclear, interval), interval, _derived(fit, uncertainty, seen and not singular)
+        _estimates(fit, uncertainty, unclear, intervals),
+        next(iter(intervals.values()), None),
+        _derived(fit, uncertainty, seen and not singular),
     )
 
 
@@ -290,17 +322,39 @@ def _of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertainty:
 
 
 def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
-    """Tests of each experiment, at levels that make a false alarm as likely as with one."""
-    level = 1.0 - (1.0 - LEVEL) / len(records)
-    found = []
+    """Tests of each experiment, at levels that make a false alarm as likely as with one.
+
+    With several inputs there is a test with each of them.
+    """
+    found, delays = [], delays_of(fit.model)
+    level = 1.0 - (1.0 - LEVEL) / (len(records) * len(delays))
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
             acting = options._acting(record)
-            tests = residual_tests(
-                eps, acting.input.at(record.t[use] - fit.model.delay), level=level, sensitivities=psi
-            )
-            found.append(tests if acting is record else replace(tests, driver="reference"))
+            for signal, delay in zip(acting.held.values(), delays, strict=True):
+                tests = residual_tests(eps, signal.at(record.t[use] - delay), level=level, sensitivities=psi)
+                found.append(tests if acting is record else replace(tests, driver="reference"))
     return tuple(found)
+
+
+def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolArray]) -> AnswerTest:
+    """Test the response of the output to its input; of several to any of them, by the least of their p-values."""
+    names = list(records[0].held)
+    if len(names) == 1:
+        return response_test(records, used, options.delay_bounds, options.initial_state)
+    assert isinstance(options, DelayProfile)
+    each = zip(names, options._each(names), strict=True)
+    tests = [
+        response_test([record.of_input(name) for record in records], used, own.delay_bounds, own.initial_state)
+        for name, own in each
+    ]
+    best = min(tests, key=lambda test: test.p_value)
+    return replace(best, p_value=min(1.0, len(names) * best.p_value))
+
+
+def delay_names(fit: MeasuredFit) -> list[str]:
+    """Return the names of the delays of all inputs."""
+    return [f"{name}_delay" for name in fit.model.parts] if isinstance(fit, MultiInputFit) else ["delay"]
 
 
 def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
@@ -309,7 +363,7 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
     A coefficient or delay with ten times its own size for a standard error, and whatever moves along with it.
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
-    looked_at = np.array([re.fullmatch(r"(g\d+_)?[ab]\d+|delay", name) is not None for name in names])
+    looked_at = np.array([re.fullmatch(r"(.*_)?([ab]\d+|delay)", name) is not None for name in names])
     if not fit.signs_known:
         looked_at &= np.array(["a" not in name for name in names])
     unclear = ~np.isfinite(errors) | (looked_at & (errors > LARGE_STANDARD_ERROR * np.abs(fit.theta)))
@@ -324,7 +378,7 @@ def unsafe_intervals(found: Identification) -> list[str]:
     """Parameters whose intervals reach as far as the output is not linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
-    if not shown or getattr(options, "instruments", "open_loop") != "open_loop":
+    if not shown or getattr(options, "instruments", "open_loop") != "open_loop" or isinstance(fit, MultiInputFit):
         return []
     records = [options._acting(record) for record in options.prepare(found.records).laid_out.records]
     model, linear = Parametric(fit.parametrised, fit.parameter_names), fit.linear
@@ -342,18 +396,20 @@ def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 # --- the delay -------------------------------------------------------------------------------------
 
 
-def _delay_interval(measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty) -> DelayInterval | None:
+def _delay_interval(
+    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str
+) -> DelayInterval | None:
     """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
-    profile, reach, error = _cost_of_delay(measured, fit, uncertainty)
+    profile, reach, error = _cost_of_delay(measured, fit, uncertainty, name)
     return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
 
 
 def _cost_of_delay(
-    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty
+    measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str = "delay"
 ) -> tuple[CostOfDelay, float, float]:
     """The cost about a delay, how many standard errors its interval reaches, and the standard error."""
-    place = fit.parameter_names.index("delay")
-    held = fit.status is Status.DELAY_AT_BOUND
+    place, k = fit.parameter_names.index(name), delay_names(fit).index(name)
+    held = not fit.tangent[place].any()
     if held:
         # What the noise does to a delay is seen where it is free.
         fit = replace(fit, tangent=np.column_stack((fit.tangent, np.eye(fit.theta.size)[place])))
@@ -361,12 +417,12 @@ def _cost_of_delay(
     variance = float(uncertainty.covariance[place, place])
     white = float(fit.uncertainty("white").covariance[place, place])
     profile = CostOfDelay(
-        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial)),
+        cache(lambda trial: measured.squared_error_at(fit.parametrised, trial, k)),
         float(fit.theta[place]),
         fit.cost * fit.count,
         fit.count,
         fit.theta.size - len(fit.known),
-        measured.treatment.delay_bounds,
+        each_bounds(measured.treatment.delay_bounds)[k],
         max(variance / white, np.finfo(float).tiny),
     )
     reach = uncertainty.quantile(np.eye(fit.theta.size)[place], LEVEL)
@@ -413,7 +469,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
 
 
 def _estimates(
-    fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], interval: DelayInterval | None
+    fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], intervals: Mapping[str, DelayInterval]
 ) -> tuple[UncertainValue, ...]:
     """Parameters, numerator first, then denominator, delay, and what belongs to the experiments."""
     found: dict[str, UncertainValue] = {}
@@ -429,11 +485,20 @@ def _estimates(
             found[name] = UncertainValue.symmetric(name, value, float(errors[k]), quantile=reach, reason=reason)
         else:
             found[name] = UncertainValue(name, value, status="fixed" if name in fit.known else "at bound")
-        if name == "delay" and interval is not None:
-            found[name] = replace(found[name], low=interval.low, high=interval.high)
-    found.setdefault("delay", UncertainValue("delay", fit.model.delay, status="fixed"))
+        if name in intervals:
+            found[name] = replace(found[name], low=intervals[name].low, high=intervals[name].high)
+    for name, delay in zip(delay_names(fit), delays_of(fit.model), strict=True):
+        found.setdefault(name, UncertainValue(name, delay, status="fixed"))
     order = {"b": 0, "a": 1, "g": 1, "d": 2}
-    return tuple(sorted(found.values(), key=lambda item: order.get(item.name[0], 3)))
+    inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else []
+
+    def place(item: UncertainValue) -> tuple[int, int]:
+        # What belongs to an input stands together, what is common follows.
+        own = next((k for k, name in enumerate(inputs) if item.name.startswith(f"{name}_")), len(inputs))
+        kind = item.name.removeprefix(f"{inputs[own]}_") if own < len(inputs) else item.name
+        return own, order.get(kind[0], 3)
+
+    return tuple(sorted(found.values(), key=place))
 
 
 def laid_out_validation(options: Options, validation: Record) -> LaidOut:
@@ -452,9 +517,38 @@ def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Un
     covariance[known] = covariance[:, known] = 0.0
     if isinstance(fit, SubmodelsFit) and fit.additive is not None:
         return derived_parameters(fit.additive, covariance, uncertainty.quantile)
+    if isinstance(fit, MultiInputFit):
+        return _derived_of_inputs(fit, covariance, uncertainty)
     size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
     held = fit.tangent[:size] if fit.held_poles else None
     return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
+
+
+def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncertainty) -> tuple[UncertainValue, ...]:
+    """Derived quantities of the transfer function of each input; those of a common denominator once."""
+    found: list[UncertainValue] = []
+    for k, (name, model) in enumerate(fit.model.parts.items()):
+        names = fit.of_input(name).parameter_names
+        own = [i for kind in "ab" for i, each in enumerate(names) if each.startswith(kind)]
+
+        def quantile(gradient: Array, own: Sequence[int] = own) -> float:
+            whole = np.zeros(len(covariance))
+            whole[own[: gradient.size]] = gradient
+            return uncertainty.quantile(whole)
+
+        held = fit.tangent[own] if fit.held_poles else None
+        values = derived_parameters(model, covariance[np.ix_(own, own)], quantile, held)
+        shared = [] if not fit.model.common else [item for item in values if item.name != "static_gain"]
+        found += shared if k == 0 else []
+        found += [replace(item, name=f"{name}_{item.name}") for item in values if item not in shared]
+    return tuple(found)
+
+
+def models_of(found: Identification) -> dict[str, FittedModel]:
+    """Return the model with its responses, or that of each of several inputs by its name."""
+    if isinstance(found.fit, MultiInputFit):
+        return {name: found.of_input(name) for name in found.fit.model.parts}
+    return {"": found}
 
 
 def validated(applied: AppliedModel, record: Record) -> Validation:

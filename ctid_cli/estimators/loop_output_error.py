@@ -180,7 +180,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         if loop is None or loop.controller is None:
             missing = "neither" if loop is None else "no controller"
             raise DataError(f"{where}the loop needs the reference and the controller, and this record has {missing}")
-        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
+        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], [0.0], 0.0)
         assert record.loop is not None
         if loop.continuous and self.delay_bounds[1] > 0:
             why = "a loop in continuous time with a delay in it has no finite state"
@@ -196,7 +196,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         response = LoopResponse(driven, law, at_controller, *structure)
         check_record(record, driven, self.poles + self.zeros + 2)
         problem = LoopProblem(data, response, self.offset == "estimate", free, self.delay_bounds)
-        return LaidOutLoop(record, problem, u0, y0)
+        return LaidOutLoop(record, problem, u0[0], y0)
 
     def _estimate(self, laid_out: LaidOutLoop, start: Start | None) -> LoopFit:
         found = laid_out.problem.best(laid_out.record)

@@ -201,8 +201,8 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         several = [records] if isinstance(records, Record) else list(records)
         if len(several) != 1:
             raise DataError("submodels are estimated from one record; give one file")
-        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], 0.0, 0.0)
-        return LaidOutSubmodels(record, self.estimator._lay_out(record).problem, u0, y0)
+        record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], [0.0], 0.0)
+        return LaidOutSubmodels(record, self.estimator._lay_out(record).problem, u0[0], y0)
 
     def _estimate(self, laid_out: LaidOutSubmodels, start: Start | None) -> SubmodelsFit:
         model, method = laid_out.started(start)

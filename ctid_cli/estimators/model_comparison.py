@@ -9,12 +9,14 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, UsageError
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment
+from ctid_cli.estimators.delay_profile import MultiInputFit
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.sensitivities import Parametric, Structure
+from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, Offset
 
@@ -129,6 +131,9 @@ def _applied(fit: FittedModel, record: Record, initial_state: InitialState | Non
     if isinstance(fit, Identification):
         own = fit.options.initial_state, fit.options.offset
     state, shift = initial_state or own[0], offset or own[1]
+    if isinstance(fit, Identification) and isinstance(fit.fit, MultiInputFit):
+        found = _treated(fit, None, record, state, shift)
+        return _Applied(state, shift, found.used[0], found.residuals[0], found.sensitivities[0])
     parametric = fit._estimated().parametric
     delay, span = parametric.model.delay, float(record.t[-1] - record.input.t[0])
     if delay >= span:
@@ -150,8 +155,14 @@ def _on_record(fit: FittedModel, record: Record, applied: _Applied, common: Bool
     tests = None
     if residuals.size >= FEWEST_TESTED:
         moving = slopes[:, slopes.any(axis=0)]
-        delayed = record.input.at(record.t[common] - fit._estimated().parametric.model.delay)
-        tests = residual_tests(residuals, delayed, sensitivities=moving if moving.size else None)
+        each = [
+            residual_tests(
+                residuals, signal.at(record.t[common] - delay), sensitivities=moving if moving.size else None
+            )
+            for signal, delay in zip(record.held.values(), _delays(fit), strict=True)
+        ]
+        # Of several inputs that on which the residuals depend most.
+        tests = min(each, key=lambda test: test.cross_p_value)
     return ModelOnRecord(
         fit_percent=fit_percent(measured, measured - residuals),
         r2=r_squared(measured, measured - residuals),
@@ -167,8 +178,15 @@ def _on_record(fit: FittedModel, record: Record, applied: _Applied, common: Bool
     )
 
 
+def _delays(fit: FittedModel) -> list[float]:
+    """Return the delay of each input [s]."""
+    if isinstance(fit, Identification):
+        return delays_of(fit.fit.model)
+    return [fit._estimated().parametric.model.delay]
+
+
 def _treated(
-    fit: FittedModel, parametric: Parametric, record: Record, state: InitialState, shift: Offset
+    fit: FittedModel, parametric: Parametric | None, record: Record, state: InitialState, shift: Offset
 ) -> AppliedModel:
     """The model with its best initial state and offset: as its own estimator has them, or as one fraction."""
     if isinstance(fit, Identification):
@@ -178,6 +196,7 @@ def _treated(
         except ValueError as error:
             raise UsageError(str(error)) from None
         return options._applied(fit.fit, options.prepare(record).laid_out)
+    assert parametric is not None
     model = parametric.fraction
     structure = Structure(model.order, parametric.zeros)
     treatment = Treatment((model.delay, model.delay), state, shift, "foh")

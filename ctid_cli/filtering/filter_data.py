@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.signals.band_limited import FINER
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
@@ -39,6 +40,13 @@ class FilterData(NamedTuple):
     common_clock: bool
     #: Time [s] by which a break may be late and still count as reached: what rounding makes of one instant.
     slack: float = 0.0
+    #: The same samples with each of the further inputs.
+    further: tuple["FilterData", ...] = ()
+
+    @property
+    def inputs(self) -> tuple["FilterData", ...]:
+        """The samples with each of the inputs."""
+        return (self, *self.further)
 
     @property
     def count(self) -> int:  # type: ignore[override]  # what a tuple counts is of no use here
@@ -67,29 +75,41 @@ def filter_data(
     """Lay a record out for filtering; a periodic one repeats itself one interval after its end.
 
     The samples of a record whose input is band-limited are every k-th point of its finer clock: regular passes are
-    many times faster than those over any clock.
+    many times faster than those over any clock. All inputs share these points.
     """
-    signal = record.input.periodic_lines if periodic else record.input.lines
+    signals = [one.periodic_lines if periodic else one.lines for one in record.held.values()]
     slack = 1e-9 * (record.interval or 0.0)
-    use = record.valid & (record.t >= record.input.t[0] + start - slack)
-    t, y, interval = record.t, record.bridged_y, (record.interval or 0.0) if record.input_on_grid else 0.0
-    same = bool(np.array_equal(signal.t, t))
-    if signal is not record.input and record.input_on_grid:
-        points = np.zeros(signal.t.size, dtype=bool)
+    known = max(float(one.t[0]) for one in record.held.values()) + start
+    use = record.valid & (record.t >= known - slack)
+    t, y, on_grid = record.t, record.bridged_y, record.input_on_grid
+    interval = (record.interval or 0.0) if on_grid else 0.0
+    finer = next((one for one, given in zip(signals, record.held.values(), strict=True) if one is not given), None)
+    if finer is not None and on_grid:
+        points = np.zeros(finer.t.size, dtype=bool)
         points[::FINER] = use
-        t, y, use, interval, same = signal.t, np.interp(signal.t, t, y), points, interval / FINER, False
-    return FilterData(
-        t=plain_array(t),
-        y=plain_array(y),
-        use=use,
-        tu=plain_array(signal.t),
-        u=plain_array(signal.values),
-        input_foh=signal.hold == "foh",
-        y_foh=hold_output == "foh",
-        interval=interval,
-        common_clock=same,
-        slack=clock_slack(t, signal.t),
-    )
+        t, y, use, interval = finer.t, np.interp(finer.t, t, y), points, interval / FINER
+        signals = [_on_points(one, finer.t) for one in signals]
+    first, *others = [
+        FilterData(
+            t=plain_array(t),
+            y=plain_array(y),
+            use=use,
+            tu=plain_array(signal.t),
+            u=plain_array(signal.values),
+            input_foh=signal.hold == "foh",
+            y_foh=hold_output == "foh",
+            interval=interval,
+            common_clock=finer is None and bool(np.array_equal(signal.t, t)),
+            slack=clock_slack(t, signal.t),
+        )
+        for signal in signals
+    ]
+    return first._replace(further=tuple(others))
+
+
+def _on_points(signal: HeldSignal, t: Array) -> HeldSignal:
+    """A held signal, or lines, with a value at every point of a finer clock."""
+    return signal if signal.t.size == t.size else HeldSignal(t, signal.at(t), signal.hold)
 
 
 def clock_slack(*clocks: Array) -> float:

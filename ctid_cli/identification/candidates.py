@@ -4,18 +4,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
+
 from ctid_cli.errors import DataError
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
-from ctid_cli.estimators.delay_profile import DelayProfile, fitted
-from ctid_cli.identification.criterion import Candidate, Ranking, penalised, ranked
-from ctid_cli.inference.sensitivities import Structure
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel, fitted
+from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, penalised, ranked
+from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
-from ctid_cli.signals.treatment import Hold, InitialState, InputBefore, Offset
+from ctid_cli.signals.treatment import Holds, InitialState, InputBefore, Offset
 
 #: Most poles, integrators included.
 MOST_POLES = 12
@@ -35,7 +36,7 @@ SAMPLES_PER_PARAMETER = 3
 class Setting(NamedTuple):
     """How records are taken."""
 
-    hold: Hold
+    hold: Holds
     initial_state: InitialState
     input_before: InputBefore
     offset: Offset
@@ -44,6 +45,17 @@ class Setting(NamedTuple):
     def state(self) -> tuple[InitialState, InputBefore]:
         """The state before the records."""
         return self.initial_state, self.input_before
+
+
+class Several(NamedTuple):
+    """What is known of several inputs, which share a denominator."""
+
+    #: Given ranges of their delays.
+    inputs: tuple[InputModel, ...] | None = None
+    #: Whether each may have fewer zeros than the structure.
+    fewer_zeros: bool = True
+    #: Delays of a small model.
+    first_delays: tuple[float, ...] | None = None
 
 
 class Span(NamedTuple):
@@ -74,10 +86,13 @@ class Span(NamedTuple):
         return small or [each for _, each in found[:1]]
 
 
-def with_hold(record: Record, hold: Hold) -> Record:
-    """Return a record with another hold of its input."""
-    signal = record.input
-    return record if signal.hold == hold else replace(record, input=HeldSignal(signal.t, signal.values, hold))
+def with_hold(record: Record, hold: Holds) -> Record:
+    """Return a record with another hold of its inputs."""
+    if record.hold == hold:
+        return record
+    holds = [hold] * len(record.held) if isinstance(hold, str) else hold
+    each = zip(record.held.items(), holds, strict=True)
+    return replace(record, inputs={name: HeldSignal(one.t, one.values, own) for (name, one), own in each})
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +100,14 @@ class Structures:
     """Structures with one number of integrators, in one setting of the records."""
 
     records: Sequence[Record]
-    hold: Hold
+    hold: Holds
     options: DelayProfile
     measured: MeasuredRecords
     search: StructureSearch
     #: Models of another setting, from which all searches start.
-    near: Callable[[int, int], TransferFunction] | None = None
+    near: Callable[[int, int], AnyModel] | None = None
+    #: Whether each of several inputs may have fewer zeros than its structure.
+    fewer_zeros: bool = False
     found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
@@ -100,43 +117,79 @@ class Structures:
         setting: Setting,
         integrators: int,
         delays: tuple[float, float],
-        near: Callable[[int, int], TransferFunction] | None = None,
+        near: Callable[[int, int], AnyModel] | None = None,
+        several: "Several | None" = None,
     ) -> "Structures":
         """Lay records out."""
         hold, state, before, offset = setting
-        least = int(not integrators)
+        least, several = int(not integrators), several or Several()
         options = DelayProfile(
-            *(least, 0, delays), initial_state=state, offset=offset, integrators=integrators, input_before=before
+            *(least, 0, delays),
+            initial_state=state,
+            offset=offset,
+            integrators=integrators,
+            input_before=before,
+            inputs=several.inputs,
         )
         held = [with_hold(record, hold) for record in records]
         measured = options.prepare(held).laid_out
         # One box for all: a wider one for those at rest would favour them.
-        box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
-        return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK), near)
+        box = box_of(measured.problem._replace(free_response=state != "periodic"), measured.treatment.delay_bounds)
+        search = StructureSearch(measured.problem, box, effort=QUICK, first_delays=several.first_delays)
+        return cls(held, hold, options, measured, search, near, several.fewer_zeros)
 
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
         if (poles, zeros) not in self.found:
             options, measured = replace(self.options, poles=poles, zeros=zeros), self.measured
-            structure = Structure(options.order, zeros, delay=self.search.box.delay_free)
-            own = measured.layout_of(options.order, structure.delay).own * len(self.records)
-            size = structure.size - options.integrators + own
+            laid_out = measured.with_degrees(options.order, [zeros] * len(measured.degrees.inputs))
+            size = laid_out.layout.size - options.integrators
             if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
                 return None
-            found = fitted(measured.with_structure(structure), self._least(poles, zeros), None, None)
-            self.found[poles, zeros] = Candidate(options, self.hold, found, size)
+            found = fitted(laid_out, self._least(poles, zeros), None, None)
+            candidate = Candidate(options, self.hold, found, size)
+            self.found[poles, zeros] = self._with_fewer_zeros(candidate) if self.fewer_zeros else candidate
         return self.found[poles, zeros]
 
-    def model(self, poles: int, zeros: int) -> TransferFunction:
+    def _with_fewer_zeros(self, candidate: Candidate) -> Candidate:
+        """Return a candidate whose inputs have only the zeros that are worth their parameters, in white noise."""
+        names = self.measured.degrees.inputs
+        zeros = [candidate.options.zeros] * len(names)
+        if candidate.fit.poles_at_infinity or len(names) < 2:
+            return candidate
+        worth = float(np.exp(PENALTY * np.log(candidate.fit.count) / candidate.fit.count))
+        for k in range(len(names)):
+            while zeros[k] > 0:
+                fewer = [*zeros[:k], zeros[k] - 1, *zeros[k + 1 :]]
+                trial = self._near(candidate, fewer)
+                if trial.fit.cost > candidate.fit.cost * worth:
+                    break
+                candidate, zeros = trial, fewer
+        return candidate
+
+    def _near(self, candidate: Candidate, zeros: Sequence[int]) -> Candidate:
+        """Fit numerators of other degrees near a candidate."""
+        own = {one.name: one for one in candidate.options.inputs or ()}
+        names = self.measured.degrees.inputs
+        inputs = tuple(replace(own.get(name, InputModel(name)), zeros=m) for name, m in zip(names, zeros, strict=True))
+        laid_out = self.measured.with_degrees(candidate.options.order, zeros)
+        search = StructureSearch(laid_out.problem, self.search.box, effort=QUICK)
+        fit = fitted(laid_out, best_near(search, max(zeros), self._start(candidate.fit.model)), None, None)
+        size = laid_out.layout.size - candidate.options.integrators
+        return replace(candidate, options=replace(candidate.options, inputs=inputs), fit=fit, size=size)
+
+    def _start(self, model: AnyModel) -> Begin:
+        """Return the poles of a model, without integrators, and its delays."""
+        return np.atleast_1d(np.poly(self.measured.free_poles(model)).real), tuple(delays_of(model))
+
+    def model(self, poles: int, zeros: int) -> AnyModel:
         """Return a model that has been fitted."""
         return self.found[poles, zeros].fit.model
 
     def _least(self, poles: int, zeros: int) -> Optimum:
         if self.near is None:
             return best_of_orders(self.search, poles, zeros)
-        start = self.near(poles, zeros)
-        alone = start.denominator[: start.denominator.size - self.options.integrators]
-        return best_near(self.search, zeros, alone, start.delay)
+        return best_near(self.search, zeros, self._start(self.near(poles, zeros)))
 
 
 class SmallModels:
@@ -148,9 +201,11 @@ class SmallModels:
         span: Span,
         delays: tuple[float, float],
         most: int = len(SMALL),
-        near: TransferFunction | None = None,
+        near: AnyModel | None = None,
+        several: Several | None = None,
     ) -> None:
         self.records, self.span, self.delays, self.most, self.near = records, span, delays, most, near
+        self.several = several
         self._structures: dict[tuple[Setting, int], Structures] = {}
 
     def compared(self, settings: Sequence[Setting]) -> Ranking:
@@ -176,13 +231,19 @@ class SmallModels:
             alike = next((self._structures[pair] for pair in pairs if pair[1] == integrators), None)
             model = self.near
             near = (lambda *_: model) if model is not None else None if alike is None else alike.model
-            self._structures[key] = Structures.of(self.records, *key, self.delays, near)
+            self._structures[key] = Structures.of(self.records, *key, self.delays, near, self.several)
         return self._structures[key]
 
 
-def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:
+def grid(
+    records: Sequence[Record],
+    setting: Setting,
+    span: Span,
+    delays: tuple[float, float],
+    several: Several | None = None,
+) -> Ranking:
     """Fit structures of ever more poles, until the best lies inside or there are no more."""
-    families = [Structures.of(records, setting, integrators, delays) for integrators in span.integrators]
+    families = [Structures.of(records, setting, integrators, delays, None, several) for integrators in span.integrators]
     found: list[Candidate] = []
     most = span.poles[1] + max(span.integrators)
     for order in range(1, min(most, MOST_POLES) + 1):

@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed
-from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.identification.candidates import MOST_POLES, Span
 from ctid_cli.identification.criterion import Ranking
 from ctid_cli.inference.response_test import AnswerTest
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,16 @@ class Given:
         Offset of the output.
     input_before : float or "first", optional
         Input before the first sample of a record that begins at rest [input unit].
-    hold : {"auto", "zoh", "foh", "band-limited"}, default "auto"
-        The input between its samples.
+    hold : {"auto", "zoh", "foh", "band-limited"} or tuple of these but "auto", default "auto"
+        The input between its samples; a tuple has the hold of each of several inputs.
     loss : {"squares", "huber", "tukey"}, default "squares"
         What output errors count in the fit; the choice is made with their squares.
     fixed : tuple of Fixed, optional
         Known parameters of the fit.
     noise_model : str, default "white"
         Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
+    inputs : tuple of InputModel, optional
+        What is given of each of several inputs by itself.
     """
 
     poles: int | tuple[int, int] | None = None
@@ -47,14 +49,42 @@ class Given:
     initial_state: InitialState | None = None
     offset: Offset | None = None
     input_before: InputBefore = None
-    hold: AskedHold = "auto"
+    hold: AskedHold | tuple[Hold, ...] = "auto"
     loss: LossKind = "squares"
     fixed: tuple[Fixed, ...] | None = None
     noise_model: str = "white"
+    inputs: tuple[InputModel, ...] | None = None
+
+    @property
+    def typed(self) -> bool:
+        """Whether inputs have degrees of their own, of which nothing is chosen."""
+        return any((one.poles, one.zeros, one.integrators) != (None,) * 3 for one in self.inputs or ())
+
+    @property
+    def delays_given(self) -> tuple[float, float] | None:
+        """The range that holds the delays of all inputs; None where that of one is to be chosen."""
+        own = [one.delay_bounds for one in self.inputs or ()]
+        given = [self.delay_bounds if bounds is None else bounds for bounds in own] or [self.delay_bounds]
+        known = [bounds for bounds in given if bounds is not None]
+        if len(known) < len(given):
+            return None
+        return min(low for low, _ in known), max(high for _, high in known)
+
+    @property
+    def delays_of_inputs(self) -> tuple[InputModel, ...] | None:
+        """The given ranges of single inputs."""
+        own = [InputModel(one.name, delay_bounds=one.delay_bounds) for one in self.inputs or ()]
+        return tuple(one for one in own if one.delay_bounds is not None) or None
 
     @property
     def span(self) -> Span:
-        """Structures that are admitted."""
+        """Structures that are admitted; where inputs have degrees of their own, small ones to compare treatments."""
+        if self.typed:
+            own = [one.integrators for one in self.inputs or () if one.integrators is not None]
+            treated = None not in (self.initial_state, self.offset, self.delays_given) and self.hold != "auto"
+            # Where nothing of the treatment is open the smallest will do.
+            poles, zeros = ((1, 1), (0, 0)) if treated else ((1, 3), (0, 2))
+            return Span(poles, zeros, (max(own, default=self.integrators or 0),))
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )
@@ -80,6 +110,7 @@ class Given:
             integrators=self.integrators or 0,
             input_before=self.input_before,
             noise_model=self.noise_model,
+            inputs=self.inputs,
         )
 
 
@@ -129,10 +160,13 @@ class Choice:
         options = self.options
         found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
         found += ["--integrators", f"{options.integrators}"] if options.integrators else []
-        low, high = options.delay_bounds
-        found += ["--delay", f"{low:g}:{high:g}" if low < high else f"{low:g}"]
+        for one in (None, *(options.inputs or ())):
+            bounds, of = (options.delay_bounds, "") if one is None else (one.delay_bounds, f"{one.name}=")
+            if bounds is not None:
+                low, high = bounds
+                found += ["--delay", f"{of}{low:g}:{high:g}" if low < high else f"{of}{low:g}"]
         found += ["--initial-state", options.initial_state, "--offset", options.offset]
         if options.initial_state == "rest" and options.offset != "remove":
             before = options.input_before
             found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
-        return [*found, "--hold", self.records[0].input.hold]
+        return [*found, *(word for text in self.records[0].hold_options for word in ("--hold", text))]

@@ -7,14 +7,15 @@ that an unknown input before the record leaves to an estimated state.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from ctid_cli.estimation.common import check_greatest_delay
 from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
-from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
+from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking
 from ctid_cli.identification.initial_states import (
@@ -27,11 +28,11 @@ from ctid_cli.identification.initial_states import (
 )
 from ctid_cli.identification.parts import FEW, MANY, parts_of
 from ctid_cli.inference.input_response import analyse_response
-from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import input_moves
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
 from ctid_cli.signals.record import Record
+from ctid_cli.signals.treatment import Holds
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
 LATEST, LATER = 0.1, 0.5
@@ -73,9 +74,9 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     several = [records] if isinstance(records, Record) else list(records)
     given = given or Given()
     given.check()
-    if given.delay_bounds is not None:
+    if given.delays_given is not None:
         for record in several:
-            check_greatest_delay(record, given.delay_bounds[1])
+            check_greatest_delay(record, given.delays_given[1])
     return _Choosing(several, given, time_unit).choice()
 
 
@@ -90,13 +91,16 @@ class _Choosing:
         whole = given.initial_state == "periodic"
         self.few, self.from_start = (records, True) if whole else parts_of(records, FEW)
         self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
-        self.first_hold: Hold = "zoh" if given.hold == "auto" else given.hold
+        self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
+        self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
         self.said: list[str] = []
 
     def choice(self) -> Choice:
         """Return what is chosen."""
         delays, latest = self._delays()
         setting = self._setting(self.span, delays)
+        if self.given.typed:
+            return self._typed(setting, delays)
         ranking = self._grid(setting, delays)
         # Small models may miss so much that a state makes up for it, or that their delay is far too long.
         span, narrower = Span.only(ranking.best.options), self._range_of(ranking, delays)
@@ -105,18 +109,33 @@ class _Choosing:
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
-        while self.given.delay_bounds is None and _at_end(ranking, delays) and delays[1] < latest:
+        while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = self._grid(setting, delays)
+        said = [*self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
+        return self._chosen(ranking.best.options, setting, ranking, said)
+
+    def _typed(self, setting: Setting, delays: tuple[float, float]) -> Choice:
+        """Return the choice where the degrees of each input are given."""
+        ranking = self.models.compared([setting])
+        delays = self._range_of(ranking, delays)
+        given, treated = self.given, ranking.best.options
+        degrees: Any = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
+        options = replace(treated, **degrees, delay_bounds=delays, inputs=given.inputs)
+        said = sentences.of_range(ranking, delays, given, self.time_unit)
+        return self._chosen(options, setting, ranking, said)
+
+    def _chosen(self, options: DelayProfile, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
+        """Return a choice with what was said of it."""
         best = ranking.best
-        options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
+        options = replace(options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
         options = replace(options, noise_model=self.given.noise_model)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
         measured = best.options.prepare(fitted).laid_out
-        answer = response_test(measured.records, measured.used(), delays, setting.initial_state)
-        said = [*self.said, *self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
+        answer = answer_of(best.options, measured.records, measured.used())
+        said = [*self.said, *about]
         said += [sentences.of_criterion(ranking)] * bool(said)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
         return Choice(options, held, fitted, ranking, answer, tuple(said))
@@ -124,47 +143,65 @@ class _Choosing:
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        return grid(self.many, setting, self.span, delays)
+        return grid(self.many, setting, self.span, delays, self.several)
+
+    def _small(
+        self,
+        records: list[Record],
+        span: Span,
+        delays: tuple[float, float],
+        near: AnyModel | None = None,
+        most: int = len(SMALL),
+    ) -> SmallModels:
+        return SmallModels(records, span, delays, most, near, self.several)
 
     # --- the range of the delay ------------------------------------------------------------------------
 
     def _delays(self) -> tuple[tuple[float, float], float]:
         """Return the range of the delay, and how far it may be extended [s]."""
-        given = self.given.delay_bounds
+        given = self.given.delays_given
         if given is not None:
             return given, given[1]
         length = min(record.duration for record in self.few)
-        hints = [analyse_response(record).delay for record in self.few]
+        hints = [analyse_response(each).delay for record in self.few for each in record.each_input]
         seen = max((2.0 * hint.late for hint in hints if hint is not None), default=0.0)
         latest = _rounded(min(max(LATEST * length, seen), LATER * length))
         # An estimated state does no harm to the delay; rest may.
         settings = self._settings(latest)[-1:]
-        models = SmallModels(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        models = self._small(self._common(settings, latest), self.span, (0.0, latest), most=2).compared(settings)
+        self._note(models)
         return self._range_of(models, (0.0, latest)), latest
+
+    def _note(self, models: Ranking) -> None:
+        """Keep the delays of the best small model, from which later searches of several inputs start."""
+        if self.several.first_delays is None:
+            self.several = self.several._replace(first_delays=tuple(delays_of(models.best.fit.model)))
 
     def _range_of(self, ranking: Ranking, delays: tuple[float, float]) -> tuple[float, float]:
         """Return the range that the delay of the best model asks for, within another; that one where it is given."""
-        if self.given.delay_bounds is not None:
+        if self.given.delays_given is not None:
             return delays
         interval = max(float(np.median(np.diff(record.t))) for record in self.few)
-        reach = REACH * ranking.best.fit.model.delay + FURTHER * interval
+        reach = REACH * max(delays_of(ranking.best.fit.model)) + FURTHER * interval
         return 0.0, _rounded(min(max(reach, 2.0 * FURTHER * interval), delays[1]))
 
     # --- state, offset and hold ------------------------------------------------------------------------
 
-    def _setting(self, span: Span, delays: tuple[float, float], near: TransferFunction | None = None) -> Setting:
+    def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
         """Return state, offset and hold, as structures of a span show them; their minima may be near a known model."""
         self.said = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
             # The level before the record is told by all samples, the first ones above all.
-            level = SmallModels(self.few, span, delays, near=near).compared(rests).best.options.input_before
+            level = self._small(self.few, span, delays, near).compared(rests).best.options.input_before
             settings = [each for each in settings if each.initial_state != "rest" or each.input_before == level]
-        models = SmallModels(self._common(settings, delays[1]), span, delays, near=near)
+        models = self._small(self._common(settings, delays[1]), span, delays, near)
         if self.given.offset is None:
             settings += [each._replace(offset="none") for each in settings]
-        best = self._treated(models.compared(settings), delays[1])
+        ranking = models.compared(settings)
+        self._note(ranking)
+        self.models, best = models, self._treated(ranking, delays[1])
         setting = Setting(self.first_hold, best.initial_state, best.input_before, best.offset)
         holds = self._holds()
         if len(holds) > 1:
@@ -205,16 +242,21 @@ class _Choosing:
         determined = excited_after(self.few, latest)
         return [state for state in found if state[0] != "estimate" or determined or len(found) == 1]
 
-    def _holds(self) -> list[Hold]:
+    def _holds(self) -> list[Holds]:
         """Return the holds to compare: an input that jumps between levels shows that it is held, as in most loops."""
-        if self.given.hold != "auto" or {input_moves(record).kind for record in self.records} != {"continuous"}:
+        if self.given.hold != "auto" or self._moves != {"continuous"}:
             return [self.first_hold]
         if any(record.feedback for record in self.records):
             return [self.first_hold]
-        if not all(np.array_equal(record.input.t, record.t) for record in self.records):
-            return [self.records[0].input.hold]
+        if not all(np.array_equal(one.t, record.t) for record in self.records for one in record.held.values()):
+            return [self.records[0].hold]
         regular = all(record.interval is not None for record in self.few)
         return [hold for hold in get_args(Hold) if regular or hold != "band-limited"]
+
+    @property
+    def _moves(self) -> set[str]:
+        """How the inputs move."""
+        return {input_moves(each).kind for record in self.records for each in record.each_input}
 
     def _common(self, settings: Sequence[Setting], latest: float) -> list[Record]:
         """Return the records with the samples that all settings can use."""
@@ -224,7 +266,7 @@ class _Choosing:
 
 
 def _at_end(ranking: Ranking, delays: tuple[float, float]) -> bool:
-    return ranking.best.fit.model.delay > AT_END * delays[1]
+    return max(delays_of(ranking.best.fit.model)) > AT_END * delays[1]
 
 
 def _rounded(delay: float) -> float:

@@ -24,7 +24,7 @@ from ctid_cli.inference.criteria import (
     squared_innovations,
 )
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
-from ctid_cli.signals.treatment import Hold
+from ctid_cli.signals.treatment import Holds
 
 #: What a parameter counts over its share in BIC. Of 134 simulated records of known structure, models so chosen had at
 #: most 1.25 times the error of the true structure in 87 %, with BIC itself in 84 %.
@@ -54,7 +54,7 @@ class Candidate:
     """
 
     options: DelayProfile
-    hold: Hold
+    hold: Holds
     fit: MeasuredFit
     size: int
     criterion: float = float("nan")
@@ -69,9 +69,11 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Poles and zeros, and integrators if there are any, for example ``2/1`` or ``1/0 + 1``."""
+        """Poles and zeros, and integrators if there are any: ``2/1``, ``1/0 + 1`` or, of several inputs, ``3/1,2``."""
         integrators = f" + {self.options.integrators}" if self.options.integrators else ""
-        return f"{self.options.poles}/{self.options.zeros}{integrators}"
+        own = [self.options.zeros if one.zeros is None else one.zeros for one in self.options.inputs or ()]
+        zeros = ",".join(map(str, own)) if len(set(own)) > 1 else f"{own[0] if own else self.options.zeros}"
+        return f"{self.options.poles}/{zeros}{integrators}"
 
 
 @dataclass(frozen=True, eq=False)

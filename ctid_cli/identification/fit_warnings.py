@@ -6,14 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.arrays import BoolArray
-from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.identification import Identification, free_directions, unsafe_intervals
+from ctid_cli.estimators.delay_profile import MeasuredFit, MultiInputFit
+from ctid_cli.estimators.identification import Identification, delay_names, free_directions, unsafe_intervals
 from ctid_cli.identification.remedies import Kind, Remedy, Trials, tried_remedies
 from ctid_cli.inference.covariance import condition_number, describe_conditioning
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, input_dependence
 from ctid_cli.inference.signal_features import growth_time, residual_outliers, saturated
 from ctid_cli.inference.uncertainty import Uncertainty
+from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed
 
@@ -52,9 +53,11 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     """Try changes of a fit, and return its warnings, the costliest first."""
     fit, records = found.fit, found.records
     growing = [
-        growth_time(record.t[use], record.y[use], record.input.at(record.t[use])) for record, use in _used(found)
+        growth_time(record.t[use], record.y[use], signal.at(record.t[use]))
+        for record, use in _used(found)
+        for signal in record.held.values()
     ]
-    if any(np.isfinite(growing)):
+    if all(np.isfinite(growing)):
         fastest = float(np.nanmin(growing))
         what = f"The output diverges: it grows by a factor of e every {fastest:.2g} {time_unit}, and the input does not"
         return [FitWarning(f"{what}; an unstable plant is not among the models")]
@@ -63,11 +66,15 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
         unfinished = fit.status.value.removesuffix(".")
         return [FitWarning(f"{unfinished}{loop * any(record.loop is not None for record in records)}")]
     seen = found.answer.seen
-    suspicious = fit.fit_percent < LOW_FIT or fit.status is not Status.CONVERGED or len(found.tests) < len(records)
+    suspicious = (
+        fit.fit_percent < LOW_FIT
+        or fit.status is not Status.CONVERGED
+        or len(found.tests) < len(records) * len(delays_of(fit.model))
+    )
     suspicious |= not all(test.white and test.uncorrelated for test in found.tests)
     # Changes are compared as output-error fits are.
     tried = Trials([], [])
-    if fit.noise is None:
+    if fit.noise is None and not isinstance(fit, MultiInputFit):
         tried = tried_remedies(records, found.options, fit, suspicious=suspicious, response=seen)
     named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
     mended = {remedy.kind for remedy in tried.remedies}
@@ -100,7 +107,7 @@ def _observed(remedy: Remedy, found: Identification, time_unit: str) -> str:
     if remedy.kind == "loss":
         return _outliers(found, time_unit)
     if remedy.kind == "hold":
-        return f"The input is taken with --hold {found.records[0].input.hold}"
+        return f"The input is taken with --hold {' --hold '.join(found.records[0].hold_options)}"
     if remedy.kind == "treatment":
         return f"The fit is made with --initial-state {options.initial_state} --offset {options.offset}"
     low, high = options.delay_bounds
@@ -120,10 +127,13 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
     if test is None or not p < least:
         return ""
     later = int(np.argmax(np.abs(test.cross_correlation))) < test.lags
-    if later and found.records[k - 1].feedback:  # as the input of a loop must
+    names = list(found.records[0].held)
+    record, name = divmod(k - 1, len(names))
+    if later and found.records[record].feedback:  # as the input of a loop must
         return ""
-    of = f" of experiment {k}" * (len(found.records) > 1)
-    return f"The residuals{of} depend on the input{', most on later values' * later} (p = {p:.2g})"
+    of = f" of experiment {record + 1}" * (len(found.records) > 1)
+    which = f" {names[name]}" * (len(names) > 1)
+    return f"The residuals{of} depend on the input{which}{', most on later values' * later} (p = {p:.2g})"
 
 
 def _outliers(found: Identification, time_unit: str) -> str:
@@ -183,7 +193,11 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
         e, psi, t = fit.residuals[k], fit.sensitivities[k], record.t[use]
         acting = found.options._acting(record)
         x = record.y[use] - (found.fit.residuals[k] if noisy else e)
-        seen = input_dependence(e, x, psi, t, acting, fit.model.delay)
+        dependences = [
+            input_dependence(e, x, psi, t, one, delay)
+            for one, delay in zip(acting.each_input, delays_of(fit.model), strict=True)
+        ]
+        seen = min(filter(None, dependences), key=lambda each: each.feedback_p_value, default=None)
         if seen is None or seen.feedback_share < FEEDBACK_SHARE:
             continue
         # Dynamics that are missed may leave something for later inputs to tell.
@@ -219,8 +233,12 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
         why = "".join(f"; the {limit.what} is {value:.4g}: {limit.meaning}" for _, limit, value in met)
         yield f"Held at the border of the admissible models: {held} (poles, rad/{time_unit}){why}"
     if fit.status is Status.DELAY_AT_BOUND:
-        where = f"end of its range, {fit.model.delay:.4g} {time_unit}" if fit.model.delay else "least possible, 0"
-        yield f"The delay is at the {where}, and has no standard error"
+        names, delays = delay_names(fit), delays_of(fit.model)
+        for name, delay in zip(names, delays, strict=True):
+            if name in fit.parameter_names and not fit.tangent[fit.parameter_names.index(name)].any():
+                where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
+                of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
+                yield f"The delay{of} is at the {where}, and has no standard error"
     if fit.poles_at_infinity:
         lost = "1 pole runs" if fit.poles_at_infinity == 1 else f"{fit.poles_at_infinity} poles run"
         yield f"{lost} to infinity: more than {fit.model.order} lower the cost no further"
@@ -255,12 +273,12 @@ def _of_uncertainty(found: Identification, time_unit: str) -> Iterator[str]:
         what = f"Intervals of {listed(unsafe)} are" if len(unsafe) > 1 else f"The interval of {unsafe[0]} is"
         yield f"{what} unsafe: so far from the estimate the output is not linear in the parameters"
     low, high = found.options.delay_bounds
-    interval = found.delay_interval
+    interval = None if isinstance(fit, MultiInputFit) else found.delay_interval
     # Below zero there is nothing left to search.
     ends = (
         [] if interval is None else [f"{low:g}"] * (interval.open_low and low > 0) + [f"{high:g}"] * interval.open_high
     )
     if ends:
         yield f"The interval of the delay reaches the end of its range ({' and '.join(ends)} {time_unit})"
-    if len(found.tests) < len(fit.residuals):
+    if len(found.tests) < len(fit.residuals) * len(delays_of(fit.model)):
         yield f"Fewer than {FEWEST_TESTED} residuals are too few to test; standard errors take them as white"

@@ -82,7 +82,7 @@ def identify(
     choice = choose(several, given, time_unit)
     if given.poles is None and not choice.seen:
         raise DataError(f"{choice.why_none} Give the number of poles (--poles) to fit a model all the same.")
-    other = None if validation is None else with_hold(validation, choice.records[0].input.hold)
+    other = None if validation is None else with_hold(validation, choice.records[0].hold)
     if other is not None:
         # Refused before the fit takes its time.
         laid_out_for(other, choice.options, given)

@@ -40,8 +40,9 @@ def states_of(records: Sequence[Record], given: Given) -> list[State]:
     if given.offset == "remove":
         both: list[State] = [("rest", None), ("estimate", None)]
         return both if state is None else both[:1]
-    first = [float(record.input.values[0]) for record in records]
-    varies = all(np.ptp(record.input.values) > 0.0 for record in records)
+    signals = [signal for record in records for signal in record.held.values()]
+    first = [float(signal.values[0]) for signal in signals]
+    varies = all(np.ptp(signal.values) > 0.0 for signal in signals)
     levels: list[InputBefore] = ["first"] if before is None else [before]
     if before is None and varies and any(first):
         levels.append(None)
@@ -54,7 +55,7 @@ def excited_after(records: Sequence[Record], delay: float) -> bool:
 
     A state explains most of the response to a single step that comes soon after.
     """
-    for record in records:
+    for record in (each for whole in records for each in whole.each_input):
         later = record.t >= record.t[0] + delay
         u, whole = record.input.at(record.t[later]), record.input.at(record.t)
         if u.size < 2 or np.ptp(u) <= EXCITED * np.ptp(whole):
@@ -67,7 +68,8 @@ def excited_after(records: Sequence[Record], delay: float) -> bool:
 
 def changes_at_the_beginning_only(records: Sequence[Record]) -> bool:
     """Whether all inputs are constant but for the first samples: an integrator then answers as a drift does."""
-    return all(np.ptp(record.input.at(record.t[LEAD:])) == 0.0 for record in records if record.t.size > LEAD)
+    long = [record for record in records if record.t.size > LEAD]
+    return all(np.ptp(signal.at(record.t[LEAD:])) == 0.0 for record in long for signal in record.held.values())
 
 
 def without_beginning(records: Sequence[Record], length: float) -> list[Record]:

@@ -32,10 +32,12 @@ def parts_of(records: Sequence[Record], most: int) -> Parts:
 
 
 def _part(record: Record, most: int) -> tuple[Record, bool]:
-    signal = record.input
     thinned = -(-record.n_samples // most)
     if thinned == 1:
         return record, True
+    if record.several:
+        return beginning(record, most), True
+    signal = record.input
     if input_moves(record).kind in ("constant", "steps") or not np.array_equal(signal.t, record.t):
         # Seldom does anything happen, and all of it must be seen.
         moves = np.append(True, np.diff(signal.values) != 0) | (signal.hold != "zoh")

@@ -23,7 +23,7 @@ from ctid_cli.inference.signal_features import input_moves, residual_outliers
 from ctid_cli.models.additive import Term
 from ctid_cli.signals.held import Hold, regular_interval
 from ctid_cli.signals.record import Record, beginning
-from ctid_cli.signals.treatment import Offset
+from ctid_cli.signals.treatment import Holds, Offset
 
 #: Samples of all records on which changes are tried.
 MOST_SAMPLES = 10_000
@@ -58,7 +58,7 @@ class Remedy:
     option: str
     #: The changed estimator, and the input between its samples.
     options: Options
-    hold: Hold
+    hold: Holds
     #: Fit of blocks that were held back without and with the change, and standard error of the difference [%]; or the
     #: criterion [-], and NaN.
     before: float
@@ -89,7 +89,7 @@ class Trial:
 
     kind: Kind
     options: Any
-    hold: Hold
+    hold: Holds
     records: tuple[Record, ...]
     fit: MeasuredFit
 
@@ -159,7 +159,7 @@ def tried_remedies(
     # A record in a loop cannot be cut.
     most = np.inf if submodels else max(MOST_SAMPLES // len(records), 1)
     part = tuple(record if record.n_samples <= most else beginning(record, int(most)) for record in records)
-    base = Trial("structure", options, records[0].input.hold, part, fit)
+    base = Trial("structure", options, records[0].hold, part, fit)
     found = Trials([], [])
     try:
         if isinstance(options, DelayProfile) and any(map(is_not, part, records)):
@@ -199,7 +199,7 @@ class Change:
     """An estimator and a hold, and where the search for their estimate begins."""
 
     options: Any
-    hold: Hold
+    hold: Holds
     starts: tuple[Near, ...]
 
 

@@ -6,7 +6,8 @@ from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
-from ctid_cli.text import count
+from ctid_cli.models.several_inputs import delays_of
+from ctid_cli.text import count, listed
 
 #: What is said where the beginning of a record is not looked at.
 STATE_OF_PART = (
@@ -25,6 +26,9 @@ def spelled(options: Options) -> str:
     """Return a structure in words: poles, zeros and integrators, of each submodel if there are several."""
     if not isinstance(options, MeasuredSubmodels | AdditiveOutputError) or not options.factored:
         zeros = count(options.zeros, "zero") if options.zeros else "no zero"
+        own = [one for one in getattr(options, "inputs", None) or () if one.zeros is not None]
+        if own:
+            zeros = f"numerators of degree {listed(f'{one.zeros} ({one.name})' for one in own)}"
         return f"{count(options.poles, 'pole')}, {zeros}{_integrators(getattr(options, 'integrators', 0))}"
     terms = options.terms
     parts = ", ".join(f"{term.poles}/{term.zeros}{_integrators(term.integrators)}" for term in terms)
@@ -81,7 +85,7 @@ def of_offset(models: Ranking) -> str:
 def of_hold(models: Ranking) -> str:
     """Return the hold."""
     other = models.runner_up("hold")
-    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else other.hold)}."
+    return f"Hold: {models.best.hold} (--hold); {_below(models, other, '' if other is None else str(other.hold))}."
 
 
 def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
@@ -91,9 +95,15 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
-    if given.delay_bounds is None:
-        found.append(f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay).")
-    return found
+    return found + of_range(ranking, delays, given, time_unit)
+
+
+def of_range(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
+    """Return the range of the delay where it was chosen."""
+    if given.delays_given is not None:
+        return []
+    at = listed(f"{delay:.4g}" for delay in delays_of(ranking.best.fit.model))
+    return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay), found at {at} {time_unit}."]
 
 
 def of_criterion(ranking: Ranking) -> str:

@@ -185,7 +185,7 @@ def _response_p_value(record: Record) -> float:
     """Probability that the output follows the input by chance, with the system in equilibrium at first."""
     signal = record.input
     moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
-    test = response_test([replace(record, input=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
+    test = response_test([record.driven_by(u=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
     return test.p_value
 
 

@@ -84,26 +84,6 @@ class Structure:
         """Standard row of the output error."""
         return 3 * self.poles + 1
 
-    @property
-    def denominators(self) -> IndexArray:
-        """Places of the coefficients of the denominator."""
-        return np.arange(self.poles)
-
-    def theta_of(self, model: Model) -> Array:
-        """Parameters of a model of this structure."""
-        assert isinstance(model, TransferFunction)
-        theta = np.zeros(self.size)
-        theta[: self.poles] = model.denominator[1:]
-        last = self.poles + self.zeros + 1
-        theta[last - model.numerator.size : last] = model.numerator
-        theta[last:] = model.delay
-        return theta
-
-    def fractions_of(self, theta: Array) -> tuple[list[tuple[Array, Array]], Array]:
-        """Return B and the monic A of each fraction, and the derivatives of their coefficients by the parameters."""
-        n, last = self.poles, self.poles + self.zeros + 1
-        return [(theta[n:last], np.concatenate(([1.0], theta[:n])))], np.eye(last)
-
 
 @dataclass(frozen=True)
 class SumStructure:

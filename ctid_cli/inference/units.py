@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.signals.measurement import Measurement
+from ctid_cli.signals.measurement import SEPARATOR, Measurement
 from ctid_cli.signals.sampled_signal import SECONDS
 from ctid_cli.signals.table import Role, split_header
 
@@ -40,8 +40,16 @@ class Units:
         return f"{name} [{unit}]" if self.is_known(unit) else name
 
     def column(self, measurement: Measurement, role: Role) -> str:
-        """Return the name of a column of a record with its unit."""
-        return self.label(split_header(str(getattr(measurement, role)))[0], getattr(self, role))
+        """Return the name of a column of a record with its unit; of several inputs each."""
+        names = measurement.inputs if role == "input" and measurement.inputs else (str(getattr(measurement, role)),)
+        return SEPARATOR.join(
+            self.label(split_header(name)[0], getattr(self.of_input(k), role)) for k, name in enumerate(names)
+        )
+
+    def of_input(self, k: int) -> "Units":
+        """Units of one of several inputs, whose labels stand one after the other."""
+        labels = self.input.split(SEPARATOR)
+        return replace(self, input=labels[k]) if len(labels) > 1 else self
 
     def amount(self, text: str, unit: str) -> str:
         """Return a number with its unit, where the unit is known."""

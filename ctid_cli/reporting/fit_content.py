@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -11,15 +12,16 @@ import numpy as np
 from ctid_cli.canonical import plain
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import MeasuredFit
+from ctid_cli.estimators.delay_profile import MeasuredFit, MultiInputFit
 from ctid_cli.estimators.identification import Identification, Validation
 from ctid_cli.estimators.loop_output_error import LoopFit
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
-from ctid_cli.inference.derived import modes_of
+from ctid_cli.inference.derived import GAIN_UNIT, modes_of
 from ctid_cli.inference.intervals import BIASED, UncertainValue
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.units import Units
 from ctid_cli.models.additive import AdditiveModel
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.document import Column
 from ctid_cli.reporting.estimate import parameter_rows
 from ctid_cli.reporting.layout import picked
@@ -45,17 +47,11 @@ def fit_content(
 ) -> dict[str, Any]:
     """Return the fit for ``fit.json`` and ``ctid fit --json``."""
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
-    profile, validation, additive = fit.profile, fitted.validation, additive_of(fit)
+    profile, validation = fit.profile, fitted.validation
     measurements, units = records.measurements, units or records.units
-    hold = measurements[0].record.input.hold if measurements else None
-    numerator = [item.estimate for item in fitted.estimates if item.name.startswith("b")]
+    hold = measurements[0].hold if measurements else None
     content = {
-        "model": {
-            "numerator": numerator or fit.model.numerator,
-            "denominator": fit.model.denominator,
-            "delay": fit.model.delay,
-            **({} if additive is None else {"submodels": [asdict(part) for part in additive.submodels]}),
-        },
+        "model": _model_object(fitted),
         "parameters": parameter_rows(parameters_of(fitted, units)),
         **picked(fit, ("fit_percent", "r2", "cost")),
         "loss": _loss_object(fit, records.data),
@@ -95,8 +91,25 @@ def fit_content(
     return dict(plain(content))
 
 
+def _model_object(fitted: Identification) -> dict[str, Any]:
+    """Return the model; of several inputs a transfer function for each."""
+    fit, additive = fitted.fit, additive_of(fitted.fit)
+    if isinstance(fit, MultiInputFit):
+        parts = {name: _fraction_object(part) for name, part in fit.model.parts.items()}
+        return {"inputs": parts, "common_denominator": fit.model.common}
+    numerator = [item.estimate for item in fitted.estimates if item.name.startswith("b")]
+    found = _fraction_object(fit.model) | ({"numerator": numerator} if numerator else {})
+    return found if additive is None else {**found, "submodels": [asdict(part) for part in additive.submodels]}
+
+
+def _fraction_object(model: TransferFunction) -> dict[str, Any]:
+    return {"numerator": model.numerator, "denominator": model.denominator, "delay": model.delay}
+
+
 def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Parameters with the units of the records."""
+    if isinstance(result.fit, MultiInputFit):
+        return [replace(item, unit=_unit_of_input(item.name, result.fit, units)) for item in result.estimates]
     additive, poles, zeros = additive_of(result.fit), result.fit.model.order, result.options.zeros
     monic = isinstance(result.options, AdditiveOutputError)
     # The states of a loop are those of plant and controller, in different units.
@@ -110,6 +123,16 @@ def parameters_of(result: Identification, units: Units) -> list[UncertainValue]:
     return [replace(item, unit=unit(item.name)) for item in result.estimates]
 
 
+def _unit_of_input(name: str, fit: MultiInputFit, units: Units) -> str:
+    """Unit of a parameter of a model with several inputs."""
+    for k, (own, model) in enumerate(fit.model.parts.items()):
+        if name.startswith(f"{own}_"):
+            bare = name.removeprefix(f"{own}_")
+            zeros = sum(re.fullmatch(rf"{re.escape(own)}_b\d+", each) is not None for each in fit.parameter_names) - 1
+            return units.of_input(k).of(bare, model.order, zeros)
+    return units.of(name, fit.model.order, 0)
+
+
 def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
     """The submodels of a fit, None of a fit of one transfer function."""
     return fit.additive if isinstance(fit, SubmodelsFit) else None
@@ -117,11 +140,15 @@ def additive_of(fit: MeasuredFit) -> AdditiveModel | None:
 
 def derived_of(result: Identification, units: Units) -> list[UncertainValue]:
     """Derived quantities in the units of the records; frequencies that are called Hz are in Hz."""
-    names = {"s": units.time, "rad/s": f"rad/{units.time}", "output unit/input unit": units.gain}
+    names = {"s": units.time, "rad/s": f"rad/{units.time}", GAIN_UNIT: units.gain}
     found = []
     for row in result.derived:
         if row.unit != "Hz":
-            found.append(replace(row, unit=names.get(row.unit, row.unit)))
+            unit = names.get(row.unit, row.unit)
+            if row.unit == GAIN_UNIT and isinstance(result.fit, MultiInputFit):
+                place = list(result.fit.model.parts).index(row.name.removesuffix("_static_gain"))
+                unit = units.of_input(place).gain
+            found.append(replace(row, unit=unit))
         elif (seconds := units.seconds) is not None:
             scaled = {name: getattr(row, name) / seconds for name in ("estimate", "standard_error", "low", "high")}
             found.append(replace(row, **scaled))
@@ -147,7 +174,7 @@ def _box_object(box: Box, held: Iterable[complex]) -> dict[str, Any]:
         "poles": (box.slowest, box.fastest),
         "imaginary_part": box.imaginary if np.isfinite(box.imaginary) else None,
         "damping": box.least_damping,
-        "delay": box.delays,
+        "delay": box.delays if box.several_delays else box.each_delay[0],
         "met": [
             {"limit": name, "what": limit.what, "value": value, "meaning": limit.meaning, "reason": limit.reason}
             for name, limit, value in box.limits_met(held)
@@ -188,7 +215,7 @@ def _record_object(measurement: Measurement, use: Any) -> dict[str, Any]:
         "start": float(record.t[0]),
         "stop": float(record.t[-1]),
         "regular": record.interval is not None,
-        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
+        "columns": {"time": measurement.time, "input": measurement.columns, "output": measurement.output},
     }
 
 

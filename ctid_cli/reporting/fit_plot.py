@@ -11,6 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, BoolArray, IndexArray, IntArray
 from ctid_cli.estimators.identification import Identification
 from ctid_cli.inference.units import Units
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.figures.style import BAND, DARK, LIGHT, STRIPES, Drawing, name_axes, outline, plain
 from ctid_cli.signals.measurement import Measurement
 
@@ -34,24 +35,17 @@ class FitFigures:
     units: Units
 
     @property
-    def _drawn(self) -> int:
+    def drawn(self) -> int:
+        """How many experiments are drawn."""
         return min(len(self.measurements), MOST_DRAWN)
 
     def all(self) -> Drawing:
         """Output and residuals of each experiment, autocorrelation, and the search over the delay."""
-        n = self._drawn
+        n = self.drawn
 
         def draw(figure: Figure) -> None:
             grid = figure.add_gridspec(2 * n + 1, 2, height_ratios=[2, 1.2] * n + [2])
-            for k in range(n):
-                output = figure.add_subplot(grid[2 * k, :])
-                self.draw_output(output, k)
-                output.tick_params(labelbottom=False)
-                error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
-                self.draw_residuals(error, k)
-                for axes in (output, error):
-                    axes.margins(x=0.0)
-                self._name_panels(output, error, k)
+            self.draw_experiments(figure, grid)
             self.draw_autocorrelation(figure.add_subplot(grid[-1, 0]))
             self.draw_profile(figure.add_subplot(grid[-1, 1]))
 
@@ -67,12 +61,12 @@ class FitFigures:
 
     def _by_experiment(self, part: Callable[[Any, int], None]) -> Drawing:
         def draw(figure: Figure) -> None:
-            for k, axes in enumerate(figure.subplots(self._drawn, 1, squeeze=False)[:, 0]):
+            for k, axes in enumerate(figure.subplots(self.drawn, 1, squeeze=False)[:, 0]):
                 part(axes, k)
                 axes.margins(x=0.0)
                 self._name_panels(axes, axes, k)
 
-        return Drawing(8.0, 2.8 * self._drawn, draw)
+        return Drawing(8.0, 2.8 * self.drawn, draw)
 
     def correlations(self) -> Drawing:
         """Correlation of the residuals, or innovations, with themselves and with the input."""
@@ -80,16 +74,23 @@ class FitFigures:
         def draw(figure: Figure) -> None:
             both = figure.subplots(1, 2)
             self.draw_autocorrelation(both[0])
-            tests = self.result.tests
-            name_axes(
-                both[1], y=f"correlation of the {self.result.fit.left_over}\nwith the delayed {self.result.driver} [-]"
-            )
-            self._draw_lags(both[1], [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests])
-            _draw_band(both[1], [test.cross_correlation_band for test in tests], tests[0].level, "independent")
+            self.draw_cross_correlation(both[1])
 
         return Drawing(8.0, 3.0, draw)
 
     # --- panels ------------------------------------------------------------------------------------
+
+    def draw_experiments(self, figure: Figure, grid: Any) -> None:
+        """Output and residuals of the first experiments, each in two rows of a grid."""
+        for k in range(self.drawn):
+            output = figure.add_subplot(grid[2 * k, :])
+            self.draw_output(output, k)
+            output.tick_params(labelbottom=False)
+            error = figure.add_subplot(grid[2 * k + 1, :], sharex=output)
+            self.draw_residuals(error, k)
+            for axes in (output, error):
+                axes.margins(x=0.0)
+            self._name_panels(output, error, k)
 
     def draw_output(self, axes: Any, k: int) -> None:
         """The measured output of an experiment, the simulated one, and what counts for little."""
@@ -117,11 +118,27 @@ class FitFigures:
 
     def draw_autocorrelation(self, axes: Any) -> None:
         """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
-        tests = self.result.tests
+        tests = self.result.tests[:: self._inputs]
         name_axes(axes, y=f"autocorrelation\nof the {self.result.fit.left_over} [-]")
         self._draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests])
         if tests:
             _draw_band(axes, [test.autocorrelation_band for test in tests], tests[0].level, "white")
+
+    def draw_cross_correlation(self, axes: Any) -> None:
+        """Correlation of the residuals of each experiment with its delayed input, or each of several."""
+        result, tests = self.result, self.result.tests
+        name_axes(axes, y=f"correlation of the {result.fit.left_over}\nwith the delayed {result.driver} [-]")
+        self._draw_lags(axes, [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests])
+        _draw_band(axes, [test.cross_correlation_band for test in tests], tests[0].level, "independent")
+
+    @property
+    def delay(self) -> float:
+        """The estimated delay, of several inputs that of the first."""
+        return fractions_of(self.result.fit.model)[0].delay
+
+    @property
+    def _inputs(self) -> int:
+        return len(fractions_of(self.result.fit.model))
 
     def _draw_lags(self, axes: Any, curves: Sequence[tuple[IntArray, Array]]) -> None:
         axes.set_xlabel("lag [samples]")
@@ -134,22 +151,22 @@ class FitFigures:
     def draw_profile(self, axes: Any) -> None:
         """The search over the delay."""
         fit, units = self.result.fit, self.units
-        profile, found = fit.profile, f"{fit.model.delay:.4g} {units.time}"
+        profile, found = fit.profile, f"{self.delay:.4g} {units.time}"
         if profile is None:
             low, high = self.result.options.delay_bounds
             label = plain(f"{'estimated' if low < high else 'known'} delay {found}")
-            axes.plot([fit.model.delay], [fit.cost], "o", color=DARK, label=label)
+            axes.plot([self.delay], [fit.cost], "o", color=DARK, label=label)
         else:
             whole = profile.samples >= fit.count
             part = "" if whole else f" of the most active {profile.samples} samples"
             part += "" if profile.cutoff is None else f" below {profile.cutoff:.3g} rad/{units.time}"
             axes.plot(profile.delays, profile.costs, ".-", color=DARK, lw=0.8, ms=4, label=plain(f"profile{part}"))
             if profile.cutoff is None and whole and fit.noise is None:
-                axes.plot([fit.model.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
+                axes.plot([self.delay], [fit.cost], "v", color="black", ms=7, label=plain(f"minimum at {found}"))
             else:
                 # The cost of the estimate is that of all frequencies and samples, or of the innovations.
                 what = "minimum at" if fit.noise is None else "estimate with the noise model:"
-                axes.axvline(fit.model.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
+                axes.axvline(self.delay, color="black", linewidth=0.8, label=plain(f"{what} {found}"))
         low, high = axes.get_ylim()
         if profile is not None and 0.0 < STEEP * profile.costs.min() < profile.costs[np.isfinite(profile.costs)].max():
             # The least cost would lie on the axis of a straight scale, whatever the others around it are.

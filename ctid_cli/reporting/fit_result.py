@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from ctid_cli.errors import StorageError
-from ctid_cli.estimators.delay_profile import MeasuredFit
-from ctid_cli.estimators.identification import Identification, Options
+from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit, MultiInputFit
+from ctid_cli.estimators.identification import Identification, Options, models_of
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import SubmodelsFit
 from ctid_cli.identification.sentences import spelled
@@ -22,17 +22,20 @@ from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.residual_tests import ResidualTests
 from ctid_cli.inference.robust_loss import Weighting
 from ctid_cli.inference.units import Units
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.document import Section, pairs
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
 from ctid_cli.reporting.fit_plot import FitFigures
+from ctid_cli.reporting.inputs_plot import inputs_drawing
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.model_plot import figure_chapters
 from ctid_cli.reporting.pages.page import Chapter, PagedResult
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Hold
@@ -110,7 +113,8 @@ class FitResult(PagedResult):
 
     def drawing(self) -> Drawing:
         """Return the figure of output, residuals, their correlation, and the search over the delay."""
-        return self.figures.all()
+        several = isinstance(self.fitted.fit, MultiInputFit)
+        return inputs_drawing(self.figures) if several else self.figures.all()
 
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and how well the model simulates."""
@@ -129,12 +133,14 @@ class FitResult(PagedResult):
 
     def chapters_of_numbers(self) -> Iterator[Chapter]:
         """Return data and model."""
-        model = self.fitted.fit.model
-        terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
-        equation = Section(sentences=[formula(terms, delayed=model.delay > 0, digits=DIGITS)])
+        equations = []
+        for name, model in zip(models_of(self.fitted), fractions_of(self.fitted.fit.model), strict=True):
+            terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+            equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
+            equations.append(f"Response to {name}: {equation}" if name else equation)
         quality = Section("How good it is", frame=pairs(self.quality()))
         yield Chapter("Data", [self.data(), Section(frame=pairs(self.settings()))])
-        yield Chapter("Model", [equation, self.parameters(), self.derived(), quality])
+        yield Chapter("Model", [Section(sentences=equations), self.parameters(), self.derived(), quality])
 
     def cited(self) -> list[str]:
         """Return the articles whose methods the fit used, and the frequency response that stands beside it."""
@@ -166,7 +172,6 @@ class FitResult(PagedResult):
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
         fit, options, units, first = self.fitted.fit, self.fitted.options, self.units, self.records.measurements[0]
-        hold = first.record.input.hold
         yield from self.structure()
         yield from _loop(options, first)
         if isinstance(fit, SubmodelsFit):
@@ -176,16 +181,23 @@ class FitResult(PagedResult):
             f"{TREATMENTS[options.initial_state]}{_before(self.fitted, options.initial_state)}",
         )
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
-        yield "input", f"{HOLDS[hold]} (--hold {hold}){_unknown_ends(first, options, units)}"
+        holds = [first.hold] if isinstance(first.hold, str) else first.hold
+        signals = list(first.record.held.values())
+        for hold, text, signal in zip(holds, first.record.hold_options, signals, strict=False):
+            of, _, _ = text.rpartition("=")
+            yield f"input {of}".strip(), f"{HOLDS[hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
     def structure(self) -> Iterator[tuple[str, str]]:
         """Return the structure of the model, and what of it was known."""
-        options, time = self.fitted.options, self.units.time
-        low, high = options.delay_bounds
-        searched = f"searched from {low:g} to {high:g} {time}" if low < high else f"known, {low:g} {time}"
-        yield "model", f"{spelled(options)}; delay {searched}"
+        fit, options, units = self.fitted.fit, self.fitted.options, self.units
+        if isinstance(fit, MultiInputFit) and isinstance(options, DelayProfile):
+            yield "model", "common denominator" if options.common else "a denominator for each input"
+            for name, own in zip(fit.model.parts, options._each(list(fit.model.parts)), strict=True):
+                yield f"input {name}", f"{spelled(own)}; delay {_searched(own, units)}"
+        else:
+            yield "model", f"{spelled(options)}; delay {_searched(options, units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
@@ -217,8 +229,11 @@ class FitResult(PagedResult):
         if isinstance(fit, SubmodelsFit):
             yield from fit.conditions
         yield from self.search()
-        for k, test in enumerate(self.fitted.tests, start=1):
-            yield fit.left_over if len(fit.residuals) == 1 else f"{fit.left_over} {k}", _tested(test)
+        names = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
+        for k, test in enumerate(self.fitted.tests):
+            record, place = divmod(k, len(names))
+            number_of = f" {record + 1}" * (len(fit.residuals) > 1)
+            yield f"{fit.left_over}{number_of}", _tested(test, f"{test.driver} {names[place]}".strip())
 
     def search(self) -> Iterator[tuple[str, str]]:
         """Return how the search went, and the bounds of the admissible models where it ended at them."""
@@ -261,9 +276,8 @@ class FitResult(PagedResult):
         return fit_content(self.fitted, self.records, self.predicted)
 
 
-def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> str:
+def _unknown_ends(signal: HeldSignal, options: Options, units: Units) -> str:
     """What is not known of a band-limited input for want of the samples beyond the ends."""
-    signal = measurement.record.input
     if signal.hold != "band-limited" or options.initial_state == "periodic":
         return ""
     doubt = band_limited_doubt(signal.t, signal.values)
@@ -271,6 +285,12 @@ def _unknown_ends(measurement: Measurement, options: Options, units: Units) -> s
     known = f"within {doubt.reach:.3g} {units.time} of the ends known to about {level}"
     rough = f"; {100 * doubt.beyond:.2g} % of its power is too close to the Nyquist frequency" * (doubt.beyond > 0.01)
     return f", {known}{rough}"
+
+
+def _searched(options: Options, units: Units) -> str:
+    """Range of the delay, or its known value."""
+    low, high = options.delay_bounds
+    return f"searched from {low:g} to {high:g} {units.time}" if low < high else f"known, {low:g} {units.time}"
 
 
 def _loop(options: Options, measurement: Measurement) -> Iterator[tuple[str, str]]:
@@ -292,7 +312,8 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     part = f" ({', '.join(less)})" if less else ""
     clock = "regular clock" if record.interval is not None else "irregular clock"
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
-    columns = f"input {units.column(measurement, 'input')}, output {units.column(measurement, 'output')}"
+    columns = f"input{'s' * record.several} {units.column(measurement, 'input')}, "
+    columns += f"output {units.column(measurement, 'output')}"
     return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
@@ -310,10 +331,12 @@ def _offset(result: Identification, units: Units) -> str:
     fit, options = result.fit, result.options
     if options.offset != "remove":
         return TREATMENTS[options.offset]
-    means = (
-        f"{units.amount(f'{u:.6g}', units.input)}, {units.amount(f'{y:.6g}', units.output)}"
-        for u, y in zip(fit.input_offsets, fit.offsets, strict=True)
-    )
+    count_of = len(fit.input_offsets) // len(fit.offsets)
+    each = [fit.input_offsets[k : k + count_of] for k in range(0, len(fit.input_offsets), count_of)]
+    means = []
+    for levels, level in zip(each, fit.offsets, strict=True):
+        of_inputs = [units.amount(f"{u:.6g}", units.of_input(k).input) for k, u in enumerate(levels)]
+        means.append(", ".join([*of_inputs, units.amount(f"{level:.6g}", units.output)]))
     return f"{TREATMENTS['remove']}: {'; '.join(means)}"
 
 
@@ -344,10 +367,10 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
 
 
-def _tested(test: ResidualTests) -> str:
+def _tested(test: ResidualTests, driver: str) -> str:
     """Return the outcome of the tests of residuals; the warnings say what to do."""
     white = "white" if test.white else "not white"
-    free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
+    free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {driver}"
     return f"{white} ({probability(test.whiteness_p_value)}), {free} ({probability(test.cross_p_value)})"
 
 

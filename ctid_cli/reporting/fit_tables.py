@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import pandas as pd
 
 from ctid_cli.errors import UsageError
 from ctid_cli.estimators.frequency_domain import FrequencyDomainFit
+from ctid_cli.estimators.identification import Identification, models_of
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.model_responses import FrequencyBand, ResponseBand
 from ctid_cli.inference.units import Units
@@ -23,17 +25,21 @@ if TYPE_CHECKING:
 def fit_tables(result: FitResult) -> dict[str, pd.DataFrame]:
     """Return what the page of a fit shows as tables by the names of their files; several records are numbered."""
     fitted, units = result.fitted, result.units
-    tables = {
-        "step.csv": response_frame(fitted.step_response(), units),
-        "bode.csv": frequency_frame(fitted.frequency_response(), units),
-    }
+    tables = {}
+    for k, (name, model) in enumerate(models_of(fitted).items()):
+        tail, own = f"_{name}" if name else "", units.of_input(k)
+        tables[f"step{tail}.csv"] = response_frame(model.step_response(), own)
+        tables[f"bode{tail}.csv"] = frequency_frame(model.frequency_response(), own)
     if isinstance(fitted.fit, FrequencyDomainFit):
         return tables | {"lines.csv": line_frame(fitted.fit, units)}
     several = len(result.records.data) > 1
     for k, record in enumerate(result.records.data):
         number, t = f"_{k + 1}" * several, f"t [{units.time}]"
         used, residuals = fitted.fit.used[k], fitted.fit.residuals[k]
-        columns = {t: record.t[used], units.label("input", units.input): record.input.at(record.t[used])}
+        columns = {t: record.t[used]}
+        for i, (name, signal) in enumerate(record.held.items()):
+            label = name if record.several else "input"
+            columns[units.label(label, units.of_input(i).input)] = signal.at(record.t[used])
         columns[units.label("measured", units.output)] = record.y[used]
         columns[units.label("simulated", units.output)] = record.y[used] - residuals
         tables[f"simulation{number}.csv"] = pd.DataFrame(columns)
@@ -76,9 +82,14 @@ def model_code(fit: FittedModel, tool: Tool, time_unit: str, pade: int | None = 
     """Return the name of a file and the code in it that builds a model in another tool, with every digit."""
     if pade is not None and tool != "control":
         raise UsageError(f"--pade is for control, which knows no delays, not for {tool}, where the delay stays exact")
+    models = models_of(fit) if isinstance(fit, Identification) else {"": fit}
+    variables = {name: "G" + f"_{re.sub(r'[^A-Za-z0-9_]', '_', name)}" * bool(name) for name in models}
     if tool == "matlab":
-        return "G.m", fit.to_matlab(time_unit=time_unit)
-    return f"G_{tool}.py", fit.to_python("G", tool, pade)
+        parts = [model.to_matlab(variables[name], time_unit=time_unit) for name, model in models.items()]
+        parts += [f"G = [{', '.join(variables.values())}];\n"] * (len(models) > 1)
+        return "G.m", "".join(parts)
+    parts = [model.to_python(variables[name], tool, pade) for name, model in models.items()]
+    return f"G_{tool}.py", "\n".join(parts)
 
 
 def stored_model_code(file: Path, tool: Tool, pade: int | None = None) -> str:

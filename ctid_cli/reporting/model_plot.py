@@ -9,10 +9,11 @@ import numpy as np
 
 from ctid_cli.arrays import ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimators.identification import DelayCosts, Identification, Validation, costs_about_delay
+from ctid_cli.estimators.identification import DelayCosts, Identification, Validation, costs_about_delay, models_of
 from ctid_cli.inference.frequency_response import FrequencyResponse, estimate_frequency_response
 from ctid_cli.inference.model_responses import FrequencyBand, PoleBand, ResponseBand
 from ctid_cli.inference.units import Units
+from ctid_cli.models.several_inputs import fractions_of
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, name_axes, plain
 from ctid_cli.reporting.fit_plot import MOST_DRAWN, FitFigures, draw_overlay
@@ -53,29 +54,34 @@ def bode_drawing(band: FrequencyBand, found: FrequencyResponse | None, units: Un
         if found is not None:
             around = np.interp(found.frequencies, band.frequencies, band.phase)
             draw_points(gain, phase, found, "without a model", around)
-        w, size, angle = band.frequencies, decibels(band.gain), np.rad2deg(band.phase)
-        low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
-        gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **_shade(band.level))
-        lower, upper = np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper)
-        phase.fill_between(w, lower, upper, where=upper - lower <= WIDEST_PHASE, **_shade(band.level))
-        for axes, values in ((gain, size), (phase, angle)):
-            axes.semilogx(w, values, label="model", **LINE)
-        name_response(gain, phase, phase, units)
+        draw_bode(gain, phase, band, units)
 
     return Drawing(8.0, 4.8, draw)
 
 
+def draw_bode(gain: Any, phase: Any, band: FrequencyBand, units: Units) -> None:
+    """Gain [dB] and phase [degrees] of a model with their bands."""
+    w, size, angle = band.frequencies, decibels(band.gain), np.rad2deg(band.phase)
+    low = np.maximum(decibels(band.gain_lower), size - WIDEST_GAIN)
+    gain.fill_between(w, low, np.minimum(decibels(band.gain_upper), size + WIDEST_GAIN), **_shade(band.level))
+    lower, upper = np.rad2deg(band.phase_lower), np.rad2deg(band.phase_upper)
+    phase.fill_between(w, lower, upper, where=upper - lower <= WIDEST_PHASE, **_shade(band.level))
+    for axes, values in ((gain, size), (phase, angle)):
+        axes.semilogx(w, values, label="model", **LINE)
+    name_response(gain, phase, phase, units)
+
+
 def step_drawing(band: ResponseBand, units: Units) -> Drawing:
     """Response to a step of size one, with its band."""
+    return Drawing(8.0, 2.8, lambda figure: draw_step(figure.add_subplot(), band, units))
 
-    def draw(figure: Figure) -> None:
-        axes = figure.add_subplot()
-        axes.fill_between(band.t, band.lower, band.upper, **_shade(band.level))
-        axes.plot(band.t, band.value, label="model", **LINE)
-        axes.margins(x=0.0)
-        name_axes(axes, f"time after the step [{units.time}]", units.label("output", units.gain), legend="best")
 
-    return Drawing(8.0, 2.8, draw)
+def draw_step(axes: Any, band: ResponseBand, units: Units) -> None:
+    """Response to a step of size one, with its band."""
+    axes.fill_between(band.t, band.lower, band.upper, **_shade(band.level))
+    axes.plot(band.t, band.value, label="model", **LINE)
+    axes.margins(x=0.0)
+    name_axes(axes, f"time after the step [{units.time}]", units.label("output", units.gain), legend="best")
 
 
 def _shade(level: float) -> dict[str, Any]:
@@ -124,7 +130,7 @@ def draw_poles(axes: Any, band: PoleBand) -> None:
 
 def delay_drawing(figures: FitFigures, near: DelayCosts | None) -> Drawing:
     """The search over the delay, and beside it the cost so close to the estimate that its minimum is seen."""
-    delay, time = figures.result.fit.model.delay, figures.units.time
+    delay, time = figures.delay, figures.units.time
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, 1 if near is None else 2, squeeze=False)[0]
@@ -157,7 +163,8 @@ def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iter
     correlations = [Section(drawing=figures.correlations(), caption=caption)] if result.tests else []
     notes = Section(notes=[test.sentence for test in result.tests])
     yield Chapter("Residuals", [Section(drawing=figures.residuals(), caption="Residuals."), *correlations, notes])
-    yield Chapter("Responses", _responses(figures))
+    models = models_of(result)
+    yield Chapter("Responses", _responses(figures) if len(models) == 1 else _responses_to_inputs(figures))
     yield poles_chapter(result, units)
     if result.fit.profile is not None:
         near = costs_about_delay(result)
@@ -166,9 +173,13 @@ def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iter
 
 
 def poles_chapter(result: Identification, units: Units) -> Chapter:
-    """Return the figure of the poles."""
-    drawing = poles_drawing(result.poles(), result.fit.model.zeros, units)
-    return Chapter("Poles", [Section(drawing=drawing, caption="Poles with their regions, and zeros.")])
+    """Return the figure of the poles, one for each input."""
+    drawn = []
+    for (name, model), fraction in zip(models_of(result).items(), fractions_of(result.fit.model), strict=True):
+        of = f" of the response to {name}" if name else ""
+        poles = poles_drawing(model.poles(), fraction.zeros, units)
+        drawn.append(Section(drawing=poles, caption=f"Poles with their regions, and zeros{of}."))
+    return Chapter("Poles", drawn)
 
 
 def _responses(figures: FitFigures) -> list[Section]:
@@ -188,3 +199,14 @@ def _responses(figures: FitFigures) -> list[Section]:
         Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
         Section(notes=notes),
     ]
+
+
+def _responses_to_inputs(figures: FitFigures) -> list[Section]:
+    """Return the transfer function of each of several inputs over frequency and time."""
+    sections = []
+    for k, (name, model) in enumerate(models_of(figures.result).items()):
+        own = figures.units.of_input(k)
+        bode, step = bode_drawing(model.frequency_response(), None, own), step_drawing(model.step_response(), own)
+        sections.append(Section(drawing=bode, caption=f"Frequency response to {name}, with pointwise 95 % bands."))
+        sections.append(Section(drawing=step, caption=f"Response to a unit step of {name}, with its pointwise band."))
+    return sections

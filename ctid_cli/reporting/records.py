@@ -87,6 +87,7 @@ class Records:
 
     def content(self) -> dict[str, Any]:
         """Return files, columns and units for JSON."""
-        columns = {role: getattr(self.measurements[0], role) for role in ROLES}
+        first = self.measurements[0]
+        columns = {"time": first.time, "input": first.columns, "output": first.output}
         files = [record.name for record in self.data]
         return {"files": files, "columns": columns, "units": asdict(self.units)}

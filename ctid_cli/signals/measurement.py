@@ -1,6 +1,7 @@
 """A measured record as it is: which columns it comes from, their units, and what was assumed in reading it."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -8,14 +9,23 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ctid_cli.arrays import Array
+from ctid_cli.errors import DataError
 from ctid_cli.signals.array_file import HDF5, MATLAB, read_array_table
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
-from ctid_cli.signals.table import ROLES, Table
+from ctid_cli.signals.table import ROLES, Table, split_header
 from ctid_cli.signals.text_file import read_text_table
+from ctid_cli.signals.treatment import Holds
 
 Offset = Literal["none", "remove"]
+#: What stands between the units of several inputs.
+SEPARATOR = ", "
+
+
+def input_name(column: str) -> str:
+    """Return the name of an input: that of its column without the unit."""
+    return split_header(column)[0]
 
 
 @dataclass(frozen=True)
@@ -38,11 +48,24 @@ class Measurement:
     #: Column of the reference of its loop, and its samples.
     reference: str | None = None
     reference_values: Array | None = None
+    #: Columns of all inputs, where there are several; of these, ``input_unit`` has the units with commas between them.
+    inputs: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, record: Record) -> "Measurement":
         """A record of which nothing else is known."""
-        return cls(record, None, None, None, "t", "u", "y")
+        several = tuple(record.held) if record.several else ()
+        return cls(record, None, None, None, "t", next(iter(record.held)), "y", inputs=several)
+
+    @property
+    def columns(self) -> str | list[str]:
+        """Column of the input, or of each of several."""
+        return list(self.inputs) or self.input
+
+    @property
+    def hold(self) -> Holds:
+        """The hold of the inputs, or that of each where they differ."""
+        return self.record.hold
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:
@@ -98,9 +121,9 @@ def read_measurement(
     path: str | os.PathLike[str],
     *,
     time: str | None = None,
-    input: str | None = None,
+    input: str | Sequence[str] | None = None,
     output: str | None = None,
-    hold: Hold = "zoh",
+    hold: Hold | Sequence[Hold] = "zoh",
     start: float | None = None,
     stop: float | None = None,
     reference: str | None = None,
@@ -110,10 +133,16 @@ def read_measurement(
 
     A window is read as if the file had no other lines: the input before it is not used, since the state that it
     left behind is estimated with the model where that is asked for. Where times must be in seconds, a column that is
-    labelled with another unit is refused unless it is named with that unit.
+    labelled with another unit is refused unless it is named with that unit. Several inputs are named by their
+    columns, and may have a hold each.
     """
-    require_choice("hold", hold, get_args(Hold))
-    asked = {"time": time, "input": input, "output": output, "reference": reference}
+    first, *others = [input] if input is None or isinstance(input, str) else input
+    holds = [hold] * (1 + len(others)) if isinstance(hold, str) else hold
+    for one in holds:
+        require_choice("hold", one, get_args(Hold))
+    roles = ["input", *(f"input {k}" for k in range(2, len(others) + 2))]
+    asked = {"time": time, "input": first, "output": output, "reference": reference}
+    asked |= dict(zip(roles[1:], others, strict=True))
     columns = open_table(path).select(asked, in_seconds=in_seconds)
     t, notes = columns.values["time"], columns.notes
     used = columns.window(t, start, stop)
@@ -121,11 +150,20 @@ def read_measurement(
         span = f"from {t[used.start]:.6g} to {t[used.stop - 1]:.6g} {columns.unit('time') or 's'}"
         part = f"Only the {count} of {t.size} samples {span} are used; the input before them is not."
         notes = (*notes, part)
-    u, y = columns.input(used), columns.output(used)
+    names = [input_name(columns.names[role]) for role in roles]
+    each = zip(names, roles, holds, strict=True)
+    inputs = {name: HeldSignal(t[used], columns.input(used, role), own) for name, role, own in each}
+    y = columns.output(used)
+    if len(inputs) < len(names):
+        raise DataError(f"{columns.file}: each input needs a name of its own; these are {', '.join(names)}")
     r = None if reference is None else columns.input(used, "reference")
-    record = Record(t[used], y, HeldSignal(t[used], u, hold), name=columns.file)
+    record = Record(t[used], y, inputs if others else next(iter(inputs.values())), name=columns.file)
     known: dict[str, Any] = {role: columns.names[role] for role in ROLES}
     known |= {f"{role}_unit": columns.unit(role) for role in ROLES}
+    if others:
+        units = [columns.unit(role) for role in roles]
+        known["input_unit"] = SEPARATOR.join(unit or "in" for unit in units) if any(units) else None
+        known["inputs"] = tuple(columns.names[role] for role in roles)
     return Measurement(
         record,
         **known,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol, get_args
 
@@ -13,6 +14,7 @@ from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import LONGEST, freeze, require_choice, require_increasing, require_scale, require_steps
 from ctid_cli.signals.held import REGULARITY, HeldSignal, Hold, regular_interval
+from ctid_cli.signals.treatment import Holds
 
 #: Where the reference enters a loop.
 Enters = Literal["controller", "input"]
@@ -91,8 +93,9 @@ class Record:
         Instants of the output samples [s], strictly increasing.
     y : ndarray, shape (N,)
         Output samples [output unit]; a NaN is a masked (missing) sample.
-    input : HeldSignal
-        The input on its own break times [s].
+    inputs : HeldSignal, or mapping of names to HeldSignal or array_like
+        The input on its own break times [s]; or several ones by name. Values without times are those at the instants of
+        the output, each held until the next one (zoh).
     noise_free : ndarray, shape (N,), optional
         The output before noise is added [output unit], known only for simulated records.
     name : str, default ""
@@ -115,7 +118,7 @@ class Record:
 
     t: Array
     y: Array
-    input: HeldSignal
+    inputs: HeldSignal | Mapping[str, HeldSignal | ArrayLike]
     noise_free: Array | None = None
     name: str = ""
     loop: Loop | None = None
@@ -141,7 +144,9 @@ class Record:
             raise DataError(f"{where}no output sample is a finite number")
         require_steps(f"{where}the clock", t)
         require_scale(f"{where}the output", y)
-        require_scale(f"{where}the input", self.input.values)
+        object.__setattr__(self, "inputs", _named_inputs(self.inputs, t, where))
+        for name, signal in self.held.items():
+            require_scale(f"{where}the input{f' {name}' * self.several}", signal.values)
         freeze(self, t=t, y=y)
         if self.loop is not None:
             self._require_loop(self.loop, where)
@@ -150,8 +155,10 @@ class Record:
         clock = "irregular clock" if self.interval is None else f"every {self.interval:.6g} s"
         missing = f", {np.count_nonzero(~self.valid)} missing" if not self.valid.all() else ""
         loop = ", in a loop" if self.loop else ""
+        inputs = f", inputs {', '.join(self.held)}" if self.several else ""
         name = f"{self.name!r}, " if self.name else ""
-        return f"Record({name}{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s, {clock}{missing}{loop})"
+        span = f"{self.n_samples} samples from {self.t[0]:g} to {self.t[-1]:g} s"
+        return f"Record({name}{span}, {clock}{missing}{inputs}{loop})"
 
     def _require_loop(self, loop: Loop, where: str) -> None:
         if loop.reference.size != self.t.size:
@@ -191,9 +198,79 @@ class Record:
         return cls(times, np.asarray(y, dtype=float), HeldSignal(times, np.asarray(u, dtype=float), hold), name=name)
 
     @property
-    def inputs(self) -> tuple[HeldSignal, ...]:
-        """The inputs; today there is one."""
-        return (self.input,)
+    def held(self) -> dict[str, HeldSignal]:
+        """The inputs by name; one without a name is called u."""
+        assert isinstance(self.inputs, dict)
+        return self.inputs
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several inputs."""
+        return len(self.held) > 1
+
+    @property
+    def input(self) -> HeldSignal:
+        """The only input.
+
+        Raises
+        ------
+        DataError
+            If there are several.
+        """
+        if self.several:
+            raise DataError(
+                f"{named(self)}the record has the inputs {', '.join(self.held)}, and this is available for one input "
+                "only; give one"
+            )
+        return next(iter(self.held.values()))
+
+    @property
+    def hold(self) -> Holds:
+        """How the inputs behave between their samples; that of each where they differ."""
+        each = tuple(signal.hold for signal in self.held.values())
+        return each[0] if len(set(each)) == 1 else each
+
+    @property
+    def hold_options(self) -> list[str]:
+        """The hold as it is written behind ``--hold``."""
+        if isinstance(self.hold, str):
+            return [self.hold]
+        return [f"{name}={signal.hold}" for name, signal in self.held.items()]
+
+    @property
+    def each_input(self) -> list[Record]:
+        """The record with each of its inputs alone."""
+        return [self.of_input(name) for name in self.held]
+
+    def driven_by(self, **inputs: HeldSignal) -> Record:
+        """Return the record with some of its inputs changed.
+
+        Parameters
+        ----------
+        **inputs : HeldSignal
+            New inputs by name.
+
+        Returns
+        -------
+        Record
+            The changed record.
+        """
+        return replace(self, inputs={**self.held, **inputs})
+
+    def of_input(self, name: str) -> Record:
+        """Return the record with one of its inputs alone.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        Record
+            The record, its output unchanged.
+        """
+        return replace(self, inputs={name: self.held[name]}) if self.several else self
 
     @property
     def in_loop(self) -> bool:
@@ -229,10 +306,14 @@ class Record:
 
     @cached_property
     def input_on_grid(self) -> bool:
-        """Whether the input's breaks are the output's (regular) sampling instants."""
-        if self.interval is None or self.input.t.size != self.t.size:
+        """Whether the breaks of the inputs are the output's (regular) sampling instants."""
+        interval = self.interval
+        if interval is None:
             return False
-        return bool(np.abs(self.input.t - self.t).max() <= REGULARITY * self.interval)
+        return all(
+            signal.t.size == self.t.size and bool(np.abs(signal.t - self.t).max() <= REGULARITY * interval)
+            for signal in self.held.values()
+        )
 
 
 def beginning(record: Record, samples: int) -> Record:
@@ -240,9 +321,26 @@ def beginning(record: Record, samples: int) -> Record:
     if record.n_samples <= samples:
         return record
     t = record.t[:samples]
-    known = record.input.t <= t[-1]
-    signal = HeldSignal(record.input.t[known], record.input.values[known], record.input.hold)
-    return Record(t, record.y[:samples], signal, name=record.name)
+    known = {name: signal.t <= t[-1] for name, signal in record.held.items()}
+    inputs = {
+        name: HeldSignal(signal.t[known[name]], signal.values[known[name]], signal.hold)
+        for name, signal in record.held.items()
+    }
+    return Record(t, record.y[:samples], inputs, name=record.name)
+
+
+def _named_inputs(
+    inputs: HeldSignal | Mapping[str, HeldSignal | ArrayLike], t: Array, where: str
+) -> dict[str, HeldSignal]:
+    """Return inputs by name, values at the instants of the output held."""
+    if isinstance(inputs, HeldSignal):
+        return {"u": inputs}
+    if not inputs:
+        raise DataError(f"{where}there is no input")
+    return {
+        name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float))
+        for name, one in inputs.items()
+    }
 
 
 def named(record: Record) -> str:

@@ -9,6 +9,8 @@ from typing import Literal
 Hold = Literal["zoh", "foh", "band-limited"]
 #: The same, or whichever describes a record best.
 AskedHold = Literal["auto", "zoh", "foh", "band-limited"]
+#: The hold of all inputs, or that of each.
+Holds = Hold | tuple[Hold, ...]
 #: How a frequency response is estimated.
 ResponseMethod = Literal["auto", "periodic", "local-polynomial", "welch"]
 #: How an estimator's filters join the samples of the output.

@@ -277,7 +277,7 @@ class CustomEstimation:
 
     def _fit(self, record: Record, start: Any = None) -> Fit:
         """Estimate from a copy of the record, without what no measurement has."""
-        given = replace(record, input=replace(record.input), noise_free=None)
+        given = replace(record, inputs=replace(record.input), noise_free=None)
         found = called(self.options, "fit", given, start)
         pairs = [(given.t, record.t), (given.y, record.y), (given.input.t, record.input.t)]
         pairs += [(given.input.values, record.input.values)]

@@ -59,8 +59,8 @@ def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
         return {"path": None, "series": encoded(measurement.record)}
     return {
         **path_and_sum(measurement.path, folder),
-        "columns": {"time": measurement.time, "input": measurement.input, "output": measurement.output},
-        "hold": measurement.record.input.hold,
+        "columns": {"time": measurement.time, "input": measurement.columns, "output": measurement.output},
+        "hold": measurement.hold,
         "from": measurement.start,
         "to": measurement.stop,
         **_loop(measurement),
@@ -89,8 +89,11 @@ class RecordSource(Source):
         """Return the record, as it was read for the fit."""
         content = self.content
         if content["path"] is None:
-            record = decoded(content["series"], Record, "series")
-            return Measurement.of(record)
+            series = dict(content["series"])
+            if "input" in series:
+                # A file of a version that had one input only.
+                series["inputs"] = series.pop("input")
+            return Measurement.of(decoded(series, Record, "series"))
         self.require_same()
         columns = {role: content["columns"][role] for role in ("time", "input", "output")}
         window = {"start": content["from"], "stop": content["to"]}
@@ -244,7 +247,10 @@ def _require_sources(content: Mapping[str, Any]) -> None:
         require("file", "file" in each)
         if each["path"] is not None:
             require("path", texts([each["path"], each["sha256"]]))
-            require("columns", texts(each["columns"][role] for role in ROLES))
-            require("hold", each["hold"] in get_args(Hold))
+            require("columns", texts(each["columns"][role] for role in ROLES if role != "input"))
+            inputs = each["columns"]["input"]
+            require("columns", isinstance(inputs, str) or (isinstance(inputs, list) and texts(inputs)))
+            holds = each["hold"] if isinstance(each["hold"], list) else [each["hold"]]
+            require("hold", bool(holds) and all(hold in get_args(Hold) for hold in holds))
             ends = [each[word] for word in ("from", "to")]
             require("from and to", all(end is None or isinstance(end, int | float) for end in ends))

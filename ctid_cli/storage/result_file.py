@@ -10,7 +10,7 @@ import math
 import os
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -173,6 +173,8 @@ def encoded(value: Any) -> Any:
         return value.name
     if isinstance(value, tuple | list):
         return [encoded(item) for item in value]
+    if isinstance(value, Mapping):
+        return {"type": "Mapping", "values": {name: encoded(item) for name, item in value.items()}}
     return _number(value.item() if isinstance(value, np.generic) else value)
 
 
@@ -195,6 +197,11 @@ def decoded(content: Any, hint: Any, place: str = "result") -> Any:
         return _array(content, np.dtype((get_args(choices[-1]) or choices)[-1]), place)
     if origin in (tuple, Sequence):
         return _sequence(content, choices, place)
+    if origin is Mapping:
+        values = content.get("values") if isinstance(content, Mapping) else None
+        if not isinstance(values, Mapping):
+            _refuse_part(place)
+        return {name: decoded(item, choices[1], f"{place}.{name}") for name, item in values.items()}
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return _instance(content, hint, place)
     if isinstance(hint, type) and hasattr(hint, "_fields"):
@@ -210,7 +217,10 @@ def _one_of(content: Any, choices: Sequence[Any], place: str) -> Any:
     left = [choice for choice in choices if choice is not type(None)]
     if isinstance(content, Mapping) and len(left) > 1:
         left = [choice for choice in left if getattr(choice, "__name__", "") == content.get("type")]
-    return decoded(content, left[0], place) if left else _refuse_part(place)
+    for choice in left[:-1]:
+        with suppress(DataError):
+            return decoded(content, choice, place)
+    return decoded(content, left[-1], place) if left else _refuse_part(place)
 
 
 def _sequence(content: Any, choices: Sequence[Any], place: str) -> tuple[Any, ...]:

@@ -106,7 +106,7 @@ def test_microseconds(ctid, record, tmp_path):
 @pytest.mark.parametrize("text", ["3:0", "-1:2", "nan", "0:inf", "0:1:2"])
 def test_a_range_of_delays_is_low_high_and_not_negative(text):
     with pytest.raises(UsageError, match="--delay must be LOW:HIGH"):
-        _ = StructureOptions(delay=text).bounds
+        _ = StructureOptions(delays=[text]).bounds
 
 
 def test_a_long_fit_shows_its_time_on_a_terminal(monkeypatch):

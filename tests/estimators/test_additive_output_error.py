@@ -111,4 +111,4 @@ def test_an_irregular_clock_and_a_linear_input():
     assert irregular.parameters["delay"] == pytest.approx(0.13, abs=0.01)
     record = open_record(TWO, 600, 0.05, 13)
     smooth = HeldSignal(record.t, np.convolve(record.input.values, np.ones(8), "same"), "foh")
-    assert np.isfinite(AdditiveOutputError((MODE, MODE)).fit(replace(record, input=smooth)).cost)
+    assert np.isfinite(AdditiveOutputError((MODE, MODE)).fit(replace(record, inputs=smooth)).cost)

@@ -400,7 +400,7 @@ NOT_PERIODIC = r"beam.csv: one period .* regular clock .* use initial_state 'est
             NOT_PERIODIC,
         ),
         (open_record(TWO_MODES, 100, 0.1, 1, times=IRREGULAR), {"initial_state": "periodic"}, NOT_PERIODIC),
-        (replace(RECORD, input=HeldSignal(RECORD.t, np.ones(100))), {}, "beam.csv: the input is constant"),
+        (replace(RECORD, inputs=HeldSignal(RECORD.t, np.ones(100))), {}, "beam.csv: the input is constant"),
         (replace(RECORD, y=np.zeros(100)), {}, "beam.csv: the output is constant"),
     ],
 )

@@ -183,7 +183,7 @@ def test_record_without_a_loop_is_refused(estimator, model):
     with pytest.raises(DataError, match="a closed loop needs a regular clock"):
         replace(irregular, loop=Loop(np.zeros(200), PID))
     with pytest.raises(DataError, match="in a closed loop the input is held"):
-        replace(record, input=HeldSignal(record.t, record.input.values, "foh"), loop=Loop(np.zeros(200), PID))
+        replace(record, inputs=HeldSignal(record.t, record.input.values, "foh"), loop=Loop(np.zeros(200), PID))
     with pytest.raises(DataError, match="the reference has 199 values for 200 samples"):
         replace(record, loop=Loop(np.zeros(199), PID))
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.measured_records import Layout, sensitivities
+from ctid_cli.estimation.measured_records import sensitivities
 from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.filter_data import filter_data
 from ctid_cli.filtering.simulate import simulate
@@ -46,17 +47,17 @@ def record_of(model=SYSTEM, *, n=600, seed=0, noise=0.0, irregular=False, offset
 def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irregular):
     rng = np.random.default_rng(3)
     data = [filter_data(record_of(n=80, seed=k, noise=0.1, irregular=irregular), 1.0) for k in range(2)]
-    layout = Layout(structure, 2, initial_state=True, trend=(0,))
+    layout = Layout(Degrees.of(structure), 2, initial_state=True, trend=(0,))
     problem = Problem(tuple(data), structure.zeros, True, True, (0.0, 0.0))
     n, m = structure.poles, structure.zeros
     a = np.poly([-0.8, -1.0 + 2.0j, -1.0 - 2.0j][-n:]).real[1:] if n > 1 else np.array([1.3])
     theta = np.concatenate((a, rng.standard_normal(m + 1), [delay] * structure.delay))
     theta = np.concatenate((theta, rng.standard_normal(layout.size - theta.size)))
-    parts = sensitivities(problem, layout, theta, delay)
+    parts = sensitivities(problem, layout, theta, [delay])
     for k in range(layout.size):
         step = 1e-5 * max(abs(theta[k]), 1.0)
         ends = [theta + sign * step * np.eye(layout.size)[k] for sign in (1, -1)]
-        moved = [sensitivities(problem, layout, end, delay) for end in ends]
+        moved = [sensitivities(problem, layout, end, [delay]) for end in ends]
         for (psi, _), (_, above), (_, below) in zip(parts, *moved, strict=True):
             # The error falls where the simulated output rises.
             slope = (below - above) / (2 * step)

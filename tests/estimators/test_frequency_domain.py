@@ -90,7 +90,7 @@ def test_gradient_is_that_of_differences(interval, poles):
         delay = Delay(point.delay.seconds + coordinates[3], point.delay.cell)
         return project(problem, speed, damping, delay)
 
-    found = slopes(problem, point.speed, point.damping, point.delay, cost(np.zeros(4)), True)
+    found = slopes(problem, point.speed, point.damping, point.delay, cost(np.zeros(4)), (0,))
     steps = 1e-5 * np.eye(4)
     differences = [(cost(h).squared_error - cost(-h).squared_error) / 4e-5 for h in steps]
     np.testing.assert_allclose(found.gradient, differences, rtol=1e-5, atol=1e-8 * np.abs(found.gradient).max())

@@ -48,6 +48,10 @@ def require_same(one, other):
         assert one.dtype == other.dtype
         assert one.shape == other.shape
         assert one.tobytes() == other.tobytes()
+    elif isinstance(one, dict):
+        assert list(one) == list(other)
+        for name in one:
+            require_same(one[name], other[name])
     elif isinstance(one, tuple | list):
         assert len(one) == len(other)
         for a, b in zip(one, other, strict=True):

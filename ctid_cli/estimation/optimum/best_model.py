@@ -5,16 +5,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
-from ctid_cli.estimation.optimum.box import Box, Point, box_of, point_of, widened
+from ctid_cli.estimation.optimum.box import Bounds, Box, Point, box_of, point_of, widened
 from ctid_cli.estimation.optimum.chain import all_numerators, numerators, polynomial
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected
 from ctid_cli.estimation.optimum.search import Ending, Local
-from ctid_cli.estimation.optimum.starts import SAME, StructureSearch
+from ctid_cli.estimation.optimum.starts import SAME, StructureSearch, block_starts
 from ctid_cli.estimation.optimum.sum_starts import SumGrowth, in_order
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.sensitivities import SumStructure
@@ -29,20 +28,22 @@ AS_GOOD, EXPLAINED = 1.5, 0.05
 LONG, PART = 100_000, 20_000
 
 
-#: Where a search starts: a denominator, or in a sum the poles of one submodel after the other; and a delay.
-Begin = tuple[Any, float]
+#: Where a search starts: a denominator, or of several the poles of one after the other; and a delay, or one of each
+#: input [s].
+Begin = tuple[Any, float | tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """The least output error that was found."""
 
-    #: Coefficients in descending powers, the denominator monic.
-    numerator: Array
-    denominator: Array
-    delay: float
-    #: Of each record, coefficients of C in the free response ``C/A delta(t - t_s)``, descending powers, zeros without
-    #: it; and those of the powers of time.
+    #: Coefficients in descending powers: numerators of the fractions, and their monic denominators, a common one once.
+    numerators: tuple[Array, ...]
+    denominators: tuple[Array, ...]
+    #: Delay of each input [s].
+    delays: tuple[float, ...]
+    #: Of each record, coefficients of C in the free responses ``C/A delta(t - t_s)``, descending powers, zeros without
+    #: them; and those of the powers of time.
     free_responses: Array
     trends: Array
     squared_error: float
@@ -55,37 +56,73 @@ class Optimum:
     #: keep them, where no bound of the set holds the poles; and the poles that are held.
     pole_slopes: Array
     held_poles: ComplexArray
-    #: Whether the delay would leave its bounds.
-    delay_at_bound: bool
-    #: Whether the delay sits in a kink of the cost, at a sample.
+    #: Inputs whose delays would leave their bounds.
+    delays_at_bound: tuple[int, ...]
+    #: Whether a delay sits in a kink of the cost, at a sample.
     pinned: bool
     tried: int
     agree: int
     evaluations: int
     box: Box = field(repr=False)
-    #: Poles at the origin, which the denominator does not have.
-    integrators: int = 0
-    #: The submodels, where the model is a sum; numerator and denominator are then those of the sum.
+    #: The input that drives each fraction, and which of the denominators it has.
+    drivers: tuple[tuple[int, int], ...] = ((0, 0),)
+    #: Poles at the origin of each fraction, which its denominator does not have.
+    integrators: tuple[int, ...] = (0,)
+    #: The submodels, where the model is a sum of those.
     additive: AdditiveModel | None = None
+
+    @property
+    def numerator(self) -> Array:
+        """The numerator of the first fraction."""
+        return self.numerators[0]
+
+    @property
+    def denominator(self) -> Array:
+        """The first denominator."""
+        return self.denominators[0]
+
+    @property
+    def delay(self) -> float:
+        """The delay of the first input [s]."""
+        return self.delays[0]
 
     @property
     def start(self) -> Begin:
         """Where a search for this model may start."""
-        if self.additive is None:
-            return self.denominator, self.delay
-        return poles_of_submodels(self.additive), self.delay
+        if len(self.denominators) == 1 and self.additive is None:
+            return self.denominators[0], self.delays
+        return np.concatenate([np.roots(a) for a in self.denominators]).astype(complex), self.delays
+
+    @property
+    def fractions(self) -> tuple[TransferFunction, ...]:
+        """The transfer function of each input."""
+        if self.additive is not None:
+            whole = unfactored(self.additive)
+            return (TransferFunction(_trimmed(whole.numerator), whole.denominator, self.delay),)
+        each = zip(self.numerators, self.drivers, self.integrators, strict=True)
+        return tuple(
+            TransferFunction(b, np.append(self.denominators[block], np.zeros(count)), self.delays[driver])
+            for b, (driver, block), count in each
+        )
 
     @property
     def model(self) -> TransferFunction:
-        """The model."""
-        return TransferFunction(self.numerator, np.append(self.denominator, np.zeros(self.integrators)), self.delay)
+        """The first fraction: the model, where there is one input."""
+        return self.fractions[0]
+
+
+def _point(start: Begin, box: Box) -> Point:
+    """Return the admissible point of a start."""
+    given, delays = start
+    poles = given if box.parts else np.roots(np.asarray(given, dtype=float))
+    return point_of(np.asarray(poles, dtype=complex), delays, box)
 
 
 def best_output_error(
     problem: Problem,
     poles: int,
-    delays: tuple[float, float] = (0.0, 0.0),
-    starts: Sequence[tuple[ArrayLike, float]] = (),
+    delays: Bounds = (0.0, 0.0),
+    starts: Sequence[Begin] = (),
     *,
     nested: bool = True,
     fewer_poles: bool = True,
@@ -105,13 +142,13 @@ def best_output_error(
     zeros, box = problem.zeros, box_of(problem, delays)
     if known.all_poles:
         box = widened(box, known.poles)
-    points = [point_of(np.roots(np.asarray(a, dtype=float)).astype(complex), tau, box) for a, tau in starts]
+    points = [_point(start, box) for start in starts]
     search = StructureSearch(problem, box, random_starts, seed)
-    part = part_of(problem, delays[1]) if nested else None
+    part = part_of(problem, max(high for _, high in box.each_delay)) if nested else None
     if known is not NOTHING:
         if part is not None:
             there = best_output_error(part, poles, delays, starts, random_starts=random_starts, seed=seed, known=known)
-            points, nested = [point_of(there.model.poles, there.delay, box)], False
+            points, nested = [_point(there.start, box)], False
         search = _with_known(search, poles, points, nested, known)
         return _least(search, poles, zeros, False)
     if part is not None:
@@ -143,21 +180,32 @@ def _with_known(
     zeros, box = free.problem.zeros, free.box
     search = StructureSearch(free.problem, box, known=known)
     if nested and known.all_poles:
-        points = [point_of(known.poles, 0.5 * sum(box.delays), box)]
+        points = [point_of(known.poles, box.middle, box)]
     elif nested:
         free.climb(poles, zeros)
         points += [local.point for local in free.minima(poles, zeros)] + free.from_below(poles, zeros)
         points += free.resonances(poles, zeros) + free.random_points(poles)
-    points = [point for point in (known.met(start, box) for start in points) if point is not None]
+    points = _met(points, box, known)
     if nested:
         points = search.along_delay(zeros, search.descent(zeros).sorted(points))
     search.refine(poles, zeros, points)
-    if not search.minima(poles, zeros):
-        given = ", ".join(f"a{place + 1} = {known.denominator[place]:g}" for place in known.places.tolist())
-        raise _none_admissible(given, box, "the")
     if nested:
         search.refine(poles, zeros, search.close_delays(poles, zeros))
     return search
+
+
+def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Point]:
+    """Return points where the known coefficients have their values."""
+    found = [point for point in (known.met(start, box) for start in points) if point is not None]
+    if points and not found:
+        values = known.denominator[known.places].tolist()
+        given, which = "coefficients", "a"
+        if not known.parts:
+            each = zip(known.places.tolist(), values, strict=True)
+            given, which = ", ".join(f"a{place + 1} = {value:g}" for place, value in each), "the"
+        what = f"no model with the fixed {given} has all its poles where they are searched"
+        raise DataError(f"{what}: {box.sentence('s')}; change or drop {which} fixed value")
+    return found
 
 
 def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
@@ -180,51 +228,54 @@ def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
     return _least(search, poles, zeros, True)
 
 
-def _none_admissible(fixed: str, box: Box, which: str) -> DataError:
-    """Return what is said where known coefficients leave no model in the box."""
-    what = f"no model with the fixed {fixed} has all its poles where they are searched"
-    return DataError(f"{what}: {box.sentence('s')}; change or drop {which} fixed value")
-
-
 def best_sum(
     problem: Problem,
-    delays: tuple[float, float],
+    delays: Bounds,
     starts: Sequence[Begin],
     *,
     grown: bool = True,
     known: KnownCoefficients = NOTHING,
+    random_starts: int = 0,
+    seed: int = 0,
 ) -> Optimum:
-    """Return the least sum of squared output errors of a sum of submodels.
+    """Return the least sum of squared output errors of fractions with denominators of their own.
 
-    Searches start from the poles of one submodel after the other, and delays; ``grown``: these are looked at over the
-    whole range of the delay, and so are the poles that are found term by term.
+    Searches start from the poles of one denominator after the other, and delays. ``grown``: these are looked at over
+    the whole range of the delays, and so are the poles of submodels that are found term by term, and of inputs beside
+    what the others explain.
     """
-    box, order = box_of(problem, delays), sum(term.order for term in problem.terms)
+    box, order, zeros = box_of(problem, delays), sum(problem.parts), problem.zeros
     if known.all_poles:
-        box, starts = widened(box, known.poles), [(known.poles, sum(delays) / 2)]
-    search = StructureSearch(problem, box, known=known)
-    points = [point_of(poles, delay, box, parts=problem.parts) for poles, delay in starts]
+        box = widened(box, known.poles)
+    search = StructureSearch(problem, box, random_starts, seed, known=known)
+    points = [_point(start, box) for start in starts]
     if grown:
-        points = [each for point in points for each in search.along_delay(problem.zeros, [point])]
-        if not known.all_poles:
-            part = part_of(problem, delays[1]) or problem
+        points = [each for point in points for each in search.along_delay(zeros, [point])]
+        if box.several_delays:
+            points += block_starts(problem, box, random_starts, seed)
+        elif not known.all_poles:
+            part = part_of(problem, box.each_delay[0][1]) or problem
             points += SumGrowth(part, box_of(part, delays)).points()
-    met = [point for point in (known.met(start, box) for start in points) if point is not None]
-    if not met:
-        raise _none_admissible("coefficients", box, "a")
-    search.refine(order, problem.zeros, met)
+    if known.all_poles:
+        places = [point.seconds for point in points] or [box.middle]
+        points = [point_of(known.poles, seconds, box) for seconds in places]
+        points = search.along_delay(zeros, points) if grown else points
+    search.refine(order, zeros, _met(points, box, known))
     if grown:
-        search.refine(order, problem.zeros, search.close_delays(order, problem.zeros))
-    if known is NOTHING:
-        search.put_first(order, problem.zeros, in_order(search.best(order, problem.zeros), problem.terms, box))
-    return _least(search, order, problem.zeros, False)
+        if box.several_delays:
+            around = search.along_delay(zeros, [search.best(order, zeros)])[1:]
+            search.refine(order, zeros, [*around, *_met(search.random_points(order), box, known)])
+        search.refine(order, zeros, search.close_delays(order, zeros))
+    if known is NOTHING and not problem.monic:
+        search.put_first(order, zeros, in_order(search.best(order, zeros), problem.terms, box))
+    return _least(search, order, zeros, False)
 
 
-def best_near(search: StructureSearch, zeros: int, denominator: Array, delay: float) -> Optimum:
-    """Return the least squared error in the basin of a denominator, without integrators, and a delay."""
-    poles = denominator.size - 1
-    search.refine(poles, zeros, [point_of(np.roots(denominator).astype(complex), delay, search.box)])
-    return _least(search, poles, zeros, False)
+def best_near(search: StructureSearch, zeros: int, start: Begin) -> Optimum:
+    """Return the least squared error in the basin of denominators, without integrators, and delays."""
+    point = _point(start, search.box)
+    search.refine(point.poles.size, zeros, [point])
+    return _least(search, point.poles.size, zeros, False)
 
 
 def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
@@ -238,29 +289,29 @@ def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -
     ends = np.array(search.ends(poles - lost, zeros))
     level = max(min(errors), float(ends.min()))
     agree = int(np.count_nonzero(ends <= level * (1 + SAME) + search.descent(zeros).floor))
-    return _optimum(found[lost], lost, ends.size, agree, search)
+    return _optimum(found[lost], zeros, lost, ends.size, agree, search)
 
 
-def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
+def _optimum(best: Local, zeros: int, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
     """Return the model in coefficients of polynomials."""
     assert best.ending is not None
-    point, projected = best.point, best.projected
+    point, projected, problem = best.point, best.projected, search.descent(zeros).problem
     known, n = search.known, point.poles.size
-    over = all_numerators(search.problem.rows(point.speed, point.damping))
     held = best.held[:n]
     slopes = point.coefficient_slopes()[:, ~held]
-    additive = _sum_of(search.problem, known, point, projected) if search.problem.terms else None
-    if additive is None:
-        a, b = _fraction_of(search.problem, known, point, projected)
-    else:
-        a, b = (getattr(unfactored(additive), name) for name in ("denominator", "numerator"))
     if known is not NOTHING:
         slopes = slopes @ null_space(known.slopes(point, n)[:, ~held])
+    fractions = _fractions_of(problem, point, projected)
+    additive = None if problem.monic else _sum_of(problem, known, point, fractions)
+    denominators = point.denominators
+    if known is not NOTHING and additive is None:
+        _put_known(known, fractions, denominators)
+    several = len(denominators) > 1
     return Optimum(
-        numerator=np.trim_zeros(b, "f") if b.any() else np.zeros(1),
-        denominator=a,
-        delay=point.delay.seconds,
-        free_responses=projected.free @ over,
+        numerators=tuple(_trimmed(b) for b in fractions),
+        denominators=tuple(denominators),
+        delays=point.seconds,
+        free_responses=projected.free @ all_numerators(problem.rows(point.speed, point.damping)),
         trends=projected.trend,
         squared_error=best.squared_error,
         ending=best.ending,
@@ -268,43 +319,51 @@ def _optimum(best: Local, lost: int, tried: int, agree: int, search: StructureSe
         poles_at_infinity=lost,
         pole_slopes=slopes,
         held_poles=point.poles[point.whole_sections(held)],
-        delay_at_bound=search.box.delay_free and bool(best.held[-1]) and not best.pinned,
+        delays_at_bound=best.delays_at_bound,
         pinned=best.pinned,
         tried=tried,
         agree=agree,
         evaluations=search.evaluations,
         box=search.box,
-        integrators=0 if additive else search.problem.integrators,
+        drivers=tuple((one.input, k if several else 0) for k, one in enumerate(problem.arranged(n).channels)),
+        integrators=tuple(one.terms[0].integrators for one in problem.arranged(n).channels),
         additive=additive,
     )
 
 
-def _fraction_of(problem: Problem, known: KnownCoefficients, point: Point, projected: Projected) -> tuple[Array, Array]:
-    """Return denominator, without its integrators, and numerator."""
-    a = point.denominator
-    b = projected.output @ all_numerators(problem.rows(point.speed, point.damping))
-    if projected.direct:
-        b = np.concatenate(([0.0], b)) + projected.direct * np.append(a, np.zeros(problem.integrators))
-    if known is not NOTHING:
-        # The same up to rounding.
-        a[1:][known.places] = known.denominator[known.places]
-        given = np.isfinite(known.numerator)
-        b = b[b.size - given.size :]
-        b[given] = known.numerator[given]
-    return a, b
+def _fractions_of(problem: Problem, point: Point, projected: Projected) -> list[Array]:
+    """Return the numerators of all fractions over monic denominators, each of the degree that it can have."""
+    rows, found = problem.rows(point.speed, point.damping), []
+    for k, channel in enumerate(problem.arranged(point.poles.size).channels):
+        first, directs = 0, channel.directs(projected.directs[k]).tolist()
+        for own, term, direct in zip(rows[channel.blocks], channel.terms, directs, strict=True):
+            output = projected.outputs[k][first : first + term.order]
+            b = np.concatenate(([0.0], output @ numerators(*own))) + direct * polynomial(*own)
+            found.append(b[term.order - term.zeros :])
+            first += term.order
+    return found
 
 
-def _sum_of(problem: Problem, known: KnownCoefficients, point: Point, projected: Projected) -> AdditiveModel:
+def _trimmed(b: Array) -> Array:
+    """Return a polynomial without leading zeros."""
+    return np.trim_zeros(b, "f") if b.any() else np.zeros(1)
+
+
+def _put_known(known: KnownCoefficients, fractions: list[Array], denominators: list[Array]) -> None:
+    """Give coefficients their known values, which they have up to rounding."""
+    whole, first = np.concatenate([a[1:] for a in denominators]), 0
+    whole[known.places] = known.denominator[known.places]
+    for a in denominators:
+        a[1:], whole = whole[: a.size - 1], whole[a.size - 1 :]
+    for b in fractions:
+        values, first = known.numerator[first : first + b.size], first + b.size
+        b[np.isfinite(values)] = values[np.isfinite(values)]
+
+
+def _sum_of(problem: Problem, known: KnownCoefficients, point: Point, fractions: Sequence[Array]) -> AdditiveModel:
     """Return the submodels of a sum; a DataError says that they cannot be told apart."""
-    rows, directs = problem.rows(point.speed, point.damping), problem.submodels(projected.output.size).directs
-    outputs = np.split(projected.output, np.cumsum([term.order for term in problem.terms])[:-1])
-    each = zip(rows, outputs, directs(projected.direct).tolist(), problem.terms, strict=True)
-    found = []
-    for own, output, direct, term in each:
-        a = polynomial(*own)
-        b = np.concatenate(([0.0], output @ numerators(*own))) + direct * a
-        found.append(Submodel(b[term.order - term.zeros :], a[: term.poles + 1], term.integrators))
-    model = AdditiveModel(found, point.delay.seconds)
+    each = zip(fractions, point.denominators, problem.terms, strict=True)
+    model = AdditiveModel([Submodel(b, a, term.integrators) for b, a, term in each], point.delay.seconds)
     if known is NOTHING:
         return model
     # The same up to rounding.
@@ -360,4 +419,5 @@ def _cut(data: FilterData, part: slice, latest: float) -> FilterData:
     if part == slice(None):
         return data
     t, y, u = (values[part].copy() for values in (data.t, data.y, data.u))
-    return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u)
+    further = tuple(_cut(one, part, latest) for one in data.further)
+    return data._replace(t=t, y=y, use=data.use[part] & (t >= t[0] + latest), tu=t, u=u, further=further)

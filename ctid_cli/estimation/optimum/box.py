@@ -9,8 +9,9 @@ part has the logarithms of its real and imaginary part: in these coordinates the
 met.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from math import copysign, exp, sqrt
 from typing import NamedTuple
@@ -30,6 +31,9 @@ from ctid_cli.estimation.optimum.chain import (
 from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.frequency_lines import FrequencyLines
+
+#: Least and greatest delay [s], or those of each input.
+Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
 
 
 class Limit(NamedTuple):
@@ -110,7 +114,7 @@ class Box:
     fastest: float
     #: Greatest imaginary part [rad/s].
     imaginary: float = np.inf
-    delays: tuple[float, float] = (0.0, 0.0)
+    delays: Bounds = (0.0, 0.0)
     #: Sampling interval [s] where the cost has kinks at whole intervals of delay, else 0.
     cell: float = 0.0
     #: Delay [s] that counts as a step of one, a quarter period of what the output holds.
@@ -124,11 +128,40 @@ class Box:
     slowest_spread: float = 0.0
     least_damping_spread: float = 0.0
     highest: float = np.inf
+    #: Number of poles of each of several denominators, empty for one; and whether known coefficients are those over
+    #: monic denominators, or with constant terms of 1.
+    parts: tuple[int, ...] = ()
+    monic: bool = True
+
+    @cached_property
+    def each_delay(self) -> tuple[tuple[float, float], ...]:
+        """Bounds of the delay of each input."""
+        return each_bounds(self.delays)
+
+    @property
+    def several_delays(self) -> bool:
+        """Whether there are several inputs."""
+        return len(self.each_delay) > 1
+
+    @cached_property
+    def free_delays(self) -> tuple[int, ...]:
+        """Inputs whose delays are searched."""
+        return tuple(k for k, (low, high) in enumerate(self.each_delay) if low < high)
+
+    @cached_property
+    def delay_places(self) -> dict[int, int]:
+        """Places of the free delays among the coordinates, counted from the end, by their inputs."""
+        return {k: place - len(self.free_delays) for place, k in enumerate(self.free_delays)}
 
     @property
     def delay_free(self) -> bool:
-        """Whether the delay is searched."""
-        return self.delays[0] < self.delays[1]
+        """Whether a delay is searched."""
+        return bool(self.free_delays)
+
+    @property
+    def middle(self) -> tuple[float, ...]:
+        """The middle of the range of each delay."""
+        return tuple(0.5 * (low + high) for low, high in self.each_delay)
 
     @property
     def spread(self) -> tuple[float, float]:
@@ -159,6 +192,14 @@ class Box:
         return f"{poles}; pairs with a damping of at least {self.least_damping:g}"
 
 
+def each_bounds(delays: Bounds) -> tuple[tuple[float, float], ...]:
+    """Return the bounds of the delay of each input."""
+    low, high = delays[0], delays[-1]
+    if isinstance(low, tuple) or isinstance(high, tuple):
+        return tuple(pair for pair in delays if isinstance(pair, tuple))
+    return ((low, high),)
+
+
 def widened(box: Box, poles: ComplexArray) -> Box:
     """Return a box that holds given stable poles inside its bounds, too."""
     sizes, pairs, more = np.abs(poles), poles[poles.imag > 0], 1.0 + JUST_BEYOND
@@ -177,16 +218,36 @@ ANYWHERE = Box(0.0, np.inf, delays=(0.0, np.inf), least_damping=0.0)
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Sections, fastest first, and a delay; in a sum the sections of each submodel, one submodel after the other."""
+    """Sections, fastest first in each denominator, and the delay of each input."""
 
     speed: Array
     #: Damping of a pair; -1 marks a real pole.
     damping: Array
     #: Whether the imaginary part of a pair is at its bound.
     edge: BoolArray
-    delay: Delay
-    #: Number of poles of each submodel of a sum; empty for one fraction.
+    delays: tuple[Delay, ...]
+    #: As in the box.
     parts: tuple[int, ...] = ()
+    monic: bool = True
+
+    @property
+    def delay(self) -> Delay:
+        """The delay of the first input."""
+        return self.delays[0]
+
+    @property
+    def seconds(self) -> tuple[float, ...]:
+        """The delay of each input [s]."""
+        return tuple(delay.seconds for delay in self.delays)
+
+    @cached_property
+    def cells(self) -> tuple[int, ...]:
+        """The cell of each delay."""
+        return tuple(delay.cell for delay in self.delays)
+
+    def with_delays(self, delays: Iterable[Delay]) -> "Point":
+        """Return the same poles at other delays."""
+        return replace(self, delays=tuple(delays))
 
     @property
     def poles(self) -> ComplexArray:
@@ -194,9 +255,26 @@ class Point:
         return np.array(poles_of(self.speed, self.damping), dtype=complex)
 
     @property
+    def rows(self) -> Rows:
+        """Sections of each denominator."""
+        return split(self.speed, self.damping, self.parts) if self.parts else [(self.speed, self.damping)]
+
+    @property
+    def denominators(self) -> list[Array]:
+        """Monic polynomials, descending powers."""
+        return [polynomial(*own) for own in self.rows]
+
+    @property
     def denominator(self) -> Array:
-        """Monic polynomial, descending powers."""
-        return polynomial(self.speed, self.damping)
+        """The first of them."""
+        return self.denominators[0]
+
+    @property
+    def coefficients(self) -> Array:
+        """Coefficients ``a_1 ... a_n`` of each denominator; if not monic, with the constant term 1."""
+        if self.monic:
+            return np.concatenate([a[1:] for a in self.denominators])
+        return np.concatenate([a[-2::-1] / a[-1] for a in self.denominators])
 
     def jacobian(self) -> Array:
         """Derivatives of ``ln w, ln zeta`` (or ln p) of all sections to the coordinates, block diagonal."""
@@ -208,33 +286,11 @@ class Point:
             k += 1 if zeta < 0 else 2
         return result
 
-    def denominator_slopes(self) -> Array:
-        """Derivatives of ``a_1 ... a_n`` to the coordinates, shape (n, n)."""
-        return np.asarray(polynomial_slopes(self.speed, self.damping) @ self.jacobian())
-
-    @property
-    def rows(self) -> Rows:
-        """Sections of each submodel."""
-        return split(self.speed, self.damping, self.parts) if self.parts else [(self.speed, self.damping)]
-
-    @property
-    def coefficients(self) -> Array:
-        """Coefficients of the denominator ``a_1 ... a_n``; in a sum of each submodel, with the constant term 1."""
-        if not self.parts:
-            return self.denominator[1:]
-        return np.concatenate([a[-2::-1] / a[-1] for a in (polynomial(*own) for own in self.rows)])
-
     def coefficient_slopes(self) -> Array:
-        """Their derivatives to the coordinates, shape (n, n)."""
-        if not self.parts:
-            return self.denominator_slopes()
-        found = []
-        for own in self.rows:
-            rising, slopes = (
-                polynomial(*own)[::-1],
-                np.vstack((np.zeros(order_of(own[1])), polynomial_slopes(*own)))[::-1],
-            )
-            found.append((slopes[1:] - np.outer(rising[1:] / rising[0], slopes[0])) / rising[0])
+        """Derivatives of the coefficients to the coordinates, shape (n, n)."""
+        found = [polynomial_slopes(*own) for own in self.rows]
+        if not self.monic:
+            found = [_with_constant_one(a, own) for a, own in zip(self.denominators, found, strict=True)]
         return np.asarray(block_diagonal(found) @ self.jacobian())
 
     def whole_sections(self, chosen: BoolArray) -> BoolArray:
@@ -264,10 +320,16 @@ class Point:
         return speed, damping
 
 
-def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
+def _with_constant_one(a: Array, slopes: Array) -> Array:
+    """Return the derivatives of ``a_1 ... a_n`` scaled so that the constant term is 1, from those of the monic ones."""
+    rising, each = a[::-1], np.vstack((np.zeros(a.size - 1), slopes))[::-1]
+    return np.asarray((each[1:] - np.outer(rising[1:] / rising[0], each[0])) / rising[0])
+
+
+def box_of(problem: Problem, delays: Bounds) -> Box:
     """Return the set that records, or a frequency response, admit."""
     if problem.lines is not None:
-        return _box_of_lines(problem.lines, delays)
+        return _box_of_lines(problem.lines, each_bounds(delays)[0])
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
     for data in problem.sampled:
         used, steps = data.t[data.use], np.diff(data.t)
@@ -278,8 +340,9 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
         power = float(np.sum((data.y[1:] - data.y.mean()) ** 2 * steps))
         if power > 0:
             rate = max(rate, float(np.sqrt(np.sum(np.diff(data.y) ** 2 / steps) / power)))
-        cells.add(data.interval)
-    quarter = min(0.5 * np.pi / rate if rate > 0 else length, delays[1] - delays[0])
+        cells |= {one.interval for one in data.inputs}
+    widest = max(high - low for low, high in each_bounds(delays))
+    quarter = min(0.5 * np.pi / rate if rate > 0 else length, widest)
     state = "estimated" if problem.free_response else "periodic" if any(problem.periods) else "rest"
     bounds = {name: getattr(limit, state) for name, limit in LIMITS.items()}
     greatest = bounds["imaginary"] * np.pi / interval if min(cells) > 0 else np.inf
@@ -297,6 +360,8 @@ def box_of(problem: Problem, delays: tuple[float, float]) -> Box:
         beyond,
         LIMITS["slowest"].estimated / length,
         LIMITS["least_damping"].estimated,
+        parts=problem.parts,
+        monic=problem.monic,
     )
 
 
@@ -342,26 +407,35 @@ def admissible(pole: complex, box: Box) -> complex:
 
 
 def point_of(
-    poles: ComplexArray, delay: float, box: Box, cell: int | None = None, parts: tuple[int, ...] = ()
+    poles: ComplexArray, delays: float | Sequence[float], box: Box, cells: Sequence[int | None] | None = None
 ) -> Point:
-    """Admissible sections with given poles; those of the submodels of a sum are given one after the other."""
+    """Admissible sections with given poles, those of several denominators one after the other."""
     moved, units, first = [admissible(pole, box) for pole in poles.tolist()], [], 0
-    for size in parts or (len(moved),):
-        own, first = moved[first : first + size], first + size
-        each = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in own if p.imag > 0]
-        each += _real_sections(sorted(-p.real for p in own if p.imag == 0), box)
-        units += sorted(each, key=lambda unit: -unit[0])
-    low, high = box.delays
-    tau = min(max(float(delay), low), high)
-    if cell is None:
-        cell = int(np.floor(tau / box.cell)) if box.delay_free and box.cell > 0 else -1
+    for order in box.parts or (len(moved),):
+        units += _units(moved[first : first + order], box)
+        first += order
+    each = [delays] * len(box.each_delay) if isinstance(delays, float | int) else delays
+    placed = []
+    for (low, high), delay, cell in zip(box.each_delay, each, cells or [None] * len(each), strict=True):
+        tau = min(max(float(delay), low), high)
+        if cell is None:
+            cell = int(np.floor(tau / box.cell)) if low < high and box.cell > 0 else -1
+        placed.append(Delay(tau, cell))
     return Point(
         np.array([unit[0] for unit in units]),
         np.array([unit[1] for unit in units]),
         np.array([unit[2] for unit in units]),
-        Delay(tau, cell),
-        parts,
+        tuple(placed),
+        box.parts,
+        box.monic,
     )
+
+
+def _units(poles: list[complex], box: Box) -> list[tuple[float, float, bool]]:
+    """Sections of one denominator: speed, damping, and whether the imaginary part is at its bound."""
+    units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in poles if p.imag > 0]
+    units += _real_sections(sorted(-p.real for p in poles if p.imag == 0), box)
+    return sorted(units, key=lambda unit: -unit[0])
 
 
 def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, bool]]:
@@ -383,18 +457,21 @@ def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, boo
 
 
 def moved_by(point: Point, step: Array, box: Box) -> Point:
-    """The point a step away, the delay in quarter periods last, moved back to the set where it leaves it."""
+    """The point a step away, the free delays in quarter periods last, moved back to the set where it leaves it."""
     speed, damping = point.shifted(step)
-    poles = replace(point, speed=speed, damping=damping).poles
-    tau = point.delay.seconds + (step[-1] * box.quarter if box.delay_free else 0.0)
-    if point.delay.cell < 0:
-        return point_of(poles, tau, box, parts=point.parts)
-    # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
-    low, high = point.delay.cell * box.cell, (point.delay.cell + 1) * box.cell
-    for edge in (low, high):
-        if abs(tau - edge) < TOUCH * box.cell:
-            tau = edge
-    return point_of(poles, tau, box, point.delay.cell if low <= tau <= high else None, point.parts)
+    poles = np.array(poles_of(speed, damping), dtype=complex)
+    seconds, cells = list(point.seconds), [None if k in box.free_delays else -1 for k in range(len(point.delays))]
+    for k, place in box.delay_places.items():
+        seconds[k] += step[place] * box.quarter
+        if point.delays[k].cell < 0:
+            continue
+        # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
+        low, high = point.delays[k].cell * box.cell, (point.delays[k].cell + 1) * box.cell
+        for edge in (low, high):
+            if abs(seconds[k] - edge) < TOUCH * box.cell:
+                seconds[k] = edge
+        cells[k] = point.delays[k].cell if low <= seconds[k] <= high else None
+    return point_of(poles, seconds, box, cells)
 
 
 def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
@@ -404,7 +481,7 @@ def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
 
 
 def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
-    """Return which coordinates are at their lower and upper bound; for the delay the bounds of its cell count."""
+    """Return which coordinates are at their lower and upper bound; for a delay the bounds of its cell count."""
     at_low: list[bool] = []
     at_high: list[bool] = []
     for w, zeta, edge in zip(point.speed.tolist(), point.damping.tolist(), point.edge.tolist(), strict=True):
@@ -419,11 +496,11 @@ def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
         else:
             at_low += [slow, undamped]
             at_high += [fast, False]
-    if box.delay_free:
-        edges = box.delays
-        if point.delay.cell >= 0:
-            edges = max(edges[0], point.delay.cell * box.cell), min(edges[1], (point.delay.cell + 1) * box.cell)
+    for k in box.free_delays:
+        edges, delay = box.each_delay[k], point.delays[k]
+        if delay.cell >= 0:
+            edges = max(edges[0], delay.cell * box.cell), min(edges[1], (delay.cell + 1) * box.cell)
         slack = TOUCH * (edges[1] - edges[0])
-        at_low.append(point.delay.seconds <= edges[0] + slack)
-        at_high.append(point.delay.seconds >= edges[1] - slack)
+        at_low.append(delay.seconds <= edges[0] + slack)
+        at_high.append(delay.seconds >= edges[1] - slack)
     return np.array(at_low, dtype=bool), np.array(at_high, dtype=bool)

@@ -168,10 +168,17 @@ def all_numerators(rows: Rows) -> Array:
 
 def form_of(rows: Rows, length: float) -> "Form":
     """Return the form in which sections are filtered over a record of some length [s]."""
-    if all(_apart(poles_of(*own), length) for own in rows):
-        return Modal.of(rows)
-    F, g = chains_dynamics(rows)
-    return Chain(rows, F, g, F, g)
+    return forms_of(rows, [slice(None)], length)[0]
+
+
+def forms_of(rows: Rows, channels: Sequence[slice], length: float) -> list["Form"]:
+    """Return the form of the sections that each channel drives; one kind of all, so that they pass records together."""
+    modal = all(_apart(poles_of(*own), length) for own in rows)
+    made = dict[int, Form]()
+    for own in channels:
+        if own.start not in made:
+            made[own.start] = Modal.of(rows[own]) if modal else Chain.of(rows[own])
+    return [made[own.start] for own in channels]
 
 
 def _apart(poles: list[complex], length: float) -> bool:
@@ -341,6 +348,12 @@ class Chain:
     #: Those of the free response.
     free_dynamics: Array
     free_gain: Array
+
+    @classmethod
+    def of(cls, rows: Rows) -> "Chain":
+        """Return the state space of rows of sections that nothing drives a second time."""
+        F, g = chains_dynamics(rows)
+        return cls(rows, F, g, F, g)
 
     @property
     def states(self) -> Array:

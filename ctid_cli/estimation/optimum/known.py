@@ -7,7 +7,7 @@ poles: they are eliminated with the others (:mod:`~ctid_cli.estimation.optimum.p
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -25,19 +25,26 @@ ZERO = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class KnownCoefficients:
-    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free."""
+    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free.
+
+    Those of several denominators, and of several numerators, stand one after the other.
+    """
 
     denominator: Array
     numerator: Array
-    #: The submodels of a sum, whose coefficients then follow each other; those of a numerator in descending powers.
-    terms: tuple[Term, ...] = ()
+    #: Number of poles of each of several denominators, and whether they are monic or have constant terms of 1. In both
+    #: cases the coefficients of numerators are in descending powers.
+    parts: tuple[int, ...] = ()
+    monic: bool = True
 
     @classmethod
-    def of(cls, poles: int, zeros: int, values: Mapping[int, float]) -> "KnownCoefficients":
+    def of(
+        cls, poles: int, zeros: int, values: Mapping[int, float], parts: tuple[int, ...] = ()
+    ) -> "KnownCoefficients":
         """Return them from values by places in ``a_1 ... a_n, b_0 ... b_m``."""
         theta = np.full(poles + zeros + 1, np.nan)
         theta[list(values)] = list(values.values())
-        return cls(theta[:poles], theta[poles:])
+        return cls(theta[:poles], theta[poles:], parts)
 
     @classmethod
     def of_sum(cls, terms: tuple[Term, ...], values: Mapping[int, float]) -> "KnownCoefficients":
@@ -45,7 +52,8 @@ class KnownCoefficients:
         structure = SumStructure(terms)
         theta = np.full(structure.size, np.nan)
         theta[list(values)] = list(values.values())
-        return cls(theta[structure.denominators], theta[structure.numerators], terms)
+        parts = tuple(term.poles for term in terms)
+        return cls(theta[structure.denominators], theta[structure.numerators], parts, False)
 
     @property
     def size(self) -> int:
@@ -64,16 +72,14 @@ class KnownCoefficients:
 
     @property
     def poles(self) -> ComplexArray:
-        """The poles, where all coefficients of the denominator are known."""
-        if not self.terms:
-            return np.roots(np.concatenate(([1.0], self.denominator))).astype(complex)
-        ends = np.cumsum([term.poles for term in self.terms])[:-1]
-        own = [np.roots(np.append(a[::-1], 1.0)) for a in np.split(self.denominator, ends)]
-        return np.concatenate(own).astype(complex)
+        """The poles, where all coefficients of the denominators are known."""
+        each = np.split(self.denominator, np.cumsum(self.parts)[:-1]) if self.parts else [self.denominator]
+        whole = [np.append(1.0, a) if self.monic else np.append(a[::-1], 1.0) for a in each]
+        return np.concatenate([np.roots(a) for a in whole]).astype(complex)
 
     @property
     def all_poles(self) -> bool:
-        """Whether there is but one denominator: its poles do not move, however ill-conditioned they are."""
+        """Whether all denominators are known: their poles do not move, however ill-conditioned they are."""
         return self.places.size == self.denominator.size > 0
 
     def slopes(self, point: Point, size: int) -> Array:
@@ -100,8 +106,8 @@ class KnownCoefficients:
             if not step.any():
                 return None
             step /= max(1.0, float(np.abs(step).max()))
-            moved = moved_by(point, np.append(step, 0.0) if box.delay_free else step, box)
-            point, last = replace(moved, delay=point.delay), size
+            moved = moved_by(point, np.append(step, np.zeros(len(box.free_delays))), box)
+            point, last = moved.with_delays(point.delays), size
         return None
 
     def _least_step(self, point: Point, error: Array, box: Box) -> Array:

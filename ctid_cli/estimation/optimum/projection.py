@@ -7,7 +7,8 @@ them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``; since ``
 exact. Known coefficients of B leave Phi, and their part of the response leaves y. The derivatives of ``B/A u`` at a
 fixed B are the same, so that nothing else changes.
 
-A sum of submodels has columns of each of them in the place of those of ``B/A u``, and everything else in common.
+A sum of fractions, be it of submodels or of the responses to several inputs, has columns of each of them in the place
+of those of ``B/A u``, and everything else in common.
 
 References
 ----------
@@ -16,24 +17,25 @@ L. Kaufman, "A variable projection method for solving separable nonlinear least 
 """
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray, IntArray
+from ctid_cli.arrays import Array
+from ctid_cli.estimation.optimum.arrangement import Arrangement, with_one_denominator, with_own_denominators
 from ctid_cli.estimation.optimum.chain import (
     Form,
     Modal,
     Rows,
     block_diagonal,
-    form_of,
+    forms_of,
     numerators,
     order_of,
     polynomial,
     split,
 )
-from ctid_cli.estimation.optimum.triangle import Columns, Delay, triangle_of, triangles_of
+from ctid_cli.estimation.optimum.triangle import Columns, Delay, Delays, each_delay, rows_of, triangle_of, triangles_of
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.inference.innovations import SampledNoise
@@ -49,7 +51,7 @@ class Problem(NamedTuple):
     """Records, or a frequency response in their place, and what is eliminated with them."""
 
     records: tuple[FilterData | FrequencyLines, ...]
-    #: Degree of the numerator.
+    #: Degree of the numerator; of several inputs that share a denominator, the highest.
     zeros: int
     free_response: bool
     #: Powers of time that are eliminated for each record.
@@ -57,14 +59,18 @@ class Problem(NamedTuple):
     #: Period [s] of each record that repeats for ever, else 0.
     periods: tuple[float, ...]
     #: Known coefficients of the numerators in descending powers, NaN for those that are free; empty where all are. In a
-    #: sum they belong to denominators with the constant term 1.
+    #: sum of submodels they belong to denominators with the constant term 1.
     numerator: Array = np.zeros(0)
     #: Poles at 0 that the model has besides. The lowest powers of time are then part of a free response.
     integrators: int = 0
     #: The noise by whose innovations errors count, of each record; empty where that is white.
     noises: tuple[SampledNoise, ...] = ()
-    #: The submodels of a sum, which then say what ``zeros`` and ``integrators`` say of one fraction.
+    #: Zeros that the numerator of each input has less than the highest, where inputs share a denominator.
+    fewer_zeros: tuple[int, ...] = (0,)
+    #: Fractions with denominators of their own, which then say what ``zeros`` and ``integrators`` say of one; and the
+    #: input that drives each, by default the only one.
     terms: tuple[Term, ...] = ()
+    inputs: tuple[int, ...] = ()
 
     @property
     def laid_out(self) -> Iterator[tuple[FilterData | FrequencyLines, float, SampledNoise | None]]:
@@ -88,20 +94,34 @@ class Problem(NamedTuple):
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """Number of poles of each submodel of a sum, integrators not among them; empty for one fraction."""
+        """Number of poles of each of several denominators, integrators not among them; empty for one."""
         return tuple(term.poles for term in self.terms)
+
+    @property
+    def monic(self) -> bool:
+        """Whether known coefficients are those over monic denominators: unless one input drives several."""
+        return not self.terms or len(set(self.inputs)) > 1
 
     @property
     def coefficients(self) -> int:
         """Number of coefficients of all numerators."""
-        return sum(term.zeros + 1 for term in self.terms) if self.terms else self.zeros + 1
+        if self.terms:
+            return sum(term.zeros + 1 for term in self.terms)
+        return sum(max(self.zeros - fewer, 0) + 1 for fewer in self.fewer_zeros)
 
-    def submodels(self, order: int) -> "Submodels":
-        """Return which states make up the response, of a model of a given order, integrators included."""
-        return _submodels(self.terms, order, self.zeros, self.integrators)
+    @property
+    def each_integrators(self) -> tuple[int, ...]:
+        """Poles at the origin of each denominator."""
+        return tuple(term.integrators for term in self.terms) or (self.integrators,)
+
+    def arranged(self, poles: int) -> Arrangement:
+        """Return the channels of a model with a number of poles, integrators not among them."""
+        if self.terms:
+            return with_own_denominators(self.terms, self.inputs or (0,) * len(self.terms))
+        return with_one_denominator(poles, self.integrators, self.zeros, self.fewer_zeros)
 
     def rows(self, speed: Array, damping: Array) -> Rows:
-        """Return the sections of each submodel with its integrators behind them."""
+        """Return the sections of each denominator with its integrators behind them."""
         if not self.terms:
             return [_integrating(speed, damping, self.integrators)]
         each = zip(split(speed, damping, self.parts), self.terms, strict=True)
@@ -115,37 +135,6 @@ def _integrating(speed: Array, damping: Array, integrators: int) -> tuple[Array,
     return np.append(speed, np.zeros(integrators)), np.append(damping, -np.ones(integrators))
 
 
-class Submodels(NamedTuple):
-    """Which states of the sections make up a response."""
-
-    terms: tuple[Term, ...]
-    #: Places of the states that span the strictly proper part of all ``B/A u``: of each submodel its last m + 1.
-    spanning: IntArray
-    #: Which submodel has u itself besides, as one of degree n has; none where -1.
-    direct: int
-    #: Which states belong to poles that are searched, not to integrators.
-    searched: BoolArray
-
-    def directs(self, weight: float) -> Array:
-        """Return the weight of u in each submodel."""
-        found = np.zeros(len(self.terms))
-        if self.direct >= 0:
-            found[self.direct] = weight
-        return found
-
-
-@lru_cache
-def _submodels(terms: tuple[Term, ...], order: int, zeros: int, integrators: int) -> Submodels:
-    terms = terms or (Term(order - integrators, zeros, integrators),)
-    first, spanning, direct, searched = 0, list[int](), -1, list[bool]()
-    for k, term in enumerate(terms):
-        spanning += range(first + term.order - min(term.zeros + 1, term.order), first + term.order)
-        direct = k if term.zeros == term.order else direct
-        searched += [True] * term.poles + [False] * term.integrators
-        first += term.order
-    return Submodels(terms, np.array(spanning, dtype=np.int64), direct, np.array(searched, dtype=bool))
-
-
 class Weights(NamedTuple):
     """What the weights of the states, and of u itself, can be: a given part, and the span of a basis."""
 
@@ -154,17 +143,18 @@ class Weights(NamedTuple):
 
 
 class Triangles(NamedTuple):
-    """The rows of all records in one form."""
+    """The rows of all records in one form of each channel."""
 
-    form: Form
+    arrangement: Arrangement
+    forms: Sequence[Form]
     columns: Columns
-    delay: Delay
+    delays: tuple[Delay, ...]
     #: Shape (K, q, q).
     rows: Array
 
 
 class Slopes(NamedTuple):
-    """Derivatives of half the squared error to the logarithmic coordinates and, last, the delay [1/s]."""
+    """Derivatives of half the squared error to the logarithmic coordinates and, last, the free delays [1/s]."""
 
     squared_error: float
     gradient: Array
@@ -180,22 +170,21 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
     known = np.isfinite(problem.numerator)
     if not known.any():
         return None
-    rows = problem.rows(speed, damping)
-    own = problem.submodels(sum(order_of(zeta) for _, zeta in rows))
-    tables, directs = [], []
-    for k, ((w, zeta), term) in enumerate(zip(rows, own.terms, strict=True)):
-        # Known coefficients of a submodel belong to a denominator with the constant term 1.
-        scale = polynomial(w, zeta)[term.poles] if problem.terms else 1.0
-        table, width = numerators(w, zeta) / scale, term.zeros + 1
-        if k == own.direct:
-            tables.append(np.pad(table, ((0, 0), (1, 0))))
-            directs.append(polynomial(w, zeta) / scale)
-        else:
-            tables.append(table[-width:, -width:])
-            directs.append(np.zeros(width))
+    rows, tables = problem.rows(speed, damping), []
+    for channel in problem.arranged(order_of(damping)).channels:
+        own, directs = [], []
+        for k, ((w, zeta), term) in enumerate(zip(rows[channel.blocks], channel.terms, strict=True)):
+            scale = 1.0 if problem.monic else polynomial(w, zeta)[term.poles]
+            table, width = numerators(w, zeta) / scale, term.zeros + 1
+            if k == channel.direct:
+                own.append(np.pad(table, ((0, 0), (1, 0))))
+                directs.append(polynomial(w, zeta) / scale)
+            else:
+                own.append(table[-width:, -width:])
+                directs.append(np.zeros(width))
+        proper = block_diagonal(own)
+        tables.append(np.vstack((proper, np.concatenate(directs))) if channel.direct >= 0 else proper)
     table = block_diagonal(tables)
-    if own.direct >= 0:
-        table = np.vstack((table, np.concatenate(directs)))
     asked = table[:, known]
     lengths = np.linalg.norm(asked, axis=0)
     whole, triangle = np.linalg.qr(asked / lengths, mode="complete")
@@ -204,23 +193,32 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
     return Weights(whole[:, count:], given)
 
 
-def _columns(problem: Problem, columns: Columns, rows: Array, states: Array) -> tuple[Array, Array]:
-    """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models."""
+def _columns(problem: Problem, triangles: Triangles, states: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models.
+
+    ``states``: the map from z to the states of the sections of each channel.
+    """
+    arrangement, columns, rows = triangles.arrangement, triangles.columns, triangles.rows
     *many, records, q, _ = rows.shape
-    n, shared, submodels = columns.n, problem.coefficients, problem.submodels(columns.n)
-    proper, own = submodels.spanning.size, n * problem.free_response + len(columns.trend)
-    # The numerator is common to all records; a free response and a trend are zero outside their own.
+    shared, trend = sum(channel.size for channel in arrangement.channels), len(columns.trend)
+    own = arrangement.order * problem.free_response + trend
+    # The numerators are common to all records; a free response and a trend are zero outside their own.
     phi = np.zeros((*many, records, q, shared + records * own))
-    to_states = np.swapaxes(states, -1, -2)
-    phi[..., :proper] = rows[..., :n] @ to_states[..., submodels.spanning]
-    if submodels.direct >= 0:
-        phi[..., proper] = rows[..., columns.u]
-    for k in range(records if own else 0):
-        place, record = shared + k * own, slice(k, k + 1)
-        if problem.free_response:
-            phi[..., record, :, place : place + n] = rows[..., record, :, columns.free_z] @ to_states
-        phi[..., record, :, place + own - len(columns.trend) : place + own] = rows[..., record, :, columns.powers]
-    return phi.reshape(*many, records * q, -1), rows[..., columns.u + 1].reshape(*many, -1)
+    to_states, place = [np.swapaxes(one, -1, -2) for one in states], 0
+    for k, channel in enumerate(arrangement.channels):
+        proper = channel.spanning.size
+        phi[..., place : place + proper] = rows[..., columns.z(k)] @ to_states[k][..., channel.spanning]
+        if channel.direct >= 0:
+            phi[..., place + proper] = rows[..., columns.u(k)]
+        place += channel.size
+    for record in range(records if own else 0):
+        place, one = shared + record * own, slice(record, record + 1)
+        for number, k in enumerate(columns.free):
+            order = columns.orders[k]
+            phi[..., one, :, place : place + order] = rows[..., one, :, columns.free_z(number)] @ to_states[k]
+            place += order
+        phi[..., one, :, place : place + trend] = rows[..., one, :, columns.powers]
+    return phi.reshape(*many, records * q, -1), rows[..., columns.y].reshape(*many, -1)
 
 
 class Span:
@@ -228,8 +226,8 @@ class Span:
 
     def __init__(self, problem: Problem, triangles: Triangles, weights: Weights | None) -> None:
         self.triangles, self.weights = triangles, weights
-        self.n, self.shared = triangles.columns.n, problem.coefficients
-        phi, y = _columns(problem, triangles.columns, triangles.rows, triangles.form.states)
+        self.shared = sum(channel.size for channel in triangles.arrangement.channels)
+        phi, y = _columns(problem, triangles, [form.states for form in triangles.forms])
         if weights is not None:
             both = phi[:, : self.shared]
             phi, y = np.hstack((both @ weights.basis, phi[:, self.shared :])), y - both @ weights.given
@@ -255,59 +253,82 @@ class Span:
 
 
 class Projected(NamedTuple):
-    """The least squares for given poles and delay."""
+    """The least squares for given poles and delays."""
 
     squared_error: float
-    #: Weights of the states, and of u itself.
-    output: Array
-    direct: float
-    #: Weights of the states of the free response, and of the powers of time, of each record: shapes (K, n) and (K, q).
+    #: Of each channel the weights of its states, and of its input itself.
+    outputs: list[Array]
+    directs: list[float]
+    #: Weights of the states of the free responses, and of the powers of time, of each record: shapes (K, n) and (K, q).
     free: Array
     trend: Array
     span: "Span"
 
 
-def project(problem: Problem, speed: Array, damping: Array, delay: Delay, *, slopes_too: bool = False) -> Projected:
-    """Eliminate numerator, free responses and trends for given sections, fastest first.
+def project(problem: Problem, speed: Array, damping: Array, delays: Delays, *, slopes_too: bool = False) -> Projected:
+    """Eliminate numerators, free responses and trends for given sections, fastest first in each denominator.
 
     Where :func:`slopes` will follow, one pass over the records can serve both.
     """
-    form = form_of(problem.rows(speed, damping), problem.length)
-    second = slopes_too and isinstance(form, Modal)
-    triangles = _triangles(problem, [form] * len(problem.records), delay, second)
+    arrangement = problem.arranged(order_of(damping))
+    forms = forms_of(problem.rows(speed, damping), [one.blocks for one in arrangement.channels], problem.length)
+    second = slopes_too and isinstance(forms[0], Modal)
+    triangles = _triangles(problem, arrangement, [forms] * len(problem.records), delays, second)
     span = Span(problem, triangles, weights_of(problem, speed, damping))
     shared, own = span.solution()
-    n, records = span.n, len(problem.records)
-    output, free, trend = np.zeros(n), np.zeros((records, n)), np.zeros((records, len(problem.trend)))
-    submodels = problem.submodels(n)
-    proper = submodels.spanning.size
-    output[submodels.spanning] = shared[:proper]
+    n, records, place = arrangement.order, len(problem.records), 0
+    outputs, directs = list[Array](), list[float]()
+    for channel in arrangement.channels:
+        output, proper = np.zeros(channel.order), channel.spanning.size
+        output[channel.spanning] = shared[place : place + proper]
+        outputs.append(output)
+        directs.append(float(shared[place + proper]) if channel.direct >= 0 else 0.0)
+        place += channel.size
+    free, trend = np.zeros((records, n)), np.zeros((records, len(problem.trend)))
     if problem.free_response or problem.trend:
         own = own.reshape(records, -1)
         if problem.free_response:
             free = own[:, :n]
         trend = own[:, own.shape[1] - len(problem.trend) :]
-    direct = float(shared[proper]) if submodels.direct >= 0 else 0.0
-    squared_error = float(span.residual @ span.residual)
-    return Projected(squared_error, output, direct, free, trend, span)
+    return Projected(float(span.residual @ span.residual), outputs, directs, free, trend, span)
 
 
-def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delay: Delay) -> Array:
-    """Return the squared errors of many sections of one order at one delay, to compare starts."""
-    forms = [form_of(problem.rows(*own), problem.length) for own in sections]
-    errors = np.zeros(len(forms))
-    modal = [k for k, form in enumerate(forms) if isinstance(form, Modal)]
+def responses(problem: Problem, projected: Projected) -> list[Array]:
+    """Return the response to all inputs, without free responses and trends, at the used samples of each record."""
+    triangles, found = projected.span.triangles, list[Array]()
+    columns = replace(triangles.columns, free=(), second=False, trend=())
+    for data, period, _ in problem.laid_out:
+        parts = []
+        for rows in rows_of(triangles.forms, columns, triangles.delays, data, period):
+            each = zip(triangles.forms, projected.outputs, projected.directs, strict=True)
+            of_channels = [
+                (output @ form.states) @ rows[columns.z(k)] + direct * rows[columns.u(k)]
+                for k, (form, output, direct) in enumerate(each)
+            ]
+            parts.append(np.sum(of_channels, axis=0))
+        found.append(np.concatenate(parts))
+    return found
+
+
+def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delays: Delays) -> Array:
+    """Return the squared errors of many sections of one order at given delays, to compare starts."""
+    arrangement = problem.arranged(order_of(sections[0][1]))
+    blocks = [channel.blocks for channel in arrangement.channels]
+    candidates = [forms_of(problem.rows(*own), blocks, problem.length) for own in sections]
+    errors = np.zeros(len(candidates))
+    modal = [k for k, forms in enumerate(candidates) if isinstance(forms[0], Modal)]
     if np.isfinite(problem.numerator).any():
         modal = []
-    for k in set(range(len(forms))) - set(modal):
-        errors[k] = project(problem, *sections[k], delay).squared_error
+    for k in set(range(len(candidates))) - set(modal):
+        errors[k] = project(problem, *sections[k], delays).squared_error
     at_once = max(TOGETHER // sum(data.count for data in problem.records), 1)
+    columns = Columns.of(arrangement, False, problem.free_response, problem.trend)
     for first in range(0, len(modal), at_once):
         own = modal[first : first + at_once]
-        group = [form for k in own if isinstance(form := forms[k], Modal)]
-        columns = Columns.of(group[0].poles.size, False, problem.free_response, problem.trend)
-        rows = np.stack([triangles_of(group, columns, delay, *record) for record in problem.laid_out], axis=1)
-        phi, y = _columns(problem, columns, rows, np.stack([form.states for form in group])[:, None])
+        group = [[form for form in candidates[k] if isinstance(form, Modal)] for k in own]
+        rows = np.stack([triangles_of(group, columns, delays, *record) for record in problem.laid_out], axis=1)
+        states = [np.stack([form.states for form in forms])[:, None] for forms in zip(*group, strict=True)]
+        phi, y = _columns(problem, Triangles(arrangement, group[0], columns, each_delay(delays), rows), states)
         whole = np.concatenate((phi, y[:, :, None]), axis=2)
         lengths = np.linalg.norm(whole, axis=1, keepdims=True)
         left = np.asarray(np.linalg.qr(whole / np.where(lengths > 0.0, lengths, 1.0), mode="r"))[:, -1, -1]
@@ -315,59 +336,80 @@ def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], de
     return errors
 
 
-def _triangles(problem: Problem, forms: Sequence[Form], delay: Delay, second: bool) -> Triangles:
-    """Return the triangles of all records, each in its form."""
-    n = forms[0].states.shape[0]
-    columns = Columns.of(n, second, problem.free_response, problem.trend)
+def _triangles(
+    problem: Problem, arrangement: Arrangement, forms: Sequence[Sequence[Form]], delays: Delays, second: bool
+) -> Triangles:
+    """Return the triangles of all records, each with its forms of the channels."""
+    columns = Columns.of(arrangement, second, problem.free_response, problem.trend)
     each = zip(forms, problem.laid_out, strict=True)
-    rows = np.stack([triangle_of(form, columns, delay, *record) for form, record in each])
-    return Triangles(forms[0], columns, delay, rows)
+    rows = np.stack([triangle_of(own, columns, delays, *record) for own, record in each])
+    return Triangles(arrangement, forms[0], columns, each_delay(delays), rows)
 
 
 def slopes(
-    problem: Problem, speed: Array, damping: Array, delay: Delay, projected: Projected, delay_free: bool
+    problem: Problem,
+    speed: Array,
+    damping: Array,
+    delays: Delays,
+    projected: Projected,
+    free_delays: Sequence[int] = (),
 ) -> Slopes:
-    """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delay."""
-    span, output = projected.span, projected.output
-    submodels = problem.submodels(span.n)
-    direct = submodels.directs(projected.direct)
-    triangles = span.triangles
-    if not triangles.columns.second or triangles.delay != delay:
-        forms = [triangles.form.driving(output, direct, free) for free in projected.free]
-        span = Span(problem, _triangles(problem, forms, delay, True), weights_of(problem, speed, damping))
-    form, columns, _, rows = span.triangles
-    searched = submodels.searched
-    n = int(np.count_nonzero(searched))
-    psi = np.zeros((*rows.shape[:2], n + delay_free))
-    states = 2 * columns.n
-    psi[:, :, :n] = rows[:, :, :states] @ form.slopes(output, direct)[:, searched]
-    if problem.terms and span.weights is not None:
-        psi[:, :, :n] += _of_constants(problem, speed, damping, projected, span.triangles)
-    if problem.free_response:
-        maps = np.stack([form.slopes(free, 0.0 * direct)[:, searched] for free in projected.free])
-        psi[:, :, :n] += rows[:, :, columns.free_states] @ maps
-    if delay_free:
-        # dx/dtau = -x'(t - tau).
-        of_z, of_u = form.rate(output)
-        psi[:, :, n] = -(rows[:, :, : columns.n] @ of_z + of_u * rows[:, :, columns.u])
-    psi = psi.reshape(span.residual.size, n + delay_free)
+    """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delays.
+
+    ``free_delays``: the inputs along whose delays derivatives are taken, too.
+    """
+    span, directs = projected.span, projected.directs
+    triangles, arrangement = span.triangles, span.triangles.arrangement
+    channels = arrangement.channels
+    of_direct = [channel.directs(direct) for channel, direct in zip(channels, directs, strict=True)]
+    if not triangles.columns.second or triangles.delays != each_delay(delays):
+        each = list(zip(triangles.forms, projected.outputs, of_direct, channels, strict=True))
+        forms = [
+            [form.driving(output, direct, free[channel.states]) for form, output, direct, channel in each]
+            for free in projected.free
+        ]
+        weights = weights_of(problem, speed, damping)
+        span = Span(problem, _triangles(problem, arrangement, forms, delays, True), weights)
+    _, forms_used, columns, _, rows = span.triangles
+    n = arrangement.poles
+    psi = np.zeros((*rows.shape[:2], n + len(free_delays)))
+    for k, channel in enumerate(channels):
+        form, output, direct = forms_used[k], projected.outputs[k], of_direct[k]
+        own = psi[:, :, channel.poles]
+        own += rows[:, :, columns.states(k)] @ form.slopes(output, direct)[:, channel.searched]
+        if not problem.monic and span.weights is not None:
+            own += _of_constants(problem, speed, damping, projected, span.triangles, k)
+        if channel.input in free_delays:
+            # dx/dtau = -x'(t - tau).
+            of_z, of_u = form.rate(output)
+            place = n + free_delays.index(channel.input)
+            psi[:, :, place] -= rows[:, :, columns.z(k)] @ of_z + of_u * rows[:, :, columns.u(k)]
+    for number, k in enumerate(columns.free):
+        channel, form = channels[k], forms_used[k]
+        none = 0.0 * of_direct[k]
+        maps = np.stack([form.slopes(free[channel.states], none)[:, channel.searched] for free in projected.free])
+        psi[:, :, channel.poles] += rows[:, :, columns.free_states(number)] @ maps
+    psi = psi.reshape(span.residual.size, -1)
     # (I - P): what the eliminated coefficients would follow is no effect of the poles.
     psi -= span.left @ (span.left.T @ psi)
     residual = span.residual
     return Slopes(float(residual @ residual), -(psi.T @ residual), psi.T @ psi)
 
 
-def _of_constants(problem: Problem, speed: Array, damping: Array, projected: Projected, triangles: Triangles) -> Array:
+def _of_constants(
+    problem: Problem, speed: Array, damping: Array, projected: Projected, triangles: Triangles, k: int
+) -> Array:
     """Return what the constant terms of the denominators do to the output if known numerators keep their values."""
     found, first = [], 0
-    form, columns, _, rows = triangles
-    directs = problem.submodels(columns.n).directs(projected.direct)
-    sections = split(speed, damping, problem.parts)
-    for (_, zetas), term, direct in zip(sections, problem.terms, directs.tolist(), strict=True):
-        own = np.zeros(columns.n)
-        own[first : first + term.order] = projected.output[first : first + term.order]
+    channel, form = triangles.arrangement.channels[k], triangles.forms[k]
+    columns, rows = triangles.columns, triangles.rows
+    directs = channel.directs(projected.directs[k])
+    sections = split(speed, damping, problem.parts)[channel.blocks]
+    for (_, zetas), term, direct in zip(sections, channel.terms, directs.tolist(), strict=True):
+        own = np.zeros(channel.order)
+        own[first : first + term.order] = projected.outputs[k][first : first + term.order]
         first += term.order
-        response = rows[:, :, : columns.n] @ (own @ form.states) + direct * rows[:, :, columns.u]
+        response = rows[:, :, columns.z(k)] @ (own @ form.states) + direct * rows[:, :, columns.u(k)]
         # The constant term is the product of all w^2 and p.
         found += [response * power for zeta in zetas.tolist() for power in ((1.0,) if zeta < 0 else (2.0, 0.0))]
     return np.stack(found, axis=-1)

@@ -1,6 +1,6 @@
 """Descent to a local minimum of the projected squared error, and what kind of minimum it is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, NamedTuple
@@ -9,7 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray
-from ctid_cli.estimation.optimum.box import TOUCH, Box, Point, at_bounds, box_of, frozen, moved_by, point_of, widened
+from ctid_cli.estimation.optimum.box import (
+    TOUCH,
+    Bounds,
+    Box,
+    Point,
+    at_bounds,
+    box_of,
+    frozen,
+    moved_by,
+    point_of,
+    widened,
+)
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_space
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
 from ctid_cli.estimation.optimum.triangle import Delay
@@ -39,6 +50,8 @@ RIDGE = float(np.log(2.0))
 CROSSED, NEIGHBOURS = 0.01, 8
 #: Least first step along negative curvature, and longest one over which second derivatives are kept.
 SADDLE, SHORT = 0.1, 0.01
+#: No delay is held.
+NO_DELAYS: Mapping[int, int] = {}
 
 
 class Ending(Enum):
@@ -71,8 +84,9 @@ class Local:
     promise: float = np.inf
     #: Coordinates held at a bound.
     held: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    #: Whether the delay sits in a kink of the cost, at a sample.
+    #: Whether a delay sits in a kink of the cost, at a sample; and inputs whose delays would leave their bounds.
     pinned: bool = False
+    delays_at_bound: tuple[int, ...] = ()
 
     @property
     def squared_error(self) -> float:
@@ -114,17 +128,17 @@ class Descent:
     def value(self, point: Point, *, slopes_too: bool = False) -> Projected:
         """Least squares for the poles and delay of a point, from where derivatives may be asked for, too."""
         self.evaluations += 1
-        return project(self.problem, point.speed, point.damping, point.delay, slopes_too=slopes_too)
+        return project(self.problem, point.speed, point.damping, point.delays, slopes_too=slopes_too)
 
     def squared_errors(self, points: Sequence[Point]) -> Array:
         """Return the squared errors at many points of one order, to compare them."""
         self.evaluations += len(points)
-        errors, of_delay = np.zeros(len(points)), dict[Delay, list[int]]()
+        errors, of_delay = np.zeros(len(points)), dict[tuple[Delay, ...], list[int]]()
         for k, point in enumerate(points):
-            of_delay.setdefault(point.delay, []).append(k)
-        for delay, places in of_delay.items():
+            of_delay.setdefault(point.delays, []).append(k)
+        for delays, places in of_delay.items():
             sections = [(points[k].speed, points[k].damping) for k in places]
-            errors[places] = squared_errors(self.problem, sections, delay)
+            errors[places] = squared_errors(self.problem, sections, delays)
         return errors
 
     def sorted(self, points: Sequence[Point]) -> list[Point]:
@@ -132,36 +146,36 @@ class Descent:
         return [points[k] for k in np.argsort(self.squared_errors(points), kind="stable")]
 
     def local(self, point: Point, projected: Projected | None = None) -> Local:
-        """Gradient and curvature at a point; the delay counts in quarter periods."""
+        """Gradient and curvature at a point; delays count in quarter periods."""
         projected = self.value(point, slopes_too=True) if projected is None else projected
         self.evaluations += 1
-        delay = point.delay
-        if self.box.delay_free and delay.seconds < self.box.beyond_edges:
-            delay = delay._replace(seconds=self.box.beyond_edges)
-        found = slopes(self.problem, point.speed, point.damping, delay, projected, self.box.delay_free)
-        inner = np.eye(found.gradient.size)
-        n = point.poles.size
+        free, edge = self.box.free_delays, self.box.beyond_edges
+        delays = tuple(
+            delay._replace(seconds=max(delay.seconds, edge)) if k in free else delay
+            for k, delay in enumerate(point.delays)
+        )
+        found = slopes(self.problem, point.speed, point.damping, delays, projected, free)
+        inner = self.box.quarter * np.eye(found.gradient.size)
+        n = found.gradient.size - len(free)
         inner[:n, :n] = point.jacobian()
-        if self.box.delay_free:
-            inner[n, n] = self.box.quarter
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
 
     def at_its_delay(self, point: Point) -> Point:
-        """Return a point after one Gauss-Newton step of everything but its delay."""
+        """Return a point after one Gauss-Newton step of everything but its delays."""
         here = self.local(point)
-        ways = self._freedom(here, _lengths(here), kinked=True)
+        ways = self._freedom(here, _lengths(here), kinked=self.box.delay_places)
         scaled, slope = ways.reduced(here.gradient, here.curvature)
         step = ways.whole(-np.linalg.lstsq(scaled, slope, rcond=FLAT)[0])
         step /= max(1.0, float(np.abs(step).max()))
         moved = self._moved(here.point, step)
         return point if moved is None else moved
 
-    def _freedom(self, here: Local, lengths: Array, kinked: bool = False) -> Freedom:
-        """Return where a search can go, coordinates measured in given lengths; not along the delay in a kink."""
+    def _freedom(self, here: Local, lengths: Array, kinked: Mapping[int, int] = NO_DELAYS) -> Freedom:
+        """Return where a search can go, coordinates measured in given lengths; not along delays in a kink."""
         slopes = self.known.slopes(here.point, lengths.size)
         free = ~self.known.held(here.gradient / lengths, slopes / lengths, *at_bounds(here.point, self.box))
         if kinked:
-            free[-1] = False
+            free[list(kinked.values())] = False
         return Freedom(free, lengths[free], null_space(slopes[:, free] / lengths[free]))
 
     def _moved(self, point: Point, step: Array) -> Point | None:
@@ -169,19 +183,28 @@ class Descent:
         return self.known.met(moved_by(point, step, self.box), self.box)
 
     def _faced(self, here: Local) -> Local:
-        """Where the delay is at a sample, the side of it that goes downhill, if any."""
-        delay, cell = here.point.delay, self.box.cell
-        if delay.cell < 0 or not frozen(here.point, here.gradient, self.box)[-1]:
+        """Where a delay is at a sample, the side of it that goes downhill, if any."""
+        if not self.box.cell:
             return here
-        side = 1 if here.gradient[-1] < 0 else -1
+        for k, place in self.box.delay_places.items():
+            here = self._one_faced(here, k, place)
+        return here
+
+    def _one_faced(self, here: Local, k: int, place: int) -> Local:
+        """The side of a sample that goes downhill along one delay."""
+        delay, cell = here.point.delays[k], self.box.cell
+        if delay.cell < 0 or not frozen(here.point, here.gradient, self.box)[place]:
+            return here
+        side = 1 if here.gradient[place] < 0 else -1
         # A delay at the bound of the set has no other side.
-        low, high = self.box.delays
+        low, high = self.box.each_delay[k]
         if (side > 0 and delay.seconds >= high - TOUCH * cell) or (side < 0 and delay.seconds <= low + TOUCH * cell):
             return here
         sample = (delay.cell + (side > 0)) * cell
-        other = replace(here.point, delay=delay._replace(seconds=sample, cell=delay.cell + side))
-        across = self.local(other, here.projected)
-        return across if across.gradient[-1] * side < 0 else here
+        delays = list(here.point.delays)
+        delays[k] = delay._replace(seconds=sample, cell=delay.cell + side)
+        across = self.local(here.point.with_delays(delays), here.projected)
+        return across if across.gradient[place] * side < 0 else here
 
     def descend(
         self, start: Point, known: Sequence[Local] = (), near: float = NEAR, most_steps: int = MOST_STEPS
@@ -249,8 +272,8 @@ class Descent:
         size = here.gradient.size
         forces = self._forces(here)
         steps = np.full(size, DIFFERENCE)
-        if self.box.delay_free and self.box.cell > 0:
-            steps[-1] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
+        if self.box.cell > 0:
+            steps[size - len(self.box.free_delays) :] = min(DIFFERENCE, 0.1 * self.box.cell / self.box.quarter)
         rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
         for side in (1.0, -1.0):
             for i in range(size):
@@ -272,7 +295,7 @@ class Descent:
 
     def settle(self, here: Local) -> Local:
         """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
-        kinked = False
+        kinked: dict[int, int] = {}
         second: Array | None = None
         for _ in range(MOST_NEWTON):
             here = self._faced(here)
@@ -306,10 +329,11 @@ class Descent:
                 second = None
                 continue
             # A step that gives next to nothing of what it promises has crossed a kink.
-            if free[-1] and (lower is None or fall < CROSSED * promise < np.inf):
-                kink = self._in_kink(here, float(abs(step[-1])))
+            if lower is None or fall < CROSSED * promise < np.inf:
+                kink = self._in_kink(here, step, free)
                 if kink is not None:
-                    here, kinked, second = kink, True, None
+                    here, k, place = kink
+                    kinked, second = {**kinked, k: place}, None
                     continue
             if lower is None:
                 return self._judged(here, free, promise, modes)
@@ -337,22 +361,32 @@ class Descent:
 
     def _whole_and_to_edge(self, point: Point, step: Array) -> list[Array]:
         """A step, and where it crosses a sample its part up to there: a minimum may be in the kink itself."""
-        cell, tau = self.box.cell, point.delay.seconds
-        if point.delay.cell < 0 or step[-1] == 0.0:
-            return [step]
-        way = (point.delay.cell + (step[-1] > 0)) * cell - tau
-        part = way / (step[-1] * self.box.quarter)
-        return [step, part * step] if 0.0 < part < 1.0 else [step]
+        parts = []
+        for k, place in self.box.delay_places.items():
+            delay, cell = point.delays[k], self.box.cell
+            if delay.cell >= 0 and step[place] != 0.0:
+                way = (delay.cell + (step[place] > 0)) * cell - delay.seconds
+                parts.append(way / (step[place] * self.box.quarter))
+        return [step, *(part * step for part in sorted(parts, reverse=True) if 0.0 < part < 1.0)]
 
-    def _in_kink(self, here: Local, reach: float) -> Local | None:
-        """The nearest kink along the delay, on a clock where any delay may be one; None where there is none.
+    def _in_kink(self, here: Local, step: Array, free: BoolArray) -> tuple[Local, int, int] | None:
+        """The nearest kink along a delay, on a clock where any delay may be one, its input, and its coordinate."""
+        for k, place in self.box.delay_places.items():
+            if free[place]:
+                found = self._in_kink_along(here, k, place, float(abs(step[place])))
+                if found is not None:
+                    return found, k, place
+        return None
+
+    def _in_kink_along(self, here: Local, k: int, place: int, reach: float) -> Local | None:
+        """The nearest kink along one delay; None where there is none.
 
         The slope along the delay changes sign in it. The next kink may be nearer than a step reaches, so neighbours are
         compared from the closest on; halving then leaves nothing to be gained between the two sides.
         """
-        if not self.box.delay_free or here.point.delay.cell >= 0 or not reach > 0:
+        if here.point.delays[k].cell >= 0 or not reach > 0:
             return None
-        along = np.append(np.zeros(here.gradient.size - 1), 1.0)
+        along = np.eye(here.gradient.size)[place]
 
         def at(shift: float) -> Local:
             return self.local(moved_by(here.point, shift * along, self.box))
@@ -360,16 +394,16 @@ class Descent:
         for length in reach * 10.0 ** np.arange(-NEIGHBOURS, 1.0):
             low, high = -length, length
             before, after = at(low), at(high)
-            if before.gradient[-1] <= 0 <= after.gradient[-1]:
+            if before.gradient[place] <= 0 <= after.gradient[place]:
                 break
         else:
             return None
-        while (high - low) * (after.gradient[-1] - before.gradient[-1]) > CONVERGED * here.squared_error:
+        while (high - low) * (after.gradient[place] - before.gradient[place]) > CONVERGED * here.squared_error:
             middle = 0.5 * (low + high)
             if not low < middle < high:
                 break
             between = at(middle)
-            if between.gradient[-1] <= 0:
+            if between.gradient[place] <= 0:
                 low, before = middle, between
             else:
                 high, after = middle, between
@@ -377,17 +411,19 @@ class Descent:
 
     def _judged(self, here: Local, free: BoolArray, promise: float, modes: tuple[Array, Array] | None) -> Local:
         held = ~free
-        pinned, bound = False, held.copy()
-        if self.box.delay_free and held[-1]:
-            tau, (low, high) = here.point.delay.seconds, self.box.delays
-            pinned = low < tau < high
-            bound[-1] = not pinned
+        pinned, bound, at_bound = False, held.copy(), []
+        for k, place in self.box.delay_places.items():
+            low, high = self.box.each_delay[k]
+            if held[place] and low < here.point.seconds[k] < high:
+                pinned, bound[place] = True, False
+            elif held[place]:
+                at_bound.append(k)
         ending = Ending.STALLED
         if modes is not None and self._on_ridge(here, free, *modes):
             ending = Ending.RIDGE
         elif promise <= CONVERGED:
             ending = Ending.AT_BOUND if bound.any() else Ending.CONVERGED
-        return replace(here, ending=ending, promise=promise, held=held, pinned=pinned)
+        return replace(here, ending=ending, promise=promise, held=held, pinned=pinned, delays_at_bound=tuple(at_bound))
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
         """Whether the squared error moves by less than the residual's variance as far as the set reaches.
@@ -420,8 +456,8 @@ class Descent:
 def local_minimum(
     problem: Problem,
     poles: ComplexArray,
-    delay: float,
-    delays: tuple[float, float],
+    delay: float | Sequence[float],
+    delays: Bounds,
     *effort: Any,
     box: Box | None = None,
     known: KnownCoefficients = NOTHING,
@@ -433,7 +469,7 @@ def local_minimum(
     box = box or box_of(problem, delays)
     if known.all_poles:
         box = widened(box, poles)
-    return Descent(problem, box, known).descend(point_of(poles, delay, box, parts=problem.parts), (), *effort)
+    return Descent(problem, box, known).descend(point_of(poles, delay, box), (), *effort)
 
 
 def _same(one: Point, other: Point) -> bool:
@@ -441,20 +477,22 @@ def _same(one: Point, other: Point) -> bool:
     return (
         one.speed.size == other.speed.size
         and np.allclose(one.speed, other.speed, rtol=1e-9)
-        and one.delay.seconds == other.delay.seconds
+        and one.seconds == other.seconds
     )
 
 
 def _alike(here: Local, other: Local, box: Box) -> bool:
     """Whether two places are so close that one minimum must be meant."""
-    near = here.squared_error < (1 + CLOSE) * other.squared_error and here.point.delay.cell == other.point.delay.cell
-    if not near or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
+    if here.squared_error >= (1 + CLOSE) * other.squared_error:
+        return False
+    if here.point.cells != other.point.cells or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
         return False
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
-    later = (here.point.delay.seconds - other.point.delay.seconds) / box.quarter
+    each = zip(here.point.seconds, other.point.seconds, strict=True)
+    later = max(abs(one - two) for one, two in each) / box.quarter
     # On an irregular clock minima lie closer along the delay.
     nearest = CLOSE if box.cell > 0 else CLOSE_BETWEEN_KINKS
-    return bool(np.abs(away).max(initial=0.0) < CLOSE and abs(later) < nearest)
+    return bool(np.abs(away).max(initial=0.0) < CLOSE and later < nearest)
 
 
 def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
@@ -491,10 +529,11 @@ def _promise(curvature: Array, gradient: Array) -> tuple[float, Array, Array]:
 def _unbounded(point: Point, step: Array, box: Box) -> Point | None:
     """The point a small step away, in the same coordinates, admissible or not; none across a sample."""
     speed, damping = point.shifted(step)
-    delay = point.delay
-    if box.delay_free and step[-1]:
-        tau = delay.seconds + step[-1] * box.quarter
-        if tau < 0 or (delay.cell >= 0 and not delay.cell * box.cell <= tau <= (delay.cell + 1) * box.cell):
-            return None
-        delay = delay._replace(seconds=tau)
-    return replace(point, speed=speed, damping=damping, delay=delay)
+    delays = list(point.delays)
+    for k, place in box.delay_places.items():
+        if step[place]:
+            tau, cell = delays[k].seconds + step[place] * box.quarter, delays[k].cell
+            if tau < 0 or (cell >= 0 and not cell * box.cell <= tau <= (cell + 1) * box.cell):
+                return None
+            delays[k] = delays[k]._replace(seconds=tau)
+    return replace(point, speed=speed, damping=damping, delays=tuple(delays))

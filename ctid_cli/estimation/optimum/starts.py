@@ -1,16 +1,19 @@
 """Where searches start: from the optima of the smaller models, from given estimates, and at random."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.estimation.optimum.box import LIMITS, Box, Point, point_of
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
-from ctid_cli.estimation.optimum.projection import Problem
+from ctid_cli.estimation.optimum.projection import Problem, responses
 from ctid_cli.estimation.optimum.search import Descent, Local
+from ctid_cli.models.additive import Term
 
 #: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
 #: these resolve. The best of them, and delays, that are looked at together.
@@ -26,8 +29,13 @@ SAME = 1e-6
 APART = 0.7
 #: Poles are fast whose magnitude times the sampling interval exceeds this.
 FAST = 0.25
+#: Starts of all fractions of a sum that are refined together.
+REFINED_TOGETHER = 6
 #: Most delays of a profile.
 MOST_DELAYS = 100
+
+
+T = TypeVar("T")
 
 
 class Effort(NamedTuple):
@@ -66,6 +74,7 @@ class StructureSearch:
         effort: Effort = THOROUGH,
         known: KnownCoefficients = NOTHING,
         pilot: "StructureSearch | None" = None,
+        first_delays: tuple[float, ...] | None = None,
     ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
         self.effort = effort
@@ -73,6 +82,7 @@ class StructureSearch:
         self.known = known
         #: The search of a part of the records, from whose minima this one starts.
         self.pilot = pilot
+        self._given_delays = first_delays
         self._descents: dict[int, Descent] = {}
         self._minima: dict[tuple[int, int], list[Local]] = {}
         self._ends: dict[tuple[int, int], list[float]] = {}
@@ -132,7 +142,7 @@ class StructureSearch:
         """Search from points, and keep the lowest minima."""
         descent, kept = self.descent(zeros), self._minima.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
-        queue, cells = list(points), set[int]()
+        queue, cells = list(points), set[tuple[int, int]]()
         while queue:
             local = descent.descend(queue.pop(0), kept)
             ends.append(local.squared_error)
@@ -149,45 +159,57 @@ class StructureSearch:
     def _from_pilot(self, pilot: "StructureSearch", poles: int, zeros: int) -> list[Point]:
         """Return what a part of the records says, and the models that the structure contains exactly."""
         there = pilot.best(poles, zeros)
-        points = [point_of(there.poles, there.delay.seconds, self.box)]
+        points = [point_of(there.poles, there.seconds, self.box)]
         if zeros > 0:
             points.append(self.best(poles, zeros - 1))
         if poles > 1 and zeros > 0:
             within = self.best(poles - 1, zeros - 1)
             added = [-np.sqrt(self.box.spread[0] * self.box.fastest)]
-            points.append(point_of(np.concatenate((within.poles, added)), within.delay.seconds, self.box))
+            points.append(point_of(np.concatenate((within.poles, added)), within.seconds, self.box))
         return points
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
         """Return the best single poles, or single pairs."""
-        delay = self.best(1, 0).delay.seconds if poles > 1 else 0.5 * sum(self.box.delays)
+        delay = self.best(1, 0).seconds if poles > 1 else self.first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
-    def _beside(self, point: Point, cells: set[int]) -> list[Point]:
-        """Starts in the cells of the delay beside that of a minimum, where they are not yet among these cells.
+    def _beside(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
+        """Starts in the cells of each delay beside that of a minimum, where they are not yet among these cells.
 
-        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next.
+        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next. With
+        several inputs that was seen beside slow poles too.
         """
-        low, high = self.box.delays
-        if point.delay.cell < 0 or not point.speed.size or point.speed[0] * self.box.cell < FAST:
+        width, points = self.box.cell, list[Point]()
+        slow = len(self.box.each_delay) < 2 and float(point.speed.max(initial=0.0)) * width < FAST
+        if not width or not point.speed.size or slow:
             return []
-        own, width = point.delay.cell, self.box.cell
-        cells.add(own)
-        points: list[Point] = []
-        for cell in (own - 1, own + 1):
-            if cell not in cells and (cell + 1) * width > low and cell * width < high:
-                cells.add(cell)
-                # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
-                border = max(own, cell) * width
-                points += [
-                    point_of(point.poles, tau, self.box, cell, point.parts) for tau in ((cell + 0.5) * width, border)
-                ]
+        for k in self.box.free_delays:
+            (low, high), own = self.box.each_delay[k], point.delays[k].cell
+            cells.add((k, own))
+            for cell in (own - 1, own + 1):
+                if (k, cell) not in cells and (cell + 1) * width > low and cell * width < high:
+                    cells.add((k, cell))
+                    # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
+                    border = max(own, cell) * width
+                    for tau in ((cell + 0.5) * width, border):
+                        seconds, within = list(point.seconds), [delay.cell for delay in point.delays]
+                        seconds[k], within[k] = tau, cell
+                        points.append(point_of(point.poles, seconds, self.box, within))
         return points
+
+    @cached_property
+    def first_delays(self) -> tuple[float, ...]:
+        """Delays to start from: the middle of the range; of several inputs those of a pole of its own for each."""
+        problem, count = self.problem, len(self.problem.fewer_zeros)
+        if self._given_delays is not None or count < 2:
+            return self._given_delays or self.box.middle
+        apart = problem._replace(terms=(Term(1, 0, problem.integrators),) * count, inputs=tuple(range(count)))
+        return block_starts(apart, replace(self.box, parts=apart.parts), 0, self.seed)[0].seconds
 
     def from_below(self, poles: int, zeros: int) -> list[Point]:
         """Return starts from smaller models, and along the delay."""
         if poles == 0:
-            middle = point_of(np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays), self.box)
+            middle = point_of(np.zeros(0, dtype=complex), self.first_delays, self.box)
             return self.along_delay(zeros, [middle])
         contained = self._alone(zeros, poles) if poles <= 2 else []
         others: list[Point] = []
@@ -219,16 +241,17 @@ class StructureSearch:
         count = min(int(highest / resolution), RESOLVED // samples)
         if poles < 2 or count < self.effort.pairs:
             return []
-        roots, delay = np.zeros(0, dtype=complex), 0.5 * sum(self.box.delays)
+        roots, delay = np.zeros(0, dtype=complex), self.first_delays
         if poles > 2:
             smaller = self.best(poles - 2, min(zeros, poles - 3))
-            roots, delay = smaller.poles, smaller.delay.seconds
+            roots, delay = smaller.poles, smaller.seconds
         zeta = self.box.least_damping
         frequencies = np.linspace(resolution, highest, count).tolist()
         alone = self._with_pairs(zeros, roots, [(w, zeta, delay) for w in frequencies])
         best = [alone[k] for k in lowest_minima(np.array([cost for cost, _, _ in alone]), LOOKED_AT)]
-        delays = self.delays(LOOKED_AT) or [delay]
-        if self.box.delay_free:
+        single = len(delay) == 1
+        delays = [(tau,) for tau in self.delays(LOOKED_AT)] if single and self.box.delay_free else [delay]
+        if self.box.delay_free and single:
             best += self._with_pairs(zeros, roots, [(w, zeta, tau) for _, w, _ in best for tau in delays])
         lowest: dict[float, Point] = {}
         for _, w, point in sorted(best, key=lambda entry: entry[0]):
@@ -242,7 +265,7 @@ class StructureSearch:
         return found
 
     def _with_pairs(
-        self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, float]]
+        self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, tuple[float, ...]]]
     ) -> list[tuple[float, float, Point]]:
         """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
         frequencies, points = [], []
@@ -262,18 +285,21 @@ class StructureSearch:
             return []
         best = self.best(poles, zeros)
         interval = LIMITS["fastest"].rest / self.box.fastest
-        delays = best.delay.seconds + interval * np.concatenate((-CLOSE_DELAYS, CLOSE_DELAYS))
-        inside = np.unique(np.clip(delays, *self.box.delays))
-        points = [replace(best, delay=best.delay._replace(seconds=tau)) for tau in inside.tolist()]
+        points = []
+        for k in self.box.free_delays:
+            delays = best.seconds[k] + interval * np.concatenate((-CLOSE_DELAYS, CLOSE_DELAYS))
+            inside = np.unique(np.clip(delays, *self.box.each_delay[k]))
+            for tau in inside.tolist():
+                points.append(best.with_delays(_at(best.delays, k, best.delays[k]._replace(seconds=tau))))
         return [self.descent(zeros).at_its_delay(point) for point in points]
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
         """The best of a smaller structure with poles added, for another numerator."""
         point = self.best(poles, zeros)
-        return self._extended(new_zeros, point.poles, point.delay.seconds, added, self.effort.looked_at)
+        return self._extended(new_zeros, point.poles, point.seconds, added, self.effort.looked_at)
 
     def _extended(
-        self, zeros: int, roots: ComplexArray, delay: float, added: int, most: int, denser: int = 1
+        self, zeros: int, roots: ComplexArray, delay: tuple[float, ...], added: int, most: int, denser: int = 1
     ) -> list[Point]:
         """The best few of all poles, or pairs, added to given ones, by elimination alone."""
         effort, box = self.effort, self.box
@@ -297,16 +323,24 @@ class StructureSearch:
         return [points[k] for k in chosen]
 
     def along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
-        """Return also starts at the minima of the profile over the delay, for the poles of the best start."""
-        if not self.box.delay_free or not points:
-            return points
-        poles, parts = points[0].poles, points[0].parts
-        trials = [point_of(poles, delay, self.box, parts=parts) for delay in self.delays(MOST_DELAYS)]
-        return points + [trials[k] for k in lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
+        """Return also starts at the minima of the profile over each delay, for the poles of the best start.
 
-    def delays(self, most: int) -> list[float]:
-        """Delays that are spread over the whole range, at most one for each of its cells; none of a known delay."""
-        low, high = self.box.delays
+        Of several delays one after the other is moved to its best place, twice.
+        """
+        if not points:
+            return points
+        point, found, free = points[0], list[Point](), self.box.free_delays
+        for k in free if len(free) < 2 else (*free, *free):
+            seconds = [_at(point.seconds, k, tau) for tau in self.delays(MOST_DELAYS, k)]
+            trials = [point_of(point.poles, each, self.box) for each in seconds]
+            minima = [trials[i] for i in lowest_minima(self.descent(zeros).squared_errors(trials), KEPT)]
+            point = minima[0]
+            found += minima
+        return points + found[-KEPT * len(free) :]
+
+    def delays(self, most: int, k: int = 0) -> list[float]:
+        """Delays of an input that are spread over its range, at most one for each of its cells."""
+        low, high = self.box.each_delay[k]
         spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / most)
         count = int(np.ceil((high - low) / spacing))
         delays: list[float] = (low + (high - low) * (np.arange(count) + 0.5) / count).tolist()
@@ -315,15 +349,25 @@ class StructureSearch:
     def random_points(self, poles: int) -> list[Point]:
         """Return starts drawn uniformly: logarithms of frequencies and dampings in their spread, delays."""
         rng, box, points = np.random.default_rng(self.seed), self.box, []
-        slowest, least_damping = box.spread
         for _ in range(self.random_starts * (1 + poles)):
-            pairs = int(rng.integers(0, poles // 2 + 1))
-            w = np.exp(rng.uniform(np.log(slowest), np.log(box.fastest), poles - pairs))
-            zeta = np.exp(rng.uniform(np.log(least_damping), 0.0, pairs))
-            upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
-            roots = np.concatenate((upper, upper.conj(), -w[pairs:]))
-            points.append(point_of(roots, float(rng.uniform(*box.delays)), box))
+            roots = [self._random_poles(rng, order) for order in box.parts or (poles,)]
+            delays = [float(rng.uniform(*pair)) for pair in box.each_delay]
+            points.append(point_of(np.concatenate(roots), delays, box))
         return points
+
+    def _random_poles(self, rng: np.random.Generator, poles: int) -> ComplexArray:
+        """Return the poles of one denominator."""
+        slowest, least_damping = self.box.spread
+        pairs = int(rng.integers(0, poles // 2 + 1))
+        w = np.exp(rng.uniform(np.log(slowest), np.log(self.box.fastest), poles - pairs))
+        zeta = np.exp(rng.uniform(np.log(least_damping), 0.0, pairs))
+        upper = w[:pairs] * (-zeta + 1j * np.sqrt(1 - zeta**2))
+        return np.concatenate((upper, upper.conj(), -w[pairs:]))
+
+
+def _at(values: tuple[T, ...], k: int, value: T) -> tuple[T, ...]:
+    """Return values of which one is another."""
+    return (*values[:k], value, *values[k + 1 :])
 
 
 def lowest_minima(values: Array, most: int) -> list[int]:
@@ -331,3 +375,52 @@ def lowest_minima(values: Array, most: int) -> list[int]:
     padded = np.concatenate(([np.inf], values, [np.inf]))
     minima = np.flatnonzero((values <= padded[:-2]) & (values < padded[2:]))
     return [int(k) for k in minima[np.argsort(values[minima])[:most]]]
+
+
+# --- several denominators: the fractions of each are searched beside what the others leave ------------
+
+
+def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> list[Point]:
+    """Return starts of a sum of fractions with several denominators, the most likely first.
+
+    The search of one denominator sees the output less the response of the others, as they are known by then: twice,
+    from the first denominator on and from the last one on. The lowest minima of each are combined.
+    """
+    blocks, found = range(len(problem.terms)), list[Point]()
+    for order in (blocks, blocks[::-1]):
+        searches: dict[int, StructureSearch] = {}
+        parts: dict[int, list[Array]] = {}
+        for block in (*order, *order):
+            others = [part for other, part in parts.items() if other != block]
+            own, own_box = _alone(problem, box, block, others)
+            searches[block] = search = StructureSearch(own, own_box, random_starts, seed)
+            poles = problem.terms[block].poles
+            search.climb(poles, own.zeros)
+            search.refine(poles, own.zeros, search.resonances(poles, own.zeros))
+            parts[block] = responses(own, search.minima(poles, own.zeros)[0].projected)
+        minima = [searches[k].minima(term.poles, term.zeros) for k, term in enumerate(problem.terms)]
+        for chosen in product(*minima):
+            seconds = list(box.middle)
+            for driver, local in zip(problem.inputs, chosen, strict=True):
+                seconds[driver] = local.point.delay.seconds
+            found.append(point_of(np.concatenate([local.point.poles for local in chosen]), seconds, box))
+    return Descent(problem, box).sorted(found)[:REFINED_TOGETHER]
+
+
+def _alone(problem: Problem, box: Box, block: int, others: Sequence[list[Array]]) -> tuple[Problem, Box]:
+    """Return the problem of one denominator, its output without what the others explain, and its box."""
+    driver, term, records = problem.inputs[block], problem.terms[block], []
+    for k, data in enumerate(problem.sampled):
+        y = data.y.copy()
+        y[data.use] -= np.sum([part[k] for part in others], axis=0) if others else 0.0
+        records.append(data.inputs[driver]._replace(y=y, use=data.use, further=()))
+    single = problem._replace(
+        records=tuple(records),
+        zeros=term.zeros,
+        integrators=term.integrators,
+        fewer_zeros=(0,),
+        terms=(),
+        inputs=(),
+        numerator=np.zeros(0),
+    )
+    return single, replace(box, delays=(box.each_delay[driver],), parts=())

@@ -50,17 +50,18 @@ class SumGrowth:
     def _added(self, terms: tuple[Term, ...], known: Sequence[Local]) -> list[Local]:
         """Return the lowest minima of a sum, from those that have fewer poles in the last term."""
         problem = replace_terms(self.problem, terms)
-        search = StructureSearch(problem, self.box)
+        box = replace(self.box, parts=problem.parts)
+        search = StructureSearch(problem, box)
         descent, order = search.descent(problem.zeros), sum(term.poles for term in terms)
         found: list[Local] = []
         bases = [(local.point.poles, local.point.delay.seconds) for local in known]
         # The whole range of the delay for what comes first.
-        delays = search.delays(FIRST_DELAYS) or [self.box.delays[0]]
+        delays = search.delays(FIRST_DELAYS) or [box.each_delay[0][0]]
         bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in delays]
         starts: list[Point] = []
         for roots, delay in bases:
             added = order - roots.size
-            starts += _extended(descent, self.box, problem.parts, (roots, delay), added)
+            starts += _extended(descent, box, (roots, delay), added)
         if not known:
             starts = descent.sorted(starts)[: PLACES * KEPT]
         for start in starts:
@@ -71,18 +72,16 @@ class SumGrowth:
         return distinct[:KEPT]
 
 
-def _extended(
-    descent: Descent, box: Box, parts: tuple[int, ...], base: tuple[ComplexArray, float], added: int
-) -> list[Point]:
+def _extended(descent: Descent, box: Box, base: tuple[ComplexArray, float], added: int) -> list[Point]:
     """Return the best few of all poles, or pairs, added to the last submodel of a sum, by elimination alone."""
     roots, delay = base
     if not added:
-        return [point_of(roots, delay, box, parts=parts)]
+        return [point_of(roots, delay, box)]
     frequencies = np.geomspace(box.spread[0], min(box.fastest, box.imaginary), FREQUENCIES + 2)[1:-1].tolist()
     new = [(w, zeta) for w in frequencies for zeta in (DAMPINGS if added == 2 else (1.0,))]
     pairs = [w * complex(-zeta, np.sqrt(1.0 - zeta * zeta)) for w, zeta in new]
     poles = [[pole, pole.conjugate()] if added == 2 else [complex(-abs(pole))] for pole in pairs]
-    points = [point_of(np.concatenate((roots, own)), delay, box, parts=parts) for own in poles]
+    points = [point_of(np.concatenate((roots, own)), delay, box) for own in poles]
     chosen: list[int] = []
     for k in np.argsort(descent.squared_errors(points), kind="stable").tolist():
         if all(np.abs(np.log(new[k]) - np.log(new[other])).max() > APART for other in chosen):
@@ -94,7 +93,7 @@ def _extended(
 
 def replace_terms(problem: Problem, terms: tuple[Term, ...]) -> Problem:
     """Return the same records for another sum."""
-    return problem._replace(terms=terms, integrators=sum(term.integrators for term in terms))
+    return problem._replace(terms=terms)
 
 
 def _rearranged(point: Point, order: Sequence[Term], terms: Sequence[Term], box: Box) -> Point:
@@ -114,9 +113,8 @@ def in_order(point: Point, terms: Sequence[Term], box: Box) -> Point:
 
 
 def _joined(groups: Sequence[ComplexArray], point: Point, box: Box) -> Point:
-    parts = tuple(group.size for group in groups)
-    moved = point_of(np.concatenate(groups), point.delay.seconds, box, parts=parts)
-    return replace(moved, delay=point.delay)
+    own = replace(box, parts=tuple(group.size for group in groups))
+    return point_of(np.concatenate(groups), point.seconds, own).with_delays(point.delays)
 
 
 def _groups(poles: ComplexArray, sizes: Sequence[int]) -> list[ComplexArray]:

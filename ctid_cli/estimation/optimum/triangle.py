@@ -1,16 +1,21 @@
 r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples, ``Z = Q R``: whatever is asked of
-linear maps of these rows (projections, residuals, sums of squares) is asked of the same maps of R. Second moments would
-square the condition; this costs little more, so that one route serves the search and its end.
+With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples (z, w and u of each input where there
+are several), ``Z = Q R``: whatever is asked of linear maps of these rows (projections, residuals, sums of squares) is
+asked of the same maps of R. Second moments would square the condition; this costs little more, so that one route serves
+the search and its end.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array
+from ctid_cli.arrays import Array, IntArray
+from ctid_cli.estimation.optimum.arrangement import Arrangement
 from ctid_cli.estimation.optimum.chain import Chain, Form, Fractions, Modal, Record
 from ctid_cli.filtering.bank import Place
 from ctid_cli.filtering.filter_data import FilterData, split_delay
@@ -36,76 +41,125 @@ class Delay(NamedTuple):
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
 
 
-class Columns(NamedTuple):
-    """Where the rows of n states have what."""
+#: A delay, or one of each input.
+Delays = Delay | tuple[Delay, ...]
 
-    n: int
-    #: Rows of w and of the free response that there are, and the powers of time beside them.
-    second: int
-    free: int
+
+def each_delay(delays: Delays) -> tuple[Delay, ...]:
+    """Return the delay of each input."""
+    return (delays,) if isinstance(delays, Delay) else delays
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where the rows have what: z, w and u of each channel, y, z and w of each free response, powers of time."""
+
+    #: Number of states of each channel, and which input drives it.
+    orders: tuple[int, ...]
+    inputs: tuple[int, ...]
+    #: The channels whose states have free responses.
+    free: tuple[int, ...]
+    #: Whether there is w.
+    second: bool
     trend: tuple[int, ...]
 
-    @classmethod
-    def of(cls, n: int, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
-        """Return the columns of rows with or without w and free response, and with powers of time."""
-        states = 2 * n if second else n
-        return cls(n, states - n, states if free else 0, trend)
+    @staticmethod
+    @lru_cache(maxsize=1024)
+    def of(arrangement: Arrangement, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
+        """Return the columns of the channels of a model, with or without w and free responses."""
+        channels = arrangement.channels
+        orders, inputs = (tuple(each) for each in zip(*((one.order, one.input) for one in channels), strict=True))
+        return Columns(orders, inputs, arrangement.owners if free else (), second, trend)
+
+    @cached_property
+    def _first(self) -> list[int]:
+        """First row of each channel, and the row of the output behind them."""
+        return list(accumulate(((1 + self.second) * order + 1 for order in self.orders), initial=0))
+
+    @cached_property
+    def _first_free(self) -> list[int]:
+        """First row of each free response, and what comes behind them."""
+        widths = ((1 + self.second) * self.orders[k] for k in self.free)
+        return list(accumulate(widths, initial=self.y + 1))
+
+    def z(self, k: int = 0) -> slice:
+        """Z of a channel."""
+        return slice(self._first[k], self._first[k] + self.orders[k])
+
+    def states(self, k: int = 0) -> slice:
+        """Z and w of a channel."""
+        return slice(self._first[k], self._first[k + 1] - 1)
+
+    def u(self, k: int = 0) -> int:
+        """The input of a channel."""
+        return self._first[k + 1] - 1
 
     @property
-    def u(self) -> int:
-        """The input."""
-        return self.n + self.second
+    def y(self) -> int:
+        """The output."""
+        return self._first[-1]
 
-    @property
-    def free_z(self) -> slice:
-        """Z of the free response."""
-        return slice(self.u + 2, self.u + 2 + self.n)
+    def free_states(self, place: int = 0) -> slice:
+        """Z and w of a free response."""
+        return slice(self._first_free[place], self._first_free[place + 1])
 
-    @property
-    def free_states(self) -> slice:
-        """Z and w of the free response."""
-        return slice(self.u + 2, self.u + 2 + self.free)
-
-    @property
-    def size(self) -> int:
-        """Number of columns."""
-        return self.u + 2 + self.free + len(self.trend)
+    def free_z(self, place: int = 0) -> slice:
+        """Z of a free response."""
+        first = self._first_free[place]
+        return slice(first, first + self.orders[self.free[place]])
 
     @property
     def powers(self) -> slice:
         """Powers of the time since the first instant."""
-        return slice(self.u + 2 + self.free, self.size)
+        return slice(self._first_free[-1], self.size)
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return self._first_free[-1] + len(self.trend)
 
 
 def rows_of(
-    form: Fractions | Chain,
+    forms: Sequence[Fractions | Chain],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
 ) -> Iterator[Array]:
-    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given."""
+    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given.
+
+    There is a form for each channel.
+    """
+    each = each_delay(delays)
     if isinstance(data, FrequencyLines):
-        answers = form.at_lines(data, delay.place(data.interval), columns.second > 0)
+        answers = forms[0].at_lines(data, each[0].place(data.interval), columns.second)
         yield data.parts(np.column_stack((answers, data.response)))
         return
     whitener = None if noise is None else Whitener(noise.noise, columns.size)
-    second, done, record = columns.second > 0, 0, _record(delay, data, period)
+    second, done, inputs = columns.second, 0, data.inputs
     elapsed = data.t[data.use] if columns.free or any(columns.trend) else data.t
-    for forced in form.forced(record, second):
-        if not len(forced):
+    forced = [
+        form.forced(_record(each[number], inputs[number], period), second)
+        for form, number in zip(forms, columns.inputs, strict=True)
+    ]
+    for parts in zip(*forced, strict=True):
+        count = len(parts[0])
+        if not count:
             # A piece without outputs.
             continue
-        rows = np.empty((columns.size, len(forced)))
-        rows[: columns.u + 2] = forced.T
-        if columns.free:
-            rows[columns.free_states] = form.free(elapsed[done : done + len(forced)] - elapsed[0], second)
+        rows = np.empty((columns.size, count))
+        for k, part in enumerate(parts):
+            # The output comes behind the input, and behind the last one it stays.
+            rows[columns.states(k).start : columns.u(k) + 2] = part.T
+        for place, k in enumerate(columns.free):
+            own = forms[k].free(elapsed[done : done + count] - elapsed[0], second)
+            rows[columns.free_states(place)] = own
         for row, power in zip(rows[columns.powers], columns.trend, strict=True):
-            row[:] = (elapsed[done : done + len(forced)] - data.t[0]) ** power if power else 1.0
+            row[:] = (elapsed[done : done + count] - data.t[0]) ** power if power else 1.0
         if noise is not None and whitener is not None:
-            whitener(rows, noise.steps[done : done + len(forced)])
-        done += len(forced)
+            whitener(rows, noise.steps[done : done + count])
+        done += count
         yield rows
 
 
@@ -122,9 +176,9 @@ def _reduced(triangle: Array | None, rows: Array) -> Array:
 
 
 def triangle_of(
-    form: Form,
+    forms: Sequence[Form],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
@@ -132,36 +186,39 @@ def triangle_of(
     """Return a triangle with the second moments of the rows of all used samples."""
     # Memory is that of one piece, however long the record.
     triangle: Array | None = None
-    for rows in rows_of(form, columns, delay, data, period, noise):
+    for rows in rows_of(forms, columns, delays, data, period, noise):
         triangle = _reduced(triangle, rows)
     assert triangle is not None
     return triangle
 
 
 def triangles_of(
-    forms: list[Modal],
+    candidates: Sequence[Sequence[Modal]],
     columns: Columns,
-    delay: Delay,
+    delays: Delays,
     data: FilterData | FrequencyLines,
     period: float,
     noise: SampledNoise | None = None,
 ) -> Array:
-    """Return the triangles of several forms of one order without w, from one pass of all their modes: (K, q, q)."""
-    poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
-    widths = np.where(poles.imag > 0.0, 2, 1)
-    last = np.cumsum(widths)
-    # Of each form the rows among those of all modes.
-    each = [np.arange(last[place] - widths[place], last[place]) for place in places]
-    z, n = np.concatenate(each).reshape(len(forms), columns.n), int(last[-1])
-    whole = Columns.of(n, second=False, free=columns.free > 0, trend=columns.trend)
-    others = np.arange(whole.size)
-    chosen = [z, np.tile(others[n : n + 2], (len(forms), 1))]
-    chosen += [n + 2 + z] if columns.free else []
-    chosen += [np.tile(others[whole.powers], (len(forms), 1))]
-    rows_of_forms = np.hstack(chosen)
-    triangles: list[Array | None] = [None] * len(forms)
-    for rows in rows_of(Fractions(Fractions.modes_of(poles)), whole, delay, data, period, noise):
-        triangles = [_reduced(*pair) for pair in zip(triangles, rows[rows_of_forms], strict=True)]
+    """Return the triangles of models of one arrangement without w, from one pass of all their modes: (K, q, q)."""
+    shared, chosen, count = list[Fractions](), list[IntArray](), len(candidates)
+    for forms in zip(*candidates, strict=True):
+        poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
+        widths = np.where(poles.imag > 0.0, 2, 1)
+        last = np.cumsum(widths)
+        # Of each model the rows among those of all modes.
+        each = [np.arange(last[place] - widths[place], last[place]) for place in places]
+        shared.append(Fractions(Fractions.modes_of(poles)))
+        chosen.append(np.concatenate(each).reshape(count, -1) if each else np.zeros((count, 0), dtype=np.int64))
+    whole = replace(columns, orders=tuple(int(np.where(one.modes.poles.imag > 0, 2, 1).sum()) for one in shared))
+    everywhere = np.tile(np.arange(whole.size), (count, 1))
+    wanted = [np.hstack((whole.z(k).start + z, everywhere[:, whole.u(k), None])) for k, z in enumerate(chosen)]
+    wanted.append(everywhere[:, whole.y, None])
+    wanted += [whole.free_z(place).start + chosen[k] for place, k in enumerate(columns.free)]
+    rows_of_models = np.hstack([*wanted, everywhere[:, whole.powers]])
+    triangles: list[Array | None] = [None] * count
+    for rows in rows_of(shared, whole, delays, data, period, noise):
+        triangles = [_reduced(*pair) for pair in zip(triangles, rows[rows_of_models], strict=True)]
     return np.array(triangles)
 
 

@@ -38,6 +38,6 @@ def test_gradient_is_that_of_differences(integrators, free_response):
         return project(problem, speed, damping, Delay(0.37 + step[3], -1)).squared_error
 
     here = Delay(0.37, -1)
-    found = slopes(problem, SPEED, DAMPING, here, project(problem, SPEED, DAMPING, here), True)
+    found = slopes(problem, SPEED, DAMPING, here, project(problem, SPEED, DAMPING, here), (0,))
     differences = [(value(step) - value(-step)) / 4e-5 for step in 1e-5 * np.eye(4)]
     np.testing.assert_allclose(found.gradient, differences, rtol=0, atol=1e-6 * np.abs(found.gradient).max())

@@ -49,7 +49,7 @@ def test_projection_with_known_numerators_is_that_of_dense_matrices(zeros, known
         moved = project(problem, SPEED * np.exp(step[[0, 2]]), DAMPING * np.exp([step[1], 0.0]), delay)
         return moved.squared_error
 
-    gradient = slopes(problem, SPEED, DAMPING, delay, found, False).gradient
+    gradient = slopes(problem, SPEED, DAMPING, delay, found).gradient
     differences = [(value(step) - value(-step)) / 4e-5 for step in 1e-5 * np.eye(3)]
     np.testing.assert_allclose(gradient, differences, rtol=0, atol=1e-6 * np.abs(gradient).max())
 
@@ -67,7 +67,7 @@ def test_points_move_to_where_the_denominator_has_its_values(seed):
     # Directions of the null space keep the values to first order.
     direction = null_space(known.slopes(point, n))[:, -1]
     speed, damping = point.shifted(1e-6 * direction)
-    moved = type(point)(speed, damping, point.edge, point.delay).denominator[1:][known.places]
+    moved = type(point)(speed, damping, point.edge, point.delays).denominator[1:][known.places]
     np.testing.assert_allclose(moved, known.denominator[known.places], rtol=1e-9)
 
 

@@ -5,11 +5,13 @@ import pytest
 from scipy.linalg import block_diag
 
 from ctid_cli.estimation.optimum import chain
+from ctid_cli.estimation.optimum.arrangement import with_one_denominator
 from ctid_cli.estimation.optimum.box import Box, point_of
 from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form_of, numerators, poles_of
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.models.additive import Term
 from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
@@ -64,7 +66,7 @@ def test_gradient_is_that_of_differences(case, treatment):
         damping[1] *= np.exp(step[2])
         return project(problem, speed, damping, Delay(0.37 + step[4], -1)).squared_error
 
-    found = slopes(problem, SPEED, DAMPING, delay, project(problem, SPEED, DAMPING, delay), True)
+    found = slopes(problem, SPEED, DAMPING, delay, project(problem, SPEED, DAMPING, delay), (0,))
     steps = 1e-5 * np.eye(5)
     differences = [(value(step) - value(-step)) / 4e-5 for step in steps]
     np.testing.assert_allclose(found.gradient, differences, rtol=0, atol=1e-7 * np.abs(found.gradient).max())
@@ -81,11 +83,9 @@ def test_curvature_is_that_of_the_gradient_where_residuals_vanish():
     def gradient(step):
         speed, damping = point.shifted(step)
         here = project(problem, speed, damping, delay)
-        return slopes(problem, speed, damping, delay, here, False).gradient
+        return slopes(problem, speed, damping, delay, here).gradient
 
-    curvature = slopes(
-        problem, point.speed, point.damping, delay, project(problem, point.speed, point.damping, delay), False
-    )
+    curvature = slopes(problem, point.speed, point.damping, delay, project(problem, point.speed, point.damping, delay))
     differences = np.array([(gradient(step) - gradient(-step)) / 2e-4 for step in 1e-4 * np.eye(3)])
     np.testing.assert_allclose(curvature.curvature, differences, rtol=0, atol=1e-6 * curvature.curvature.max())
 
@@ -100,7 +100,7 @@ def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
     assert here.squared_error == pytest.approx(project(problem, SPEED, DAMPING, Delay(2.0, -1)).squared_error)
     beyond = [project(problem, SPEED, DAMPING, Delay(2.0 + side * step, -1)).squared_error for step in (1e-5, 2e-5)]
     slope = side * (4 * beyond[0] - beyond[1] - 3 * here.squared_error) / 4e-5
-    assert slopes(problem, SPEED, DAMPING, at, here, True).gradient[-1] == pytest.approx(slope, rel=1e-5)
+    assert slopes(problem, SPEED, DAMPING, at, here, (0,)).gradient[-1] == pytest.approx(slope, rel=1e-5)
 
 
 def test_masked_samples_do_not_count():
@@ -123,7 +123,7 @@ def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_re
     phi = np.hstack((np.vstack([shared for shared, _ in parts]), block_diag(*[own for _, own in parts])))
     left = left_over(phi, np.concatenate([record.y for record in records]))
     assert found.squared_error == pytest.approx(left @ left, rel=1e-8)
-    found_slopes = slopes(problem, SPEED, DAMPING, delay, found, True)
+    found_slopes = slopes(problem, SPEED, DAMPING, delay, found, (0,))
     ends = [project(problem, SPEED, DAMPING, Delay(0.37 + step, -1)).squared_error for step in (-1e-5, 1e-5)]
     assert found_slopes.gradient[-1] == pytest.approx((ends[1] - ends[0]) / 4e-5, rel=1e-6)
 
@@ -180,10 +180,24 @@ def test_poles_of_a_section_meet_and_part():
 def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping):
     data = filter_data(record_of(MODEL, np.random.default_rng(3), samples=400, regular=regular))
     form = form_of([(np.array([2.0]), np.array([damping]))], 100.0)
-    columns = Columns.of(2, False, True, (0,))
-    (whole,) = rows_of(form, columns, Delay(0.8, -1), data, 0.0)
+    columns = Columns.of(with_one_denominator(2, 0, 0, (0,)), False, True, (0,))
+    (whole,) = rows_of([form], columns, Delay(0.8, -1), data, 0.0)
     monkeypatch.setattr(chain, "PIECE", 37)
-    found = np.hstack(list(rows_of(form, columns, Delay(0.8, -1), data, 0.0)))
+    found = np.hstack(list(rows_of([form], columns, Delay(0.8, -1), data, 0.0)))
     np.testing.assert_allclose(found, whole, atol=1e-12)
-    triangle = triangle_of(form, columns, Delay(0.8, -1), data, 0.0)
+    triangle = triangle_of([form], columns, Delay(0.8, -1), data, 0.0)
     np.testing.assert_allclose(triangle.T @ triangle, whole @ whole.T, rtol=1e-10, atol=1e-12)
+
+
+def test_two_submodels_of_one_input_are_fractions_of_two_inputs_that_are_the_same():
+    record = record_of(MODEL, np.random.default_rng(11), noise=0.1)
+    speed, damping, delay = np.array([3.0, 1.5, 0.5, 0.2]), np.array([0.4, -1.0, -1.0, -1.0]), Delay(0.37, -1)
+    one = problem_of(record, 0, True, True)._replace(terms=(Term(2, 1), Term(3, 0, 1)))
+    data = filter_data(record)
+    two = one._replace(records=(data._replace(further=(data,)),), inputs=(0, 1))
+    here, there = project(one, speed, damping, delay), project(two, speed, damping, (delay, delay))
+    assert there.squared_error == pytest.approx(here.squared_error, rel=1e-10)
+    single = slopes(one, speed, damping, delay, here, (0,))
+    each = slopes(two, speed, damping, (delay, delay), there, (0, 1))
+    np.testing.assert_allclose(each.gradient[:-2], single.gradient[:-1], rtol=1e-6)
+    assert each.gradient[-2:].sum() == pytest.approx(single.gradient[-1], rel=1e-6)

@@ -1,7 +1,5 @@
 """Local searches against a general optimiser in the same box, and what they say about where they end."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -58,7 +56,7 @@ def test_a_minimum_in_a_kink_is_pinned_to_its_sample(seed):
     assert found.ending is Ending.CONVERGED
     assert found.pinned
     assert found.point.delay.seconds == 2.0
-    before, after = (descent.local(replace(found.point, delay=Delay(2.0, cell))).gradient[-1] for cell in (3, 4))
+    before, after = (descent.local(found.point.with_delays([Delay(2.0, cell)])).gradient[-1] for cell in (3, 4))
     assert before < 0 < after
 
 
