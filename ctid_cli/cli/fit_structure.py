@@ -37,6 +37,9 @@ DIRECT = (
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
 T = TypeVar("T")
+FormOption = Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")]
+#: Numbers of second-order submodels that a sum is chosen from.
+MODES = 1, 6
 HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; else chosen.")]
 
 
@@ -151,8 +154,8 @@ class ModelOptions(StructureOptions):
     each_zeros: Annotated[list[str] | None, flag("--zeros", "Zeros, fewer than poles; else chosen.", "[INPUT=]N")] = (
         None
     )
-    model: Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")] = "fraction"
-    terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel.", "P/Z,P/Z,...")] = None
+    model: FormOption = "fraction"
+    terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel; else chosen.", "P/Z,P/Z,...")] = None
     fix: Annotated[list[str] | None, flag("--fix", "Hold a parameter; repeatable.", "NAME=VALUE")] = None
 
     @property
@@ -330,7 +333,8 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
             raise UsageError(f"{option} is not available for {_what(asked)}; {remedy}")
     needing = [("--loop", asked.simulated), ("--reference", asked.iterated)]
     for option in [name for name, given in needing if given][:1] if model.terms is None and model.poles is None else ():
-        raise UsageError(f"--poles is missing: with {option} it must be given")
+        missing = "--poles" if model.model == "fraction" else "--terms"
+        raise UsageError(f"{missing} is missing: with {option} it must be given")
     state: Any = treatment.initial_state or "rest"
     offset: Any = treatment.offset or "none"
     bounds = model.bounds or (0.0, 0.0)
@@ -349,7 +353,7 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
                 factored=model.model == "additive" or bool(model.integrators),
                 fixed=model.fixed,
             )
-        if model.model == "additive":
+        if model.terms is not None:
             known: Any = {"fixed": model.fixed, "input_before": treatment.level, "noise_model": treatment.noise}
             return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss, **known)
     return _given(asked)
@@ -375,6 +379,8 @@ def _given(asked: Asked) -> Given:
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if model.zeros is None and (model.fix or own_poles or own_zeros) else model.zeros
     given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed)
+    if model.model == "additive":
+        given = replace(given, modes=MODES)
     return replace(given, loss=treatment.loss, noise_model=treatment.noise, inputs=inputs)
 
 
@@ -456,9 +462,6 @@ def _refuse_other_form(asked: Asked) -> None:
     """Options of one form of the model beside those of the other."""
     model = asked.model
     if model.model == "additive":
-        if model.terms is None:
-            what = "poles/zeros of each submodel, for example --terms 2/0,2/1"
-            raise UsageError(f"--model additive needs --terms, {what}")
         for name, value in (("--poles", model.poles), ("--zeros", model.zeros)):
             if value is not None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")

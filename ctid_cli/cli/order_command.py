@@ -11,7 +11,17 @@ from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import HoldOption, StructureOptions, TreatmentOptions, as_usage_errors, given_of
+from ctid_cli.cli.fit_structure import (
+    MODES,
+    FormOption,
+    HoldOption,
+    ModelForm,
+    StructureOptions,
+    TreatmentOptions,
+    as_usage_errors,
+    given_of,
+)
+from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
 
 
@@ -26,6 +36,8 @@ def order(
         None
     ),
     zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None,
+    model: FormOption = "fraction",
+    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None,
     hold: HoldOption = "auto",
     validate: Validate = None,
     out: Annotated[Path, flag("--out", "Folder for order.json and order.svg.", "DIR")] = Path("."),
@@ -33,13 +45,21 @@ def order(
     """Show the structures that ctid fit chooses from.
 
     Fits structures with ever more poles until the best lies inside, ranks them by the criterion that ctid fit uses, and
-    marks the one that it takes; or says that there is no model here. Writes order.json and order.svg.
+    marks the one that it takes; or says that there is no model here. With --model additive structures are sums of ever
+    more second-order submodels. Writes order.json and order.svg.
     """
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult
 
+    if frequency_files(files):
+        raise UsageError(
+            f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
+        )
+    _refuse_other_form(model, poles=poles, zeros=zeros, modes=modes)
     ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
     given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
+    if model == "additive":
+        given = replace(given, modes=_range("--modes", modes, *MODES) or MODES)
     records = columns.read_all(files, validate, "zoh")
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
         choice = choose(records.data, given, records.units.time)
@@ -50,12 +70,23 @@ def order(
     emit(result, form.form, written)
 
 
-def _range(name: str, text: str | None, least: int) -> tuple[int, int] | None:
+def _refuse_other_form(model: ModelForm, **options: str | None) -> None:
+    own = {"fraction": ("poles", "zeros"), "additive": ("modes",)}
+    why = {
+        "fraction": "is for a sum of submodels; add --model additive, or drop it",
+        "additive": "is for one transfer function; give the numbers of submodels by --modes, or drop it",
+    }
+    for name, text in options.items():
+        if text is not None and name not in own[model]:
+            raise UsageError(f"--{name} {why[model]}")
+
+
+def _range(name: str, text: str | None, least: int, most: int = 12) -> tuple[int, int] | None:
     if text is None:
         return None
     found = span(text, int)
-    if found is None or not least <= found[0] <= found[1] <= 12:
+    if found is None or not least <= found[0] <= found[1] <= most:
         raise UsageError(
-            f"{name} must be LOW:HIGH or one number, from {least} to 12, for example {least}:3; got {text!r}"
+            f"{name} must be LOW:HIGH or one number, from {least} to {most}, for example {least}:3; got {text!r}"
         )
     return found

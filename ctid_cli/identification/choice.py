@@ -4,10 +4,12 @@ from dataclasses import dataclass, field
 
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.identification.candidates import MOST_POLES, Span
-from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.inference.response_test import AnswerTest
+from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
 
@@ -40,6 +42,9 @@ class Given:
         Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
     inputs : tuple of InputModel, optional
         What is given of each of several inputs by itself.
+    modes : tuple of int, optional
+        Least and greatest number of second-order submodels, of which the model is then a sum, in place of poles and
+        zeros; integrators, in the first submodel, are none where they are not given.
     """
 
     poles: int | tuple[int, int] | None = None
@@ -54,6 +59,7 @@ class Given:
     fixed: tuple[Fixed, ...] | None = None
     noise_model: str = "white"
     inputs: tuple[InputModel, ...] | None = None
+    modes: tuple[int, int] | None = None
 
     @property
     def typed(self) -> bool:
@@ -79,6 +85,8 @@ class Given:
     @property
     def span(self) -> Span:
         """Structures that are admitted; where inputs have degrees of their own, small ones to compare treatments."""
+        if self.modes is not None:
+            return Span(integrators=(self.integrators or 0,), modes=self.modes)
         if self.typed:
             own = [one.integrators for one in self.inputs or () if one.integrators is not None]
             treated = None not in (self.initial_state, self.offset, self.delays_given) and self.hold != "auto"
@@ -94,6 +102,8 @@ class Given:
 
     def check(self) -> None:
         """Refuse what does not go together, with an OptionError."""
+        if self.modes is not None and (self.fixed or self.poles is not None or self.zeros is not None):
+            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients besides")
         delays = self.delay_bounds or (0.0, 1.0)
         (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
         integrators = max(self.span.integrators)
@@ -120,7 +130,7 @@ class Choice:
 
     Parameters
     ----------
-    options : DelayProfile
+    options : DelayProfile or AdditiveOutputError
         What is to be fitted.
     records : tuple of Record
         The records with the hold that was chosen.
@@ -134,7 +144,7 @@ class Choice:
         One for each choice, with its criterion and that of the runner-up.
     """
 
-    options: DelayProfile
+    options: Searched
     records: tuple[Record, ...] = field(repr=False)
     fitted: tuple[Record, ...] = field(repr=False)
     ranking: Ranking = field(repr=False)
@@ -157,10 +167,14 @@ class Choice:
 
     def words(self) -> list[str]:
         """Return the choice as the options of ``ctid fit``."""
-        options = self.options
-        found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
+        options, inputs = self.options, tuple[InputModel, ...]()
+        if isinstance(options, AdditiveOutputError):
+            found = ["--model", "additive", "--terms", terms_text(options.terms)]
+        else:
+            found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
+            inputs = options.inputs or ()
         found += ["--integrators", f"{options.integrators}"] if options.integrators else []
-        for one in (None, *(options.inputs or ())):
+        for one in (None, *inputs):
             bounds, of = (options.delay_bounds, "") if one is None else (one.delay_bounds, f"{one.name}=")
             if bounds is not None:
                 low, high = bounds

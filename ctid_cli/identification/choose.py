@@ -17,7 +17,7 @@ from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
@@ -120,16 +120,18 @@ class _Choosing:
         ranking = self.models.compared([setting])
         delays = self._range_of(ranking, delays)
         given, treated = self.given, ranking.best.options
-        degrees: Any = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
-        options = replace(treated, **degrees, delay_bounds=delays, inputs=given.inputs)
+        degrees = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
+        own: Any = {**degrees, "delay_bounds": delays, "inputs": given.inputs}
+        options = replace(treated, **own)
         said = sentences.of_range(ranking, delays, given, self.time_unit)
         return self._chosen(options, setting, ranking, said)
 
-    def _chosen(self, options: DelayProfile, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
+    def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
         """Return a choice with what was said of it."""
         best = ranking.best
-        options = replace(options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
-        options = replace(options, noise_model=self.given.noise_model)
+        options = replace(options, loss=self.given.loss, noise_model=self.given.noise_model)
+        if isinstance(options, DelayProfile):
+            options = replace(options, fixed=self.given.fixed, nested=True)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
@@ -210,7 +212,7 @@ class _Choosing:
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
-    def _treated(self, models: Ranking, length: float) -> DelayProfile:
+    def _treated(self, models: Ranking, length: float) -> Searched:
         """Return state and offset: rest, unless the estimated state or the first samples speak against it."""
         rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
         chosen = models
