@@ -91,9 +91,22 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
+    found += _too_large(ranking)
     if given.delay_bounds is None:
         found.append(f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay).")
     return found
+
+
+def _too_large(ranking: Ranking) -> list[str]:
+    """Return why the structure of least criterion was not chosen, where it predicts badly."""
+    larger = [each for each in ranking.candidates if not each.stands and each.unseen == each.unseen]
+    if not larger:
+        return []
+    each, best = min(larger, key=lambda each: each.criterion), ranking.best
+    return [
+        f"Not larger: {each.name}, whose criterion is {best.criterion - each.criterion:.3g} lower, has {each.unseen:.2g} "
+        f"times the squared error of its fit in blocks that it did not see, {best.name} {best.unseen:.2g} times."
+    ]
 
 
 def of_criterion(ranking: Ranking) -> str:
