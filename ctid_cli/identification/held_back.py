@@ -21,8 +21,8 @@ FEWEST_BLOCKS = 2
 SHORTEST, MOVING = 20, 0.8
 #: A smaller difference of two fits is not worth a word [%].
 WORTHWHILE = 0.3
-#: With three samples for each parameter, the least that a structure is fitted to, the mean squared error of a model that
-#: describes the record is, of what it did not see, (1 + 1/3) / (1 - 1/3) of that of its fit.
+#: A structure has at least three samples for each parameter. If it describes the record, its mean squared error of what
+#: it did not see is then at most (1 + 1/3) / (1 - 1/3) of that of its fit.
 OPTIMISTIC = 2.0
 
 
@@ -124,9 +124,7 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
         most = min(smaller, key=lambda each: each.criterion).options.order
     looked_at = {id(each): seen[order] for order, each in best_of.items()}
     found = [looked_at.get(id(each), each) for each in ranking.candidates]
-    return replace(
-        ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found])
-    )
+    return replace(ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found]))
 
 
 def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:

@@ -103,9 +103,10 @@ def _too_large(ranking: Ranking) -> list[str]:
     if not larger:
         return []
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
+    lower = f"whose criterion is {best.criterion - each.criterion:.3g} lower"
     return [
-        f"Not larger: {each.name}, whose criterion is {best.criterion - each.criterion:.3g} lower, has {each.unseen:.2g} "
-        f"times the squared error of its fit in blocks that it did not see, {best.name} {best.unseen:.2g} times."
+        f"Not larger: the squared error of {each.name}, {lower}, is {each.unseen:.2g} times that of its fit in blocks "
+        f"that it did not see; that of {best.name} is {best.unseen:.2g} times."
     ]
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.identification import held_back
 from ctid_cli.identification.candidates import still_pays
-from ctid_cli.identification.criterion import ranked
+from ctid_cli.identification.criterion import Ranking, ranked
+from ctid_cli.identification.sentences import of_grid
 
 SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
 DRIVE = TransferFunction([1.5], [1.0, 0.5, 0.0], 0.4)
@@ -105,6 +107,29 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
     best = ranking.best
     larger = replace(best, options=replace(best.options, poles=3), fit=replace(best.fit, cost=0.5 * best.fit.cost))
     assert still_pays(ranked([*ranking.candidates, larger]), 4)
+
+
+@pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
+def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
+    # Blocks are predicted by a model with an error that is so many times that of its fit.
+    record = record_of(SECOND)
+    best = choose(record).ranking.best
+    sizes = {4: unseen, 3: 1.2, 2: 1.0}
+    grid = [
+        replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
+        for k, poles in enumerate((4, 2, 3))
+    ]
+
+    def errors(options, records, near):
+        return [np.full(record.n_samples, np.sqrt(sizes[options.poles] * best.fit.cost)) for record in records]
+
+    monkeypatch.setattr(held_back, "held_back_errors", errors)
+    ranking = held_back.standing(Ranking(tuple(grid), ranked([best]).noise), [record])
+    assert ranking.best.options.poles == chosen
+    assert len(ranking.candidates) == 3
+    assert any(
+        "Not larger: the squared error of 4/" in each for each in of_grid(ranking, (0.0, 1.0), Given(), "s")
+    ) == (chosen == 2)
 
 
 def test_the_hold_is_compared_where_the_input_moves_continuously():
