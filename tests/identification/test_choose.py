@@ -203,6 +203,6 @@ def test_no_response_is_no_model():
 
 def test_a_part_of_a_long_record_is_looked_at():
     choice = choose(record_of(SECOND, count=12_000))
-    assert choice.fitted[0].n_samples == 5000
+    assert choice.fitted[0].n_samples == 2500
     assert choice.records[0].n_samples == 12_000
     assert choice.options.poles == 2
