@@ -103,10 +103,10 @@ def _too_large(ranking: Ranking) -> list[str]:
     if not larger:
         return []
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
-    lower = f"whose criterion is {best.criterion - each.criterion:.3g} lower"
+    lower = f"criterion {best.criterion - each.criterion:.3g} lower"
     return [
-        f"Not larger: the squared error of {each.name}, {lower}, is {each.unseen:.2g} times that of its fit in blocks "
-        f"that it did not see; that of {best.name} is {best.unseen:.2g} times."
+        f"Not larger: in blocks that it did not see the squared error of {each.name} ({lower}) is {each.unseen:.2g} times "
+        f"that of its fit; that of {best.name} is {best.unseen:.2g} times."
     ]
 
 
