@@ -103,10 +103,10 @@ def _too_large(ranking: Ranking) -> list[str]:
     if not larger:
         return []
     each, best = min(larger, key=lambda each: each.criterion), ranking.best
-    lower = f"criterion {best.criterion - each.criterion:.3g} lower"
+    named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
     return [
-        f"Not larger: in blocks that it did not see the squared error of {each.name} ({lower}) is {each.unseen:.2g} times "
-        f"that of its fit; that of {best.name} is {best.unseen:.2g} times."
+        f"Not larger: in blocks that it did not see the squared error of {named} is {each.unseen:.2g} times that "
+        f"of its fit; that of {best.name} is {best.unseen:.2g} times."
     ]
 
 
