@@ -18,6 +18,7 @@ from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
 from ctid_cli.identification.criterion import Ranking, Searched
+from ctid_cli.identification.held_back import standing
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
@@ -145,7 +146,8 @@ class _Choosing:
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        return grid(self.many, setting, self.span, delays, self.several)
+        held = [with_hold(record, setting.hold) for record in self.many]
+        return standing(grid(held, setting, self.span, delays, self.several), held)
 
     def _small(
         self,

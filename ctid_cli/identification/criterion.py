@@ -55,6 +55,11 @@ class Candidate:
         The criterion; only differences between candidates mean anything.
     criteria : InformationCriteria
         AICc, BIC and FPE of the innovations.
+    unseen : float
+        Mean squared error of blocks of the records that fits of the rest did not see, over that of the fit; NaN where
+        it was not looked at.
+    stands : bool
+        Whether that is like in smaller structures.
     """
 
     options: Searched
@@ -63,13 +68,15 @@ class Candidate:
     size: int
     criterion: float = float("nan")
     criteria: InformationCriteria = field(default_factory=lambda: information_criteria(np.nan, 1, 0))
+    unseen: float = float("nan")
+    stands: bool = True
 
     @property
     def is_admissible(self) -> bool:
-        """Whether the data determine its parameters, and less damping than is admitted would not improve it."""
+        """Whether the data determine it, less damping than is admitted would not improve it, and it stands."""
         box, held = self.fit.box, self.fit.held_poles
         undamped = box is not None and any(UNDAMPED.intersection(box.met_by(pole)) for pole in held)
-        return self.fit.condition_number <= LARGEST_CONDITION and not undamped
+        return self.stands and self.fit.condition_number <= LARGEST_CONDITION and not undamped
 
     @property
     def name(self) -> str:
@@ -118,10 +125,12 @@ def ranked(candidates: Sequence[Candidate]) -> Ranking:
     """Return candidates by their criterion; all must have been fitted to the same samples."""
     closest = min(candidates, key=lambda each: (not each.is_admissible, each.fit.cost))
     noise = noise_of(closest.fit.residuals)
-    judged = sorted(
-        (_judged(each, noise) for each in candidates), key=lambda each: (not each.is_admissible, each.criterion)
-    )
-    return Ranking(tuple(judged), noise)
+    return Ranking(in_order([_judged(each, noise) for each in candidates]), noise)
+
+
+def in_order(judged: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Return candidates by their criterion, those that are not admissible last."""
+    return tuple(sorted(judged, key=lambda each: (not each.is_admissible, each.criterion)))
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:

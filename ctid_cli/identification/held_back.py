@@ -6,7 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
+from ctid_cli.errors import CtidError
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.identification.criterion import Candidate, Ranking, in_order
 from ctid_cli.inference.criteria import percent_from_r_squared
 from ctid_cli.signals.record import Record
 
@@ -19,6 +22,9 @@ FEWEST_BLOCKS = 2
 SHORTEST, MOVING = 20, 0.8
 #: A smaller difference of two fits is not worth a word [%].
 WORTHWHILE = 0.3
+#: A structure has at least three samples for each parameter. If it describes the record, its mean squared error of what
+#: it did not see is then at most (1 + 1/3) / (1 - 1/3) of that of its fit.
+OPTIMISTIC = 2.0
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,44 @@ def held_back_errors(options: DelayProfile, records: Sequence[Record], near: tup
             known[use] = record.y[use] - simulated - (offset if options.offset == "remove" else 0.0)
             error[out] = known[out]
     return errors
+
+
+def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
+    """Return structures in order, those last that are too large to predict what they did not see.
+
+    The best of each number of poles is looked at: where its squared error of blocks that were held back is more times
+    that of its fit than in a smaller structure, by a factor that no number of parameters explains, it describes these
+    samples, and not the system. Sums of submodels, and models of several inputs, are not looked at.
+    """
+    if any(isinstance(each.options, AdditiveOutputError) for each in ranking.candidates) or len(records[0].inputs) > 1:
+        return ranking
+    best_of: dict[int, Candidate] = {}
+    for each in ranking.candidates:
+        if each.is_admissible and each.options.order <= ranking.best.options.order:
+            best_of.setdefault(each.options.order, each)
+    if len(best_of) < 2 or not long_enough(records):
+        return ranking
+    seen = {order: replace(each, unseen=_unseen(each, records)) for order, each in best_of.items()}
+    most = ranking.best.options.order
+    while smaller := [each for order, each in seen.items() if order < most]:
+        if not seen[most].unseen > OPTIMISTIC * min(each.unseen for each in smaller):
+            break
+        most = min(smaller, key=lambda each: each.criterion).options.order
+    looked_at = {id(each): seen[order] for order, each in best_of.items()}
+    found = [looked_at.get(id(each), each) for each in ranking.candidates]
+    return replace(ranking, candidates=in_order([replace(each, stands=each.options.order <= most) for each in found]))
+
+
+def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
+    """Return the mean squared error of blocks that are held back, over that of the fit; infinity where it fails."""
+    model, fit = candidate.fit.model, candidate.fit
+    assert isinstance(candidate.options, DelayProfile)
+    alone = model.denominator[: model.denominator.size - candidate.options.integrators]
+    try:
+        errors = np.concatenate(held_back_errors(candidate.options, records, (alone, model.delay)))
+    except CtidError:
+        return float("inf")
+    return float(np.nanmean(errors**2)) / max(fit.cost, np.finfo(float).tiny)
 
 
 def compared(before: Sequence[Array], after: Sequence[Array], records: Sequence[Record]) -> Gain:

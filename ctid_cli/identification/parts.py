@@ -12,7 +12,7 @@ from ctid_cli.signals.record import Record, beginning
 
 #: Samples of all records that settings are compared on, and that the grid of structures is fitted to: what ten seconds
 #: are enough for.
-FEW, MANY = 2000, 5000
+FEW, MANY = 2000, 2500
 #: The beginning of a record stands for the whole if input and output move so much there, as a share of all.
 LIVELY = 0.5
 

@@ -94,7 +94,7 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
-    return found + of_range(ranking, delays, given, time_unit)
+    return found + _too_large(ranking) + of_range(ranking, delays, given, time_unit)
 
 
 def of_range(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
@@ -103,6 +103,19 @@ def of_range(ranking: Ranking, delays: tuple[float, float], given: Given, time_u
         return []
     at = listed(f"{delay:.4g}" for delay in delays_of(ranking.best.fit.model))
     return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay), found at {at} {time_unit}."]
+
+
+def _too_large(ranking: Ranking) -> list[str]:
+    """Return why the structure of least criterion was not chosen, where it predicts badly."""
+    larger = [each for each in ranking.candidates if not each.stands and each.unseen == each.unseen]
+    if not larger:
+        return []
+    each, best = min(larger, key=lambda each: each.criterion), ranking.best
+    named = f"{each.name} (criterion {best.criterion - each.criterion:.3g} lower)"
+    return [
+        f"Not larger: in blocks that it did not see the squared error of {named} is {each.unseen:.2g} times that "
+        f"of its fit; that of {best.name} is {best.unseen:.2g} times."
+    ]
 
 
 def of_criterion(ranking: Ranking) -> str:

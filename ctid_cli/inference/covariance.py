@@ -168,14 +168,26 @@ def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
 
     size = len(names)
     pairs = [(j, i) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
-    for pair in pairs:
-        yield told(pair, f"correlation {correlation[pair]:.5f}", "a combination of them is")
+    for alike in _connected(pairs):
+        if len(alike) == 2:
+            yield told(alike, f"correlation {correlation[tuple(alike)]:.5f}", "a combination of them is")
+        else:
+            yield told(alike, f"correlations above {CLOSE_TO_ONE}", "combinations of them are")
     with np.errstate(invalid="ignore", divide="ignore"):
         multiple = np.sqrt(1.0 - 1.0 / np.diag(np.linalg.inv(correlation)))
     paired = {index for pair in pairs for index in pair}
     group = [i for i in range(size) if multiple[i] > CLOSE_TO_ONE and i not in paired]
     if len(group) > 1:
         yield told(group, f"multiple correlations above {CLOSE_TO_ONE}", "combinations of them are")
+
+
+def _connected(pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """Return groups of numbers, each joined by pairs."""
+    groups: list[set[int]] = []
+    for pair in pairs:
+        joined = set(pair).union(*(group for group in groups if group.intersection(pair)))
+        groups = [group for group in groups if not group & joined] + [joined]
+    return [sorted(group) for group in groups]
 
 
 def _singular_direction(hessian: Array) -> list[int]:

@@ -29,8 +29,9 @@ ROWS = 12
 #: Mark of a structure that cannot be chosen, whatever its criterion, and what it means.
 NO_CANDIDATE = "no"
 ABOUT_NO_CANDIDATE = (
-    "- Not to be chosen (no): the data do not determine the parameters, or a pair is held at the least damping or the "
-    "greatest frequency that is admitted, where it follows this record's noise."
+    "- Not to be chosen (no): the data do not determine the parameters; or a pair is held at the least damping or the "
+    "greatest frequency that is admitted, where it follows this record's noise; or a smaller structure predicts blocks "
+    "of the record that it did not see far better."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
 #: The same of a sum of second-order submodels.

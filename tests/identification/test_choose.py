@@ -7,8 +7,10 @@ import pytest
 
 from ctid_cli import Given, HeldSignal, Record, TransferFunction, choose, identify, simulate
 from ctid_cli.errors import DataError, OptionError
+from ctid_cli.identification import held_back
 from ctid_cli.identification.candidates import still_pays
-from ctid_cli.identification.criterion import ranked
+from ctid_cli.identification.criterion import Ranking, ranked
+from ctid_cli.identification.sentences import of_grid
 
 SECOND = TransferFunction([2.0], [1.0, 1.2, 4.0], 0.23)
 DRIVE = TransferFunction([1.5], [1.0, 0.5, 0.0], 0.4)
@@ -107,6 +109,28 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
     assert still_pays(ranked([*ranking.candidates, larger]), 4)
 
 
+@pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
+def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
+    # Blocks are predicted by a model with an error that is so many times that of its fit.
+    record = record_of(SECOND)
+    best = choose(record).ranking.best
+    sizes = {4: unseen, 3: 1.2, 2: 1.0}
+    grid = [
+        replace(best, options=replace(best.options, poles=poles), criterion=best.criterion + 10.0 * (k - 1))
+        for k, poles in enumerate((4, 2, 3))
+    ]
+
+    def errors(options, records, near):
+        return [np.full(record.n_samples, np.sqrt(sizes[options.poles] * best.fit.cost)) for record in records]
+
+    monkeypatch.setattr(held_back, "held_back_errors", errors)
+    ranking = held_back.standing(Ranking(tuple(grid), ranked([best]).noise), [record])
+    assert ranking.best.options.poles == chosen
+    assert len(ranking.candidates) == 3
+    said = " ".join(of_grid(ranking, (0.0, 1.0), Given(), "s"))
+    assert ("the squared error of 4/" in said) == (chosen == 2)
+
+
 def test_the_hold_is_compared_where_the_input_moves_continuously():
     u = np.sin(np.outer(0.1 * np.arange(600), [0.7, 1.9, 3.1, 5.3, 8.0]) + np.arange(5)).sum(axis=1)
     made = choose(record_of(SECOND, u=u, hold="foh", deviation=0.003))
@@ -178,6 +202,6 @@ def test_no_response_is_no_model():
 
 def test_a_part_of_a_long_record_is_looked_at():
     choice = choose(record_of(SECOND, count=12_000))
-    assert choice.fitted[0].n_samples == 5000
+    assert choice.fitted[0].n_samples == 2500
     assert choice.records[0].n_samples == 12_000
     assert choice.options.poles == 2

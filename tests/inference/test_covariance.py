@@ -184,6 +184,15 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
             ("can hardly be told apart", "hardly shows when the response begins"),
         ),
+        # Pairs that share a parameter are one sentence.
+        (
+            covariance([0.1] * 5, [(0, 1, 0.9997), (1, 2, 0.9997), (0, 2, 0.9996)]),
+            *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
+            (
+                f"{FIVE[0]}, {FIVE[1]} and {FIVE[2]} can hardly be told apart by these data (correlations above "
+                "0.999): only combinations",
+            ),
+        ),
         (
             np.cov(TOGETHER.T),
             *([5, 5, 5], ("a1", "a2", "b0"), 1e5, None),
