@@ -35,6 +35,9 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
+FormOption = Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")]
+#: Numbers of second-order submodels that a sum is chosen from.
+MODES = 1, 6
 HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; else chosen.")]
 
 
@@ -91,8 +94,8 @@ class ModelOptions(StructureOptions):
 
     poles: Annotated[int | None, flag("--poles", "Poles, 1 to 12 (0 with --integrators); else chosen.")] = None
     zeros: Annotated[int | None, flag("--zeros", "Zeros, fewer than poles; else chosen.")] = None
-    model: Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")] = "fraction"
-    terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel.", "P/Z,P/Z,...")] = None
+    model: FormOption = "fraction"
+    terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel; else chosen.", "P/Z,P/Z,...")] = None
     fix: Annotated[list[str] | None, flag("--fix", "Hold a parameter; repeatable.", "NAME=VALUE")] = None
 
     @property
@@ -242,7 +245,8 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
             raise UsageError(f"{option} is not available for {_what(asked)}; {remedy}")
     needing = [("--loop", asked.simulated), ("--reference", asked.iterated), ("--fix", bool(model.fix))]
     for option in [name for name, given in needing if given][:1] if model.terms is None and model.poles is None else ():
-        raise UsageError(f"--poles is missing: with {option} it must be given")
+        missing = "--poles" if model.model == "fraction" else "--terms"
+        raise UsageError(f"{missing} is missing: with {option} it must be given")
     state: Any = treatment.initial_state or "rest"
     offset: Any = treatment.offset or "none"
     bounds = model.bounds or (0.0, 0.0)
@@ -261,12 +265,14 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
                 factored=model.model == "additive" or bool(model.integrators),
                 fixed=model.fixed,
             )
-        if model.model == "additive":
+        if model.terms is not None:
             known: Any = {"fixed": model.fixed, "input_before": treatment.level, "noise_model": treatment.noise}
             return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss, **known)
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if model.fix and model.zeros is None else model.zeros
     given = replace(given_of(model, treatment, treatment.hold), poles=model.poles, zeros=zeros, fixed=model.fixed)
+    if model.model == "additive":
+        given = replace(given, modes=MODES)
     return replace(given, loss=treatment.loss, noise_model=treatment.noise)
 
 
@@ -304,9 +310,6 @@ def _refuse_other_form(asked: Asked) -> None:
     """Options of one form of the model beside those of the other."""
     model = asked.model
     if model.model == "additive":
-        if model.terms is None:
-            what = "poles/zeros of each submodel, for example --terms 2/0,2/1"
-            raise UsageError(f"--model additive needs --terms, {what}")
         for name, value in (("--poles", model.poles), ("--zeros", model.zeros)):
             if value is not None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")

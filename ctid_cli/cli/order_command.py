@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +12,16 @@ from ctid_cli.canonical import plain
 from ctid_cli.cli._common import emit, guarded, span, write_files
 from ctid_cli.cli._options import FormatOptions, RecordOptions, Records, Validate, flag
 from ctid_cli.cli._progress import FitProgress
-from ctid_cli.cli.fit_structure import HoldOption, StructureOptions, TreatmentOptions, as_usage_errors, given_of
+from ctid_cli.cli.fit_structure import (
+    MODES,
+    FormOption,
+    HoldOption,
+    ModelForm,
+    StructureOptions,
+    TreatmentOptions,
+    as_usage_errors,
+    given_of,
+)
 from ctid_cli.errors import UsageError
 
 
@@ -26,6 +36,8 @@ def order(
         None
     ),
     zeros: Annotated[str | None, flag("--zeros", "Numbers of zeros.", "LOW:HIGH")] = None,
+    model: FormOption = "fraction",
+    modes: Annotated[str | None, flag("--modes", "Numbers of second-order submodels of a sum.", "LOW:HIGH")] = None,
     hold: HoldOption = "auto",
     validate: Validate = None,
     out: Annotated[Path, flag("--out", "Folder for order.json and order.svg.", "DIR")] = Path("."),
@@ -33,13 +45,17 @@ def order(
     """Show the structures that ctid fit chooses from.
 
     Fits structures with ever more poles until the best lies inside, ranks them by the criterion that ctid fit uses, and
-    marks the one that it takes; or says that there is no model here. Writes order.json and order.svg.
+    marks the one that it takes; or says that there is no model here. With --model additive structures are sums of ever
+    more second-order submodels. Writes order.json and order.svg.
     """
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult
 
+    _refuse_other_form(model, {"--poles": poles, "--zeros": zeros}, {"--modes": modes})
     ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
     given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
+    if model == "additive":
+        given = replace(given, modes=_range("--modes", modes, *MODES) or MODES)
     records = columns.read_all(files, validate, "zoh")
     with as_usage_errors(), FitProgress(sum(record.n_samples for record in records.data)):
         choice = choose(records.data, given, records.units.time)
@@ -50,12 +66,25 @@ def order(
     emit(result, form.form, written)
 
 
-def _range(name: str, text: str | None, least: int) -> tuple[int, int] | None:
+def _refuse_other_form(
+    model: ModelForm, fraction: Mapping[str, str | None], additive: Mapping[str, str | None]
+) -> None:
+    other, what = (
+        (fraction, "one transfer function; a sum has --modes")
+        if model == "additive"
+        else (additive, "a sum of submodels; add --model additive")
+    )
+    for name, text in other.items():
+        if text is not None:
+            raise UsageError(f"{name} is for {what}, or drop {name}")
+
+
+def _range(name: str, text: str | None, least: int, most: int = 12) -> tuple[int, int] | None:
     if text is None:
         return None
     found = span(text, int)
-    if found is None or not least <= found[0] <= found[1] <= 12:
+    if found is None or not least <= found[0] <= found[1] <= most:
         raise UsageError(
-            f"{name} must be LOW:HIGH or one number, from {least} to 12, for example {least}:3; got {text!r}"
+            f"{name} must be LOW:HIGH or one number, from {least} to {most}, for example {least}:3; got {text!r}"
         )
     return found

@@ -111,6 +111,11 @@ class AdditiveOutputError(RecordsEstimator):
         return degrees_of(self.terms)[0]
 
     @property
+    def order(self) -> int:
+        """Number of poles, integrators included, as of one transfer function."""
+        return self.poles
+
+    @property
     def zeros(self) -> int:
         """Degree of the numerator of the sum."""
         return degrees_of(self.terms)[1]

@@ -59,7 +59,7 @@ class Validation(DeferredFields):
     r2: float
     count: int
     #: Treatment of state and offset, where it was chosen for this record.
-    options: DelayProfile | None = None
+    options: DelayProfile | AdditiveOutputError | None = None
 
     def prediction_fit(self, noise: NoiseEstimate, ahead: int) -> float:
         """Return ``100 (1 - ||y - p|| / ||y - mean y||)`` of predictions p from outputs that are some samples old."""

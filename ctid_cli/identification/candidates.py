@@ -9,9 +9,11 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, fitted
-from ctid_cli.identification.criterion import Candidate, Ranking, penalised, ranked
+from ctid_cli.identification.criterion import Candidate, Ranking, Searched, penalised, ranked
 from ctid_cli.inference.sensitivities import Structure
+from ctid_cli.models.additive import Term
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
@@ -52,12 +54,19 @@ class Span(NamedTuple):
     poles: tuple[int, int] = (0, MOST_POLES)
     zeros: tuple[int, int] = (0, MOST_POLES)
     integrators: tuple[int, ...] = (0, 1)
+    #: Least and greatest number of second-order submodels, where models are sums of these.
+    modes: tuple[int, int] | None = None
 
     @classmethod
-    def only(cls, options: DelayProfile) -> "Span":
-        """Return the span of one structure."""
-        poles, zeros = options.poles, options.zeros
+    def only(cls, options: Searched) -> "Span":
+        """Return the span of the transfer functions of one structure."""
+        poles, zeros = options.order - options.integrators, options.zeros
         return cls((poles, poles), (zeros, zeros), (options.integrators,))
+
+    @property
+    def most_poles(self) -> int:
+        """Greatest number of poles, integrators included."""
+        return (self.poles[1] if self.modes is None else 2 * self.modes[1]) + max(self.integrators)
 
     def structures(self, order: int, integrators: int, delay_free: bool) -> Iterable[tuple[int, int]]:
         """Yield poles and zeros of all structures of an order, integrators included."""
@@ -114,6 +123,11 @@ class Structures:
         box = box_of(measured.problem._replace(free_response=state != "periodic"), delays)
         return cls(held, hold, options, measured, StructureSearch(measured.problem, box, effort=QUICK), near)
 
+    def tried(self, order: int, span: Span) -> list[Candidate | None]:
+        """Fit all structures of an order, integrators included."""
+        structures = span.structures(order, self.options.integrators, self.search.box.delay_free)
+        return [self.fit(*structure) for structure in structures]
+
     def fit(self, poles: int, zeros: int) -> Candidate | None:
         """Fit a structure; None where there are too few samples."""
         if (poles, zeros) not in self.found:
@@ -137,6 +151,41 @@ class Structures:
         start = self.near(poles, zeros)
         alone = start.denominator[: start.denominator.size - self.options.integrators]
         return best_near(self.search, zeros, alone, start.delay)
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Sums of second-order submodels with integrators in the first of them, in one setting of the records."""
+
+    records: Sequence[Record]
+    hold: Hold
+    #: Of one submodel.
+    options: AdditiveOutputError
+
+    @classmethod
+    def of(cls, records: Sequence[Record], setting: Setting, integrators: int, delays: tuple[float, float]) -> "Sums":
+        """Lay records out."""
+        hold, state, before, offset = setting
+        options = AdditiveOutputError(_modes(1, integrators), delays, state, offset, input_before=before)
+        return cls([with_hold(record, hold) for record in records], hold, options)
+
+    def tried(self, order: int, span: Span) -> list[Candidate | None]:
+        """Fit the sum of an order, integrators included; None where there are too few samples."""
+        assert span.modes is not None
+        number, odd = divmod(order - self.options.integrators, 2)
+        return [self._fit(number)] if not odd and span.modes[0] <= number <= span.modes[1] else []
+
+    def _fit(self, number: int) -> Candidate | None:
+        options = replace(self.options, terms=_modes(number, self.options.integrators))
+        measured = options.prepare(self.records).laid_out
+        size = measured.layout_of(options.order, measured.structure.delay).size
+        if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
+            return None
+        return Candidate(options, self.hold, options._least(measured, []), size)
+
+
+def _modes(number: int, integrators: int) -> tuple[Term, ...]:
+    return Term(2, 0, integrators), *(Term(2, 0) for _ in range(number - 1))
 
 
 class SmallModels:
@@ -182,15 +231,11 @@ class SmallModels:
 
 def grid(records: Sequence[Record], setting: Setting, span: Span, delays: tuple[float, float]) -> Ranking:
     """Fit structures of ever more poles, until the best lies inside or there are no more."""
-    families = [Structures.of(records, setting, integrators, delays) for integrators in span.integrators]
+    kind = Structures if span.modes is None else Sums
+    families = [kind.of(records, setting, integrators, delays) for integrators in span.integrators]
     found: list[Candidate] = []
-    most = span.poles[1] + max(span.integrators)
-    for order in range(1, min(most, MOST_POLES) + 1):
-        tried = [
-            family.fit(*structure)
-            for family in families
-            for structure in span.structures(order, family.options.integrators, family.search.box.delay_free)
-        ]
+    for order in range(1, min(span.most_poles, MOST_POLES) + 1):
+        tried = [each for family in families for each in family.tried(order, span)]
         found += [each for each in tried if each is not None]
         if tried and not any(tried):
             break
@@ -216,7 +261,7 @@ def _criterion_in_white_noise(candidate: Candidate) -> float:
     return penalised(fit.cost * fit.count, fit.count, candidate.size)
 
 
-def _promising(family: Structures, ranking: Ranking) -> bool:
+def _promising(family: Structures | Sums, ranking: Ranking) -> bool:
     """Whether structures with a number of integrators may still become the best."""
     own = ranking.of(integrators=family.options.integrators)
     return own is None or own.best.criterion - ranking.best.criterion < BEHIND

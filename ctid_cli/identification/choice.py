@@ -4,10 +4,12 @@ from dataclasses import dataclass, field
 
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.candidates import MOST_POLES, Span
-from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.inference.response_test import AnswerTest
+from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, InitialState, InputBefore, LossKind, Offset
 
@@ -38,6 +40,9 @@ class Given:
         Known parameters of the fit.
     noise_model : str, default "white"
         Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
+    modes : tuple of int, optional
+        Least and greatest number of second-order submodels, of which the model is then a sum, in place of poles and
+        zeros; integrators, in the first submodel, are none where they are not given.
     """
 
     poles: int | tuple[int, int] | None = None
@@ -51,10 +56,13 @@ class Given:
     loss: LossKind = "squares"
     fixed: tuple[Fixed, ...] | None = None
     noise_model: str = "white"
+    modes: tuple[int, int] | None = None
 
     @property
     def span(self) -> Span:
         """Structures that are admitted."""
+        if self.modes is not None:
+            return Span(integrators=(self.integrators or 0,), modes=self.modes)
         poles, zeros = (
             (each, each) if isinstance(each, int) else each or (0, MOST_POLES) for each in (self.poles, self.zeros)
         )
@@ -64,6 +72,8 @@ class Given:
 
     def check(self) -> None:
         """Refuse what does not go together, with an OptionError."""
+        if self.modes is not None and (self.fixed or self.poles is not None or self.zeros is not None):
+            raise OptionError("modes", "modes choose the submodels: give no poles, zeros or known coefficients besides")
         delays = self.delay_bounds or (0.0, 1.0)
         (least, most), (fewest_zeros, _) = self.span.poles, self.span.zeros
         integrators = max(self.span.integrators)
@@ -89,7 +99,7 @@ class Choice:
 
     Parameters
     ----------
-    options : DelayProfile
+    options : DelayProfile or AdditiveOutputError
         What is to be fitted.
     records : tuple of Record
         The records with the hold that was chosen.
@@ -103,7 +113,7 @@ class Choice:
         One for each choice, with its criterion and that of the runner-up.
     """
 
-    options: DelayProfile
+    options: Searched
     records: tuple[Record, ...] = field(repr=False)
     fitted: tuple[Record, ...] = field(repr=False)
     ranking: Ranking = field(repr=False)
@@ -127,7 +137,10 @@ class Choice:
     def words(self) -> list[str]:
         """Return the choice as the options of ``ctid fit``."""
         options = self.options
-        found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
+        if isinstance(options, AdditiveOutputError):
+            found = ["--model", "additive", "--terms", terms_text(options.terms)]
+        else:
+            found = ["--poles", f"{options.poles}", "--zeros", f"{options.zeros}"]
         found += ["--integrators", f"{options.integrators}"] if options.integrators else []
         low, high = options.delay_bounds
         found += ["--delay", f"{low:g}:{high:g}" if low < high else f"{low:g}"]

@@ -16,7 +16,7 @@ from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import Setting, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Ranking
+from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.initial_states import (
     State,
     beginning_is_likely,
@@ -109,8 +109,9 @@ class _Choosing:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = self._grid(setting, delays)
         best = ranking.best
-        options = replace(best.options, loss=self.given.loss, fixed=self.given.fixed, nested=True)
-        options = replace(options, noise_model=self.given.noise_model)
+        options: Searched = replace(best.options, loss=self.given.loss, noise_model=self.given.noise_model)
+        if isinstance(options, DelayProfile):
+            options = replace(options, fixed=self.given.fixed, nested=True)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)
@@ -173,7 +174,7 @@ class _Choosing:
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
-    def _treated(self, models: Ranking, length: float) -> DelayProfile:
+    def _treated(self, models: Ranking, length: float) -> Searched:
         """Return state and offset: rest, unless the estimated state or the first samples speak against it."""
         rest, estimated = (models.of(initial_state=state) for state in ("rest", "estimate"))
         chosen = models

@@ -81,7 +81,8 @@ def identify(
     given = options or Given()
     choice = choose(several, given, time_unit)
     if given.poles is None and not choice.seen:
-        raise DataError(f"{choice.why_none} Give the number of poles (--poles) to fit a model all the same.")
+        what = "number of poles (--poles)" if given.modes is None else "submodels (--terms)"
+        raise DataError(f"{choice.why_none} Give the {what} to fit a model all the same.")
     other = None if validation is None else with_hold(validation, choice.records[0].input.hold)
     if other is not None:
         # Refused before the fit takes its time.

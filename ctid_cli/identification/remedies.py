@@ -20,7 +20,7 @@ from ctid_cli.identification.criterion import noise_of, penalised
 from ctid_cli.identification.held_back import compared, held_back_errors, long_enough
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.signal_features import input_moves, residual_outliers
-from ctid_cli.models.additive import Term
+from ctid_cli.models.additive import Term, terms_text
 from ctid_cli.signals.held import Hold, regular_interval
 from ctid_cli.signals.record import Record, beginning
 from ctid_cli.signals.treatment import Offset
@@ -452,7 +452,7 @@ def typed(old: Any, new: Any) -> str:
     """Options of ``ctid fit`` that turn one estimator into another."""
     words = []
     if isinstance(new, SUMS) and old.terms != new.terms and new.factored:
-        words.append(f"--terms {','.join(f'{term.poles}/{term.zeros}' for term in new.terms)}")
+        words.append(f"--terms {terms_text(new.terms)}")
     if old.delay_bounds != new.delay_bounds:
         words.append("--delay {:g}:{:g}".format(*new.delay_bounds))
     if not getattr(new, "factored", False) and (old.poles, old.zeros) != (new.poles, new.zeros):

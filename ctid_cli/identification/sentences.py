@@ -1,11 +1,10 @@
 """What is said of each choice: the criterion against the runner-up."""
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
-from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import Given
-from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking
+from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched
 from ctid_cli.text import count
 
 #: What is said where the beginning of a record is not looked at.
@@ -36,7 +35,7 @@ def _integrators(number: int) -> str:
     return f" and {count(number, 'integrator')}" if number else ""
 
 
-def rest_assumed(options: DelayProfile) -> str:
+def rest_assumed(options: Searched) -> str:
     """Return that no other state could be tried."""
     level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"
     return (

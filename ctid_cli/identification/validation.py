@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
+from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
 from ctid_cli.identification.choice import Given
-from ctid_cli.identification.criterion import noise_of, penalised
+from ctid_cli.identification.criterion import Searched, noise_of, penalised
 from ctid_cli.identification.initial_states import states_of
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Offset
 
 
-def laid_out_for(record: Record, options: DelayProfile, given: Given) -> list[tuple[DelayProfile, MeasuredRecords]]:
+def laid_out_for(record: Record, options: Searched, given: Given) -> list[tuple[Searched, MeasuredRecords]]:
     """Lay a record out in all treatments of state and offset that it may need; a DataError where it cannot be used."""
     offsets: list[Offset] = ["estimate", "none"] if given.offset is None else [given.offset]
     tried = [
@@ -27,7 +27,7 @@ def laid_out_for(record: Record, options: DelayProfile, given: Given) -> list[tu
     return [(each, laid_out) for each, laid_out in pairs if isinstance(laid_out, MeasuredRecords)]
 
 
-def judged_on(record: Record, options: DelayProfile, fit: MeasuredFit, given: Given) -> Validation:
+def judged_on(record: Record, options: Searched, fit: MeasuredFit, given: Given) -> Validation:
     """Judge a model in the treatment that the criterion of the choice prefers on a record, the model being fixed."""
     tried = laid_out_for(record, options, given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]

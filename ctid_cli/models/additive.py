@@ -331,6 +331,11 @@ def names_of(terms: Iterable[Term]) -> tuple[str, ...]:
     return tuple(names)
 
 
+def terms_text(terms: Iterable[Term]) -> str:
+    """Return poles and zeros of terms, without integrators, as they are typed: ``2/0,2/1``."""
+    return ",".join(f"{term.poles}/{term.zeros}" for term in terms)
+
+
 def degrees_of(terms: Iterable[Term]) -> tuple[int, int]:
     """Degrees of denominator, integrators included, and numerator of a sum of terms as one transfer function."""
     terms = tuple(terms)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.identification.choice import Choice, Given
+from ctid_cli.identification.criterion import Searched
 from ctid_cli.identification.judged import JudgedCandidate, judged_candidates
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.reporting.document import Column, Result, Section
@@ -31,6 +33,8 @@ ABOUT_NO_CANDIDATE = (
     "greatest frequency that is admitted, where it follows this record's noise."
 )
 STRUCTURE = ("poles", "zeros", "integrators")
+#: The same of a sum of second-order submodels.
+OF_A_SUM = ("modes", "integrators")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,13 +76,15 @@ class OrderSearchResult(Result):
         error, criterion = figure.subplots(1, 2)
         best = self.choice.ranking.best
         by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
-        for family in sorted({(each.options.zeros, each.options.integrators) for each in by_size}):
+        for family in sorted({_family(each.options) for each in by_size}):
             zeros, integrators = family
-            own = [each for each in by_size if (each.options.zeros, each.options.integrators) == family]
+            own = [each for each in by_size if _family(each.options) == family]
             poles = [each.options.order for each in own]
             look = dict(LOOKS[zeros % len(LOOKS)], markersize=5, linewidth=1.0)
             look |= {"fillstyle": "none", "linestyle": ":"} if integrators else {}
-            label = f"{count(zeros, 'zero')}{', integrator' * bool(integrators)}"
+            label = (
+                f"{'second-order submodels' if zeros < 0 else count(zeros, 'zero')}{', integrator' * bool(integrators)}"
+            )
             error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
             criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
         if self.choice.seen:
@@ -103,9 +109,10 @@ class OrderSearchResult(Result):
 
     def _table(self, most: int | None = None, **parts: Any) -> Section:
         """Return the best structures."""
+        names = OF_A_SUM if isinstance(self.choice.options, AdditiveOutputError) else STRUCTURE
         columns = (
             Column("chosen"),
-            *(Column(name) for name in STRUCTURE),
+            *(Column(name) for name in names),
             Column("criterion_above_least", "criterion", "+.1f"),
             Column("fit_percent", "fit %", ".2f"),
             Column("validation_percent", "validation %", ".2f"),
@@ -123,7 +130,7 @@ class OrderSearchResult(Result):
         choice, best = self.choice, self.choice.ranking.best
         return {
             **self.records.content(),
-            "recommended": picked(best.options, STRUCTURE) if choice.seen else None,
+            "recommended": _structure(best.options) if choice.seen else None,
             "reason": " ".join(choice.sentences) if choice.seen else choice.why_none,
             "choices": choice.sentences,
             "command": choice.words(),
@@ -136,7 +143,7 @@ class OrderSearchResult(Result):
         fit, criteria, least = each.candidate.fit, each.candidate.criteria, self.choice.ranking.best
         tested = bool(each.tests)
         return {
-            **picked(each.candidate.options, STRUCTURE),
+            **_structure(each.candidate.options),
             "poles_at_infinity": fit.poles_at_infinity,
             "status": fit.status.name,
             **picked(fit.model, ("numerator", "denominator", "delay")),
@@ -153,3 +160,16 @@ class OrderSearchResult(Result):
             "starts_tried": fit.starts and fit.starts.tried,
             "starts_agree": fit.starts and fit.starts.agree,
         }
+
+
+def _structure(options: Searched) -> dict[str, Any]:
+    """Return the numbers that tell a structure from others, and the terms of a sum."""
+    if isinstance(options, AdditiveOutputError):
+        terms = [asdict(term) for term in options.terms]
+        return {"modes": len(terms), "integrators": options.integrators, "terms": terms}
+    return picked(options, STRUCTURE)
+
+
+def _family(options: Searched) -> tuple[int, int]:
+    """Return the zeros and integrators of structures that are drawn as one line; all sums are one, of -1 zeros."""
+    return -1 if isinstance(options, AdditiveOutputError) else options.zeros, options.integrators
