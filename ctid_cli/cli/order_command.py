@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +21,7 @@ from ctid_cli.cli.fit_structure import (
     as_usage_errors,
     given_of,
 )
+from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
 
 
@@ -51,7 +51,11 @@ def order(
     from ctid_cli.identification.choose import choose
     from ctid_cli.reporting.order_result import OrderSearchResult
 
-    _refuse_other_form(model, {"--poles": poles, "--zeros": zeros}, {"--modes": modes})
+    if frequency_files(files):
+        raise UsageError(
+            f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
+        )
+    _refuse_other_form(model, poles=poles, zeros=zeros, modes=modes)
     ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
     given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
     if model == "additive":
@@ -66,17 +70,15 @@ def order(
     emit(result, form.form, written)
 
 
-def _refuse_other_form(
-    model: ModelForm, fraction: Mapping[str, str | None], additive: Mapping[str, str | None]
-) -> None:
-    other, what = (
-        (fraction, "one transfer function; a sum has --modes")
-        if model == "additive"
-        else (additive, "a sum of submodels; add --model additive")
-    )
-    for name, text in other.items():
-        if text is not None:
-            raise UsageError(f"{name} is for {what}, or drop {name}")
+def _refuse_other_form(model: ModelForm, **options: str | None) -> None:
+    own = {"fraction": ("poles", "zeros"), "additive": ("modes",)}
+    why = {
+        "fraction": "is for a sum of submodels; add --model additive, or drop it",
+        "additive": "is for one transfer function; give the numbers of submodels by --modes, or drop it",
+    }
+    for name, text in options.items():
+        if text is not None and name not in own[model]:
+            raise UsageError(f"--{name} {why[model]}")
 
 
 def _range(name: str, text: str | None, least: int, most: int = 12) -> tuple[int, int] | None:

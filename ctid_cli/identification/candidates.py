@@ -9,7 +9,7 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import Optimum, best_near, best_of_orders
 from ctid_cli.estimation.optimum.box import box_of
 from ctid_cli.estimation.optimum.starts import QUICK, StructureSearch
-from ctid_cli.estimators.additive_output_error import AdditiveOutputError
+from ctid_cli.estimators.additive_output_error import GROWN, AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, fitted
 from ctid_cli.identification.criterion import Candidate, Ranking, Searched, penalised, ranked
 from ctid_cli.inference.sensitivities import Structure
@@ -99,7 +99,7 @@ class Structures:
     measured: MeasuredRecords
     search: StructureSearch
     #: Models of another setting, from which all searches start.
-    near: Callable[[int, int], TransferFunction] | None = None
+    near: Callable[[int, int], TransferFunction | None] | None = None
     found: dict[tuple[int, int], Candidate] = field(default_factory=dict)
 
     @classmethod
@@ -109,7 +109,7 @@ class Structures:
         setting: Setting,
         integrators: int,
         delays: tuple[float, float],
-        near: Callable[[int, int], TransferFunction] | None = None,
+        near: Callable[[int, int], TransferFunction | None] | None = None,
     ) -> "Structures":
         """Lay records out."""
         hold, state, before, offset = setting
@@ -141,14 +141,15 @@ class Structures:
             self.found[poles, zeros] = Candidate(options, self.hold, found, size)
         return self.found[poles, zeros]
 
-    def model(self, poles: int, zeros: int) -> TransferFunction:
-        """Return a model that has been fitted."""
-        return self.found[poles, zeros].fit.model
+    def model(self, poles: int, zeros: int) -> TransferFunction | None:
+        """Return a model that has been fitted; None where there were too few samples."""
+        found = self.found.get((poles, zeros))
+        return None if found is None else found.fit.model
 
     def _least(self, poles: int, zeros: int) -> Optimum:
-        if self.near is None:
+        start = None if self.near is None else self.near(poles, zeros)
+        if start is None:
             return best_of_orders(self.search, poles, zeros)
-        start = self.near(poles, zeros)
         alone = start.denominator[: start.denominator.size - self.options.integrators]
         return best_near(self.search, zeros, alone, start.delay)
 
@@ -181,7 +182,8 @@ class Sums:
         size = measured.layout_of(options.order, measured.structure.delay).size
         if SAMPLES_PER_PARAMETER * size > sum(data.count for data in measured.data):
             return None
-        return Candidate(options, self.hold, options._least(measured, []), size)
+        fit = options._of_submodels(measured, options._least(measured, []), GROWN)
+        return Candidate(options, self.hold, fit, size)
 
 
 def _modes(number: int, integrators: int) -> tuple[Term, ...]:

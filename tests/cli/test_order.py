@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli import HeldSignal, TransferFunction, simulate
-from tests.cli.records import write
+from tests.cli.records import first_order, write
 
 
 def answered(file, gain, seed=0):
@@ -33,9 +33,33 @@ def test_table_and_files(ctid, record, tmp_path, monkeypatch, snapshot):
     assert (tmp_path / "new" / "order.svg").read_bytes().startswith(b"<?xml")
 
 
+def test_sums_of_submodels(ctid, tmp_path, snapshot, monkeypatch):
+    """Two modes are found as two, and what is recommended is a command of ctid fit."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(3)
+    t = 0.05 * np.arange(1200)
+    u = np.repeat(rng.choice([-1.0, 1.0], 400), 3)
+    modes = TransferFunction([1.0], [1.0, 0.25, 1.0], 0.137), TransferFunction([6.0], [1.0, 0.5, 25.0], 0.137)
+    y = sum(simulate(mode, HeldSignal(t, u), t) for mode in modes) + 0.1 * rng.standard_normal(1200)
+    write(tmp_path / "modes.csv", (t, u, y), "t [s],u [V],y [mm]")
+    found = ctid("order", "modes.csv", "--model", "additive", "--modes", "1:3", "--validate", "modes.csv")
+    assert found.stdout == snapshot
+    content = json.loads((tmp_path / "order.json").read_text(encoding="utf-8"))
+    assert content["recommended"]["modes"] == 2
+    typed = json.loads(ctid("fit", "modes.csv", *content["command"], "--json").stdout)
+    chosen = json.loads(ctid("fit", "modes.csv", "--model", "additive", "--json").stdout)
+    assert typed["parameters"] == chosen["parameters"]
+
+
 def test_noise_has_no_order(ctid, tmp_path):
     record = answered(tmp_path / "noise.csv", 0.0)
     done = ctid("order", record, "--poles", "1:2", "--zeros", "0", "--delay", "0:1", "--json", "--out", tmp_path)
     content = json.loads(done.stdout)
     assert content["recommended"] is None
     assert content["reason"].startswith("There is no model here")
+
+
+def test_a_record_too_short_for_some_structures(ctid, tmp_path):
+    record = write(tmp_path / "short.csv", first_order(n=24), "t [s],u [V],y [mm]")
+    content = json.loads(ctid("order", record, "--json", "--out", tmp_path).stdout)
+    assert {each["status"] for each in content["orders"]} <= {"CONVERGED", "AT_BOUND", "RIDGE", "DELAY_AT_BOUND"}

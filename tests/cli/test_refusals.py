@@ -29,7 +29,6 @@ FILES = {
     "newer.json": '{"kind": "ctid fit", "format": 99, "ctid": "9.0"}',
     "controller.yaml": LOOP,
     "sign.yaml": LOOP.replace("0.8", "-0.8"),
-    "relay.yaml": "loop: {controller: {relay: {amplitude: 1.0}}}\n",
     "nokey.yaml": "loop:\n  control: {}\n",
     "changed.json": '{"kind": "ctid fit", "format": 2, "checksum": "0"}',
 }
