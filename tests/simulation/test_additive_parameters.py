@@ -115,3 +115,19 @@ def test_real_poles_are_neighbours_in_a_submodel_of_the_second_order():
     parameters, *_ = additive_parameters(fit, TERMS)
     assert parameters["g1_a2"] == pytest.approx(1 / 2)
     assert parameters["g2_a2"] == pytest.approx(1 / 1200)
+
+
+def test_theory_of_one_mode_with_a_searched_delay_is_that_of_its_fraction():
+    mode = AdditiveModel.from_theta([0.3, 0.25, 1.0], (Term(2, 0),), 0.237)
+    t = 0.1 * np.arange(300)
+    record = Record(t, np.zeros(300), HeldSignal(t, np.random.default_rng(0).choice([-1.0, 1.0], 300)))
+    noise, of_sum, of_fraction = WhiteNoise(variance=0.01), *(
+        EstimatedForm(model, 0, 0.0, "open_loop") for model in (mode, unfactored(mode))
+    )
+    one, other = (
+        accuracy_of_records(form, form.model, [record], noise, "it is short").parameters.factored()
+        for form in (of_sum, of_fraction)
+    )
+    assert one.names == other.names == ("g1_a1", "g1_a2", "g1_b0", "delay")
+    np.testing.assert_allclose(one.values, other.values, rtol=1e-12)
+    np.testing.assert_allclose(one.standard_errors, other.standard_errors, rtol=1e-6)
