@@ -111,7 +111,7 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
     that of its fit than in a smaller structure, by a factor that no number of parameters explains, it describes these
     samples, and not the system. Sums of submodels, and models of several inputs, are not looked at.
     """
-    if any(isinstance(each.options, AdditiveOutputError) for each in ranking.candidates) or len(records[0].inputs) > 1:
+    if any(isinstance(each.options, AdditiveOutputError) for each in ranking.candidates) or records[0].several:
         return ranking
     best_of: dict[int, Candidate] = {}
     for each in ranking.candidates:

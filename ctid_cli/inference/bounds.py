@@ -41,9 +41,10 @@ class ParameterAccuracy:
     def of(
         cls, model: AdditiveModel | TransferFunction, covariance: Array, zeros: int | None = None, delay: bool = False
     ) -> ParameterAccuracy:
-        """Accuracy of the parameters of a model, or of a fraction with more zeros or with its delay estimated too."""
+        """Accuracy of the parameters of a model, or with its delay estimated too, or of a fraction with more zeros."""
         if isinstance(model, AdditiveModel):
-            return cls(model, model.names, model.theta, covariance)
+            names, values = (*model.names, *("delay",) * delay), np.append(model.theta, [model.delay] * delay)
+            return cls(model, names, values, covariance)
         own = model.numerator.size - 1
         m = own if zeros is None else zeros
         parts = [model.denominator[1:], np.zeros(m - own), model.numerator, np.full(int(delay), model.delay)]

@@ -44,6 +44,8 @@ def expected_accuracy(
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
+    if (estimated.model.poles.real > 0.0).any():
+        raise DataError("the system is unstable, and theory is given here for stable ones")
     why_not = _why_no_limit(source, estimated)
     accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
     if terms is None or not estimated.model.is_stable:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ctid_cli.arrays import ComplexArray
 from ctid_cli.canonical import canonical_json
 from ctid_cli.custom_code import reason
 from ctid_cli.errors import DataError, UsageError
@@ -14,6 +15,7 @@ from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.controller import ContinuousController, Relay
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
 from ctid_cli.simulation.components import is_custom
@@ -88,6 +90,8 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
         found["sampling"] = {}
     if spec.disturbance is None:
         found["disturbance"] = {("disturbance",): [(None, {})]}
+    # What keeps an unstable system finite, if anything does.
+    found["feedback"] = {("loop",): [(None, {})]} if spec.loop is None else found["loop"]
     if spec.generator is not None:
         found["generator"] = {spec.generator[0]: _cases(spec, *spec.generator)}
     if spec.system is not None:
@@ -259,6 +263,31 @@ def _of_continuous(loop: Any, system: Any) -> Iterator[Complaint]:
         yield ("loop", "controller"), "a controller in continuous time is for measured records; give continuous_pid"
 
 
+def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
+    """A linear loop may keep an unstable system stable; whether it does is seen when it is tried."""
+    if feedback is not None and not isinstance(feedback.controller, Relay):
+        return
+    if isinstance(system, TransferFunction):
+        if not system.is_stable:
+            yield ("system",), f"the system is unstable and cannot be simulated: {_unstable(system.poles)}"
+        return
+    for k, submodel in enumerate(system.submodels):
+        if not submodel.is_stable:
+            # Poles at the origin are declared as integrators, which may be simulated.
+            poles = submodel.poles[submodel.poles != 0]
+            place = ("system", "additive", k)
+            yield place, f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"
+
+
+def _unstable(poles: ComplexArray) -> str:
+    offending = [
+        f"{pole.real:.4g}{pole.imag:+.4g}j" if pole.imag else f"{pole.real:.4g}" for pole in poles if not pole.real < 0
+    ]
+    noun = "pole" if len(offending) == 1 else "poles"
+    remedy = "every pole needs a negative real part, or a loop around it"
+    return f"{noun} at {', '.join(offending)} rad/s; {remedy}"
+
+
 def _of_custom_system(loop: Any, custom_system: Any) -> Iterator[Complaint]:
     yield ("system", "kind"), "a loop needs a transfer function in it; give excitation in place of loop"
 
@@ -376,7 +405,16 @@ def _of_options(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complain
 
 
 CHECKS = (
-    *(_of_delay, _of_greatest_delay, _of_clock_periods, _of_ratio, _of_relay, _of_continuous, _of_custom_system),
+    *(
+        _of_delay,
+        _of_greatest_delay,
+        _of_clock_periods,
+        _of_ratio,
+        _of_relay,
+        _of_continuous,
+        _of_unstable_system,
+        _of_custom_system,
+    ),
     *(_of_start, _of_relative_start, _of_unknown_parameters, _of_unknown_structure),
     *(_of_relative_errors, _of_unknown_values, _of_one_record, _of_error_of_a_signal, _of_error),
     *(_of_frequencies, _of_steps, _of_times, _of_tones, _of_options),

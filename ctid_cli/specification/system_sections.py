@@ -7,7 +7,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from ctid_cli.arrays import ComplexArray
 from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
@@ -62,8 +61,6 @@ class SystemSection(Section):
             yield (), f"there are {zeros} zeros and {model.order} poles; the system needs fewer zeros than poles"
         elif model.order > MAX_ORDER:
             yield ("denominator",), f"{model.order} poles are too many; at most {MAX_ORDER} can be simulated exactly"
-        elif not model.is_stable:
-            yield (), f"the system is unstable and cannot be simulated: {_unstable(model.poles)}"
 
 
 class SubmodelSection(Section):
@@ -137,10 +134,6 @@ class AdditiveSystemSection(AdditiveSection):
             submodel = section.options()
             if submodel.order > MAX_ORDER:
                 yield ("additive", k), f"{submodel.order} poles are too many; at most {MAX_ORDER} can be simulated"
-            elif not submodel.is_stable:
-                # Poles at the origin are declared as integrators, which may be simulated.
-                poles = submodel.poles[submodel.poles != 0]
-                yield ("additive", k), f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"
 
 
 _LinearSystem = Annotated[Any, WithKey("additive", AdditiveSystemSection, SystemSection)]
@@ -153,14 +146,6 @@ def truth_of(system: Variant) -> dict[str, float]:
         return {"delay": system.options.delay, **system.options.parameters}
     truth = system.values["truth"].items()
     return {name: system.values[value] if isinstance(value, str) else value for name, value in truth}
-
-
-def _unstable(poles: ComplexArray) -> str:
-    offending = [
-        f"{pole.real:.4g}{pole.imag:+.4g}j" if pole.imag else f"{pole.real:.4g}" for pole in poles if not pole.real < 0
-    ]
-    noun = "pole" if len(offending) == 1 else "poles"
-    return f"{noun} at {', '.join(offending)} rad/s; every pole needs a negative real part"
 
 
 # --------------------------------------------------------------------------------------------------------------------

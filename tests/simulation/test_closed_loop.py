@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.additive import AdditiveModel, Submodel
@@ -30,6 +31,19 @@ PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
 #: Stabilises every one of the systems.
 LEAD = DiscreteController([0.5, -0.48], [1.0, -0.8])
 RECORD = RegularSampling(0.05, 400)
+
+UNSTABLE = """
+experiment: unstable
+system: {numerator: [4], denominator: [1, 0, -1]}
+loop:
+  controller: {numerator: [11, -10], denominator: [1, 0]}
+  reference: {kind: gaussian, standard_deviation: 1.0}
+sampling: {kind: regular, interval: 0.05, samples: 2000}
+noise: {kind: white, variance: 0.01}
+estimators:
+  loop: {kind: loop_output_error, poles: 2, zeros: 0, delay_bounds: [0, 0]}
+monte_carlo: {runs: 1, seed: 1}
+"""
 
 
 def source(system=MODES, controller=PID, enters="controller", noise=WhiteNoise(variance=0.01), sampling=RECORD, **more):  # noqa: B008
@@ -130,3 +144,13 @@ monte_carlo: {runs: 1, seed: 1}
     with pytest.raises(DataError, match="not that which the experiment was planned with"):
         cells[0].dataset(0)
     assert build_plan(load_spec(tmp_path / "spec.yaml")).data_cells[0].hash != cells[0].hash
+
+
+def test_an_unstable_plant_in_a_stable_loop_is_simulated_and_found(tmp_path):
+    file = tmp_path / "unstable.yaml"
+    file.write_text(UNSTABLE, encoding="utf-8")
+    (cell,) = build_plan(load_spec(file)).data_cells
+    fit = LoopOutputError(2, 0).fit(cell.dataset(0).record)
+    error = (fit.theta - [0.0, -1.0, 4.0]) / np.sqrt(np.diag(fit.covariance))
+    assert fit.status.succeeded
+    assert np.abs(error).max() < 4.0
