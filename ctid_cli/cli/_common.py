@@ -130,8 +130,10 @@ def emit(result: Result, form: Format, written: Sequence[Path] = (), stored: str
         typer.echo(f"\nWritten: {', '.join(names)}")
 
 
-def refuse_overwriting(inputs: Iterable[Path], written: Iterable[Path]) -> None:
-    """Refuse to write over what is read."""
+def refuse_overwriting(inputs: Iterable[Path], written: Sequence[Path]) -> None:
+    """Refuse, before anything is computed, to write over what is read or below a file."""
+    for folder in {folder for path in written for folder in path.parents if folder.is_file()}:
+        raise StorageError(f"{folder} is a file, not a folder to write in")
     for file, path in itertools.product(inputs, written):
         if file.exists() and path.exists() and file.samefile(path):
             raise UsageError(f"{file} would be overwritten; write elsewhere (--out DIR)")

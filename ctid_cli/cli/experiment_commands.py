@@ -1,4 +1,4 @@
-"""The commands that take experiment files: ``ctid run``, ``validate`` and ``schema``."""
+"""The commands about experiment files: ``ctid init``, ``validate``, ``accuracy``, ``run`` and ``schema``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from ctid_cli.cli._common import (
     AllowCode,
     AllowMixed,
     AllowOutside,
+    Config,
     Configs,
     Fresh,
     Jobs,
@@ -29,12 +31,13 @@ from ctid_cli.cli._common import (
     guarded,
     printable,
     require_within,
+    write_files,
 )
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.cli._progress import Reporter
-from ctid_cli.errors import ExitCode, Problem, SpecError, TooManyFailuresError, UsageError
+from ctid_cli.errors import ExitCode, Problem, RefusedError, SpecError, TooManyFailuresError, UsageError
 from ctid_cli.reporting.layout import seconds
-from ctid_cli.text import count
+from ctid_cli.text import count, did_you_mean, listed
 
 if TYPE_CHECKING:
     from ctid_cli.running.engine import RunSummary
@@ -53,9 +56,7 @@ _STOPPED = {
 
 Dask = Annotated[
     str | None,
-    typer.Option(
-        "--dask", metavar="ADDRESS", help="Compute with the workers of the dask scheduler at tcp://host:port."
-    ),
+    flag("--dask", "Compute with the workers of the dask scheduler at tcp://host:port.", "ADDRESS"),
 ]
 
 
@@ -109,11 +110,11 @@ class PlaceOptions:
     out: Out = Path("results")
     fresh: Fresh = False
     keep_readable: Annotated[
-        bool, typer.Option("--keep-readable", help="With --fresh: keep what can be read of damaged results.")
+        bool, flag("--keep-readable", "With --fresh: keep what can be read of damaged results.")
     ] = False
     allow_mixed: AllowMixed = False
     retry: Annotated[
-        list[Failure] | None, typer.Option("--retry", help="Compute stored failures of this kind again; repeatable.")
+        list[Failure] | None, flag("--retry", "Compute stored failures of this kind again; repeatable.")
     ] = None
 
     @property
@@ -127,12 +128,10 @@ class PlaceOptions:
 class EndOptions:
     """What ends a run early."""
 
-    max_failures: Annotated[
-        int | None, typer.Option("--max-failures", min=1, metavar="N", help="Stop when N estimates have failed.")
-    ] = None
+    max_failures: Annotated[int | None, flag("--max-failures", "Stop when N estimates have failed.", "N", min=1)] = None
     time_budget: Annotated[
         float | None,
-        typer.Option("--time-budget", metavar="TIME", parser=duration, help="Stop after e.g. 90s, 30m or 1h30m."),
+        flag("--time-budget", "Stop after e.g. 90s, 30m or 1h30m.", "TIME", parser=duration),
     ] = None
 
 
@@ -146,12 +145,10 @@ def run(
     runs: Runs = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", metavar="K/N", help="Only the K-th of N equal parts; ctid merge joins them."),
+        flag("--shard", "Only the K-th of N equal parts; ctid merge joins them.", "K/N"),
     ] = None,
     dask: Dask = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be computed, without computing it.")
-    ] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "Print what would be computed, without computing it.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> None:
     """Run experiments; the same command again resumes.
@@ -271,7 +268,7 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
 @guarded
 def schema(
     section: Annotated[str | None, typer.Argument(metavar="SECTION", help="A section or kind, with --text.")] = None,
-    as_text: Annotated[bool, typer.Option("--text", help="Write a readable reference instead of JSON.")] = False,
+    as_text: Annotated[bool, flag("--text", "Write a readable reference instead of JSON.")] = False,
 ) -> None:
     """Print the JSON Schema of experiment files, or a reference.
 
@@ -284,3 +281,66 @@ def schema(
     if section is not None and not as_text:
         raise UsageError(f"a part of the schema is there as text only; write: ctid schema --text {section}")
     typer.echo(reference_text(section) if as_text else json.dumps(json_schema(), indent=2))
+
+
+@guarded
+def accuracy(
+    config: Config,
+    spec: SpecOptions,
+    form: FormatOptions,
+    out: Out = Path("results"),
+) -> None:
+    """Compute the standard errors to expect of an experiment.
+
+    No data are needed.
+
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
+    formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
+    the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
+    unexpected about them comes last.
+    """
+    from ctid_cli.reporting.accuracy_result import AccuracyResult
+    from ctid_cli.reporting.results import find_results
+
+    ((_, plan),) = spec.plans([config])
+    emit(AccuracyResult.of(plan, find_results(out, plan.experiment)), form.form)
+
+
+#: Kinds of experiment files to begin with, each with what it is about and its files in the folder ``templates``; the
+#: first file is the specification, and its experiment has the name of the kind.
+TEMPLATES = {
+    "open-loop": ("a system and its delay, found from noisy data", ["open-loop.yaml"]),
+    "closed-loop": ("a system under a controller, with coloured noise", ["closed-loop.yaml"]),
+    "modes": ("a sum of submodels, or one transfer function?", ["modes.yaml"]),
+    "frequencies": ("frequencies of a signal that step", ["frequencies.yaml"]),
+    "measured": ("models of a measured record", ["measured.yaml", "measured-example.csv"]),
+}
+
+
+@guarded
+def init(
+    kinds: Annotated[
+        list[str] | None, typer.Argument(metavar="KIND", help=f"{', '.join(TEMPLATES)}; all by default.")
+    ] = None,
+    force: Annotated[bool, flag("--force", "Overwrite files that exist.")] = False,
+) -> None:
+    """Write commented experiment files to begin with.
+
+    They go into the current folder. Each runs as it is, in seconds, and says what every line of it means.
+    """
+    wanted = kinds or list(TEMPLATES)
+    for kind in wanted:
+        if kind not in TEMPLATES:
+            near = did_you_mean(kind, TEMPLATES) or "."
+            raise UsageError(f"there is no kind {kind!r}{near} Kinds: {', '.join(TEMPLATES)}")
+    folder = resources.files("ctid_cli") / "templates"
+    files = {Path(name): (folder / name).read_bytes() for kind in wanted for name in TEMPLATES[kind][1]}
+    taken = [path for path in files if path.exists()]
+    if taken and not force:
+        there = f"{listed(taken)} {'are' if len(taken) > 1 else 'is'} here already"
+        raise RefusedError(f"{there}, so that nothing was written; work in another folder, or add --force to overwrite")
+    write_files(files)
+    for kind in wanted:
+        about, names = TEMPLATES[kind]
+        typer.echo(f"{names[0]:20}  {about}{''.join(f' (with {name})' for name in names[1:])}")
+    typer.echo(f"next: ctid run {TEMPLATES[wanted[0]][1][0]}, then ctid table {wanted[0]}")

@@ -102,12 +102,14 @@ def fit(
     writes, needs --poles.
     """
     asked = Asked(model, treatment, loop.use, columns.names)
+    read = [*files, *([judging.validate] if judging.validate else [])]
+    refuse_overwriting(read, [writing.out / "fit.json", *([writing.csv / "step.csv"] if writing.csv else [])])
     if frequency_files(files):
         result: FitResult = frequency_fit(files, asked, loop, columns, asdict(judging))
     else:
         result = _fit_of_records(files, asked, loop, columns, judging)
     contents = writing.contents(result, given_command(context))
-    refuse_overwriting([*files, *([judging.validate] if judging.validate else [])], contents)
+    refuse_overwriting(read, [*contents])
     write_files(contents)
     emit(result, form.form, list(contents), stored=next(iter(contents.values())).decode())
 

@@ -7,18 +7,15 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._common import Command, ComputingCommand
-from ctid_cli.cli.accuracy_command import accuracy
 from ctid_cli.cli.check_command import check
 from ctid_cli.cli.compare_command import compare
-from ctid_cli.cli.experiment_commands import run, schema, validate
+from ctid_cli.cli.experiment_commands import accuracy, init, run, schema, validate
 from ctid_cli.cli.fit_command import fit
 from ctid_cli.cli.frf_command import frf
-from ctid_cli.cli.init_command import init
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.page_commands import figure, report
 from ctid_cli.cli.reproduce_command import reproduce
-from ctid_cli.cli.result_commands import export, status, table
-from ctid_cli.cli.storage_commands import merge, verify
+from ctid_cli.cli.result_commands import export, merge, status, table, verify
 from ctid_cli.cli.track_command import track
 
 # Plain help and error texts: they read well in log files, and leave rich out of the start-up.

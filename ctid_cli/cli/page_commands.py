@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from ctid_cli.cli._common import Out, guarded, write_files
+from ctid_cli.cli._options import flag
 from ctid_cli.errors import UsageError
 
 Form = Literal["svg", "png", "pdf"]
@@ -20,16 +21,12 @@ def figure(
         list[str] | None,
         typer.Argument(metavar="NAME", help="Experiment (quickstart), figure (2, additive/3) or study (additive)."),
     ] = None,
-    kind: Annotated[str | None, typer.Option("--kind", metavar="KIND", help="measure or box.")] = None,
-    measure: Annotated[
-        str | None, typer.Option("--measure", metavar="NAME", help="Measure, such as rmse or rmse:delay.")
-    ] = None,
-    parameters: Annotated[
-        str | None, typer.Option("--parameters", metavar="NAMES", help="With --kind box: a1,delay.")
-    ] = None,
-    style: Annotated[Form | None, typer.Option("--format", help="Format of the files; svg by default.")] = None,
+    kind: Annotated[str | None, flag("--kind", "measure or box.", "KIND")] = None,
+    measure: Annotated[str | None, flag("--measure", "Measure, such as rmse or rmse:delay.", "NAME")] = None,
+    parameters: Annotated[str | None, flag("--parameters", "With --kind box: a1,delay.", "NAMES")] = None,
+    style: Annotated[Form | None, flag("--format", "Format of the files; svg by default.")] = None,
     out: Out = Path("results"),
-    file: Annotated[Path | None, typer.Option("--file", metavar="FILE", help="File of a single figure.")] = None,
+    file: Annotated[Path | None, flag("--file", "File of a single figure.", "FILE")] = None,
 ) -> None:
     """Draw figures of experiments and of studies.
 
@@ -100,17 +97,13 @@ def report(
     out: Out = Path("results"),
     file: Annotated[
         Path | None,
-        typer.Option(
-            "--file",
-            metavar="FILE",
-            help="File of the page; OUT/<experiment>/report.html, fit.html or track.html by default.",
-        ),
+        flag("--file", "File of the page; OUT/<experiment>/report.html, fit.html or track.html by default.", "FILE"),
     ] = None,
     record: Annotated[
-        list[Path] | None, typer.Option("--record", metavar="FILE", help="Record of the fit or track, if it was moved.")
+        list[Path] | None, flag("--record", "Record of the fit or track, if it was moved.", "FILE")
     ] = None,
     validate: Annotated[
-        Path | None, typer.Option("--validate", metavar="FILE", help="Validation record of the fit, if it was moved.")
+        Path | None, flag("--validate", "Validation record of the fit, if it was moved.", "FILE")
     ] = None,
 ) -> None:
     """Write a page about a fit, a track, an experiment or a study.

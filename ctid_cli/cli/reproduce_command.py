@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ctid_cli.cli._common import Fresh, Jobs, Out, Runs, emit, guarded
-from ctid_cli.cli._options import FormatOptions
+from ctid_cli.cli._options import FormatOptions, flag
 from ctid_cli.errors import MismatchError, UsageError
 
 if TYPE_CHECKING:
@@ -24,18 +24,14 @@ if TYPE_CHECKING:
 class Actions:
     """What is done instead of running the studies; one at a time."""
 
-    list: Annotated[bool, typer.Option("--list", help="List the studies with their experiments.")] = False
-    check: Annotated[
-        bool, typer.Option("--check", help="Test the claims, and compare the tables with those committed.")
-    ] = False
-    first: Annotated[
-        bool, typer.Option("--first", help="Compute the first data sets, and compare with those committed.")
-    ] = False
+    list: Annotated[bool, flag("--list", "List the studies with their experiments.")] = False
+    check: Annotated[bool, flag("--check", "Test the claims, and compare the tables with those committed.")] = False
+    first: Annotated[bool, flag("--first", "Compute the first data sets, and compare with those committed.")] = False
     update_first: Annotated[
-        bool, typer.Option("--update-first", help="Compute the first data sets, and store them as the reference.")
+        bool, flag("--update-first", "Compute the first data sets, and store them as the reference.")
     ] = False
     publish: Annotated[
-        bool, typer.Option("--publish", help="Write tables, figures, claims and environment to results/published.")
+        bool, flag("--publish", "Write tables, figures, claims and environment to results/published.")
     ] = False
 
     @property

@@ -1,13 +1,13 @@
-"""The commands that read results: ``ctid status``, ``table`` and ``export``."""
+"""The commands about stored results: ``ctid status``, ``table``, ``export``, ``merge`` and ``verify``."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ctid_cli.cli._common import Out, emit, guarded, write_files
-from ctid_cli.cli._options import FormatOptions
-from ctid_cli.errors import UsageError
+from ctid_cli.cli._common import AllowMixed, Out, emit, guarded, write_files
+from ctid_cli.cli._options import FormatOptions, flag
+from ctid_cli.errors import MismatchError, UsageError
 from ctid_cli.reporting.document import Format, Tool
 
 
@@ -53,11 +53,11 @@ def table(
     ] = None,
     measure: Annotated[
         str | None,
-        typer.Option("--measure", metavar="NAMES", help="Measures of an experiment, such as bias,rmse,coverage."),
+        flag("--measure", "Measures of an experiment, such as bias,rmse,coverage.", "NAMES"),
     ] = None,
     compare: Annotated[
         str | None,
-        typer.Option("--compare", metavar="A,B", help="Differences of two estimators on the same data sets."),
+        flag("--compare", "Differences of two estimators on the same data sets.", "A,B"),
     ] = None,
     out: Out = Path("results"),
 ) -> None:
@@ -98,21 +98,13 @@ def export(
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Experiment (quickstart), or a fit (fit.json).")
     ] = None,
-    id: Annotated[
-        str | None, typer.Option("--id", metavar="ID", help="One estimate in full, by the first letters of its id.")
-    ] = None,
-    format: Annotated[
-        Format | None, typer.Option("--format", help="Output format: csv or json; of one estimate any.")
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
-    tool: Annotated[Tool | None, typer.Option("--as", help="Tool for which the model of a fit is written.")] = None,
-    pade: Annotated[
-        int | None, typer.Option("--pade", metavar="ORDER", help="With --as control: approximate the delay.")
-    ] = None,
+    id: Annotated[str | None, flag("--id", "One estimate in full, by the first letters of its id.", "ID")] = None,
+    format: Annotated[Format | None, flag("--format", "Output format: csv or json; of one estimate any.")] = None,
+    json: Annotated[bool, flag("--json", "Short for --format json.")] = False,
+    tool: Annotated[Tool | None, flag("--as", "Tool for which the model of a fit is written.")] = None,
+    pade: Annotated[int | None, flag("--pade", "With --as control: approximate the delay.", "ORDER")] = None,
     out: Out = Path("results"),
-    file: Annotated[
-        Path | None, typer.Option("--file", metavar="FILE", help="Write to this file, not to stdout.")
-    ] = None,
+    file: Annotated[Path | None, flag("--file", "Write to this file, not to stdout.", "FILE")] = None,
 ) -> None:
     """Write the estimates of an experiment, or a fit as code.
 
@@ -173,3 +165,54 @@ def _export_one(experiment: str | None, id: str, form: Format, out: Path, file: 
         emit(result, form)
     else:
         write_files({file: f"{result.write(form)}\n".encode()})
+
+
+@guarded
+def merge(
+    form: FormatOptions,
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER", help="Folders of shards, or folders that hold some.")
+    ],
+    out: Out = Path("results"),
+    allow_mixed: AllowMixed = False,
+    partial: Annotated[bool, flag("--partial", "Merge although some estimates are missing.")] = False,
+) -> None:
+    """Merge the shards of experiments into one folder of results.
+
+    `ctid run --shard K/N` computes one of N shards. Merged in whatever order, they give the runs.h5 of a single run,
+    byte for byte. The folders of the shards stay as they are.
+    """
+    from ctid_cli.reporting.status_result import MergeResult
+    from ctid_cli.storage.merge import find_sources, merge_all
+
+    for merged in merge_all(find_sources(folders), out, allow_mixed=allow_mixed, partial=partial):
+        emit(MergeResult(merged, out), form.form)
+
+
+@guarded
+def verify(
+    form: FormatOptions,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="NAME", help="Experiments (quickstart); all by default.")
+    ] = None,
+    out: Out = Path("results"),
+) -> None:
+    """Check what is stored of experiments.
+
+    The journal with every estimate in it, and runs.h5. Exit code 7 if anything is damaged or missing. Nothing is
+    changed: `ctid run --fresh --keep-readable` moves damaged results aside, keeps what can be read and computes the
+    rest.
+    """
+    from ctid_cli.reporting.results import experiments_in, stored_folder
+    from ctid_cli.reporting.status_result import VerificationResult
+    from ctid_cli.storage.status import verify as check
+
+    found = [check(stored_folder(out, name)) for name in dict.fromkeys(names or experiments_in(out))]
+    if not found:
+        raise UsageError(f"there are no results in {out}")
+    for number, item in enumerate(found):
+        typer.echo("", nl=number > 0 and form.form != "json")
+        emit(VerificationResult(item, out), form.form)
+    wrong = [item.folder for item in found if not item.is_intact]
+    if wrong:
+        raise MismatchError(f"not as it was written: {', '.join(map(str, wrong))}")

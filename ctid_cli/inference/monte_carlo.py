@@ -97,7 +97,13 @@ def share(hits: BoolArray) -> Measured:
     if not n:
         return Measured()
     p, (low, high) = k / n, wilson_interval(k, n)
-    return Measured(100 * p, 100 * math.sqrt(p * (1 - p) / n), 100 * low, 100 * high)
+    return Measured(100 * k / n, 100 * math.sqrt(p * (1 - p) / n), 100 * low, 100 * high)
+
+
+def total(values: Array) -> Measured:
+    """Sum of the values that are finite, without an error."""
+    known = values[np.isfinite(values)]
+    return Measured(float(known.sum()) if known.size else None)
 
 
 def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = True) -> Measured:
@@ -241,8 +247,9 @@ class Measure:
     meaning: str
     #: ``""`` stands for that of the parameter, ``^2`` for its square.
     unit: str
-    #: What it is computed from: errors of parameters, a distance between models, or what an estimate has one of.
-    source: Literal["errors", "distance", "converged", "status", "cpu_seconds", "fresh_fit_percent", "custom_measures"]
+    #: What it is computed from: ``errors`` of parameters, ``distance`` between models, whether estimates ``converged``,
+    #: their ``status``, ``measures`` of tracks, or a column of the estimates.
+    source: str
     compute: Callable[..., Measured]
     #: Whether only estimates with a standard error count.
     of_widths: bool = False

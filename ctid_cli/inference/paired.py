@@ -74,6 +74,11 @@ def percent_difference(first: int, second: int, n: int) -> Difference:
     return Difference(100 * (first - second) / n, 100 * low, 100 * high, mcnemar(first, second))
 
 
+def hit_difference(first: Array, second: Array) -> Difference:
+    """Return the difference of two percentages, from 1 for each data set with a success and 0 for others [%]."""
+    return percent_difference(int((first > second).sum()), int((first < second).sum()), first.size)
+
+
 def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, second: Array) -> Difference:
     """Difference of a statistic of two estimators, by resampling the data sets that both have, shapes (n,).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import json
 import math
 import re
@@ -12,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting import markup
-from ctid_cli.reporting.layout import latex, markdown_table, picked
+from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked
 from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
@@ -202,16 +202,28 @@ def _text_table(lines: list[list[str]], sides: str, columns: int | None = None) 
     # Columns that stand closer may fit where they would not otherwise.
     gap = 1 if columns and _width(widths, 1) <= columns < _width(widths, 2) else 2
     blocks = []
-    for part in _parts(widths, sides, gap, columns):
+    for part in _parts(widths, _key_count(lines[1:], sides), gap, columns):
         formats = [f"{'<' if sides[k] == 'l' else '>'}{widths[k]}" for k in part]
         header, *body = ((" " * gap).join(map(format, (row[k] for k in part), formats)).rstrip() for row in lines)
         blocks.append("\n".join([header, "-" * _width([widths[k] for k in part], gap), *body]))
     return "\n\n".join(blocks)
 
 
-def _parts(widths: Sequence[int], sides: str, gap: int, columns: int | None) -> Iterator[list[int]]:
+def _key_count(rows: Sequence[Sequence[str]], sides: str) -> int:
+    """Return the number of first columns that tell all rows apart; where none do, of those before the first number."""
+    # An empty cell stands for the one above it.
+    told = ["" for _ in rows]
+    for k, column in enumerate(zip(*rows, strict=True)):
+        filled: Iterator[str] = itertools.accumulate(column, lambda above, own: own or above)
+        told = [f"{before}\n{own}" for before, own in zip(told, filled, strict=True)]
+        if len({*told}) == len(told):
+            return k + 1
+    return max(1, sides.find("r", 1))
+
+
+def _parts(widths: Sequence[int], key_count: int, gap: int, columns: int | None) -> Iterator[list[int]]:
     """Yield which columns of a table stand side by side in a terminal; those that name the rows come in every part."""
-    keys = list(range(max(1, sides.find("r", 1))))
+    keys = list(range(key_count))
     part = keys
     for k in range(len(keys), len(widths)):
         if columns and part != keys and _width([widths[i] for i in (*part, k)], gap) > columns:
@@ -260,9 +272,9 @@ def render_html(sections: Iterable[Section]) -> str:
     blocks: list[str] = []
     for section in sections:
         blocks += [f"<h4>{html.escape(section.title)}</h4>"] if section.title else []
-        blocks.append(markup.paragraphs([*section.sentences, *section.lines]))
-        blocks += [markup.table(*aligned_lines(section))] if section.frame is not None else []
-        blocks.append(markup.paragraphs(section.notes))
+        blocks.append(html_paragraphs([*section.sentences, *section.lines]))
+        blocks += [html_table(*aligned_lines(section))] if section.frame is not None else []
+        blocks.append(html_paragraphs(section.notes))
     return "\n".join(filter(None, blocks))
 
 

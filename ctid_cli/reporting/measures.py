@@ -29,12 +29,12 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, wilson_interval
+from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, total
 from ctid_cli.inference.units import Units
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import least_variances
-from ctid_cli.simulation.frequency_measures import base_name
-from ctid_cli.storage.columns import COUNTS, reserved_names
+from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name
+from ctid_cli.storage.columns import COUNTS, OF_MEASURES, reserved_names
 from ctid_cli.storage.estimates import CLOCKS
 from ctid_cli.storage.groups import places_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
@@ -104,93 +104,73 @@ def settings_of(names: Iterable[Any]) -> list[str]:
     return [name for name in names if name not in others and not name.startswith(OF_FREQUENCIES)]
 
 
-# --- percentages ----------------------------------------------------------------------------------------------------
-
-
-def percentage_frame(
-    results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
-) -> pd.DataFrame:
-    """Return how often the estimators of an experiment converged, a row for each group that was planned."""
-    labels = label_frame(results, table, fields)
-    frame = with_types(labels.join(_counted(results)))
-    return frame.join(_frequencies(results)) if is_of_signal(results.manifest) else frame
-
-
-def _counted(results: Results) -> pd.DataFrame:
-    """Return counts, percentages and median times of groups."""
-    import pandas as pd
-
-    stored = results.stored
-    columns = {"failed": stored.failures, "converged": stored.judged, **{name: stored.column(name) for name in CLOCKS}}
-    found = pd.DataFrame(columns).groupby(results.numbers)
-    hits = found["converged"].agg(["size", "count", "sum"])
-    n, converged = hits["size"], hits["sum"].where(hits["count"] == hits["size"])
-    ends = [
-        wilson_interval(int(k), int(n)) if k == k else (math.nan, math.nan) for n, k in zip(n, converged, strict=True)
-    ]
-    low, high = 100 * np.reshape(ends, (-1, 2)).T
-    counts = {"n": n, "failed": found["failed"].sum(), "converged": converged, "percent": 100 * converged / n}
-    medians = {f"median_{clock}": found[clock].median() for clock in CLOCKS}
-    return pd.DataFrame(counts | {"low": low, "high": high} | medians)
-
-
-def with_types(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the counts of cells in their types and order, zero where nothing was run."""
-    counts = frame.reindex(columns=[*COUNTS])
-    empty = counts["n"].isna()
-    for name in ("n", "failed", "converged"):
-        counts[name] = counts[name].mask(empty, 0)
-    counts = counts.astype(COUNTS)
-    return frame.drop(columns=[*COUNTS], errors="ignore").join(counts)
-
-
-def _frequencies(results: Results) -> pd.DataFrame:
-    """Return medians of the measures of frequencies; what does not exist counts as later or larger than all else."""
-    import pandas as pd
-
-    stored, numbers = results.stored, results.numbers
-    if not stored.has("measures"):
-        return pd.DataFrame()
-    names = list(map(str, stored.export.parts("measures")))
-    every = pd.DataFrame(stored.column("measures"), columns=names)
-    late, found = every.fillna(math.inf), {}
-    for base in ("settling_time", "settling_after_step"):
-        if own := [name for name in names if base_name(name)[0] == base]:
-            found[f"median_{base}"] = late[own].max(axis=1).groupby(numbers).median()
-    for name in names:
-        if base_name(name)[0] == "rms":
-            found[f"median_{name}"] = late[name].groupby(numbers).median()
-    medians = pd.DataFrame(found).replace(math.inf, math.nan)
-    if "false_alarms" in every:
-        medians["false_alarms"] = every["false_alarms"].groupby(numbers).sum(min_count=1)
-    return medians
-
-
-# --- measures -------------------------------------------------------------------------------------------------------
+# --- one table of measures --------------------------------------------------------------------------------------------
 
 
 def measure_frame(results: Results, names: Sequence[str]) -> pd.DataFrame:
     """Return measures by name, of every planned combination of swept fields, estimator and start, by its number."""
-    import pandas as pd
-
-    names = list(dict.fromkeys(names))
     for name in names:
         _require_measurable(name, results)
-    labels = label_frame(results)
+    return _measure_frame(results, {name: measure_of(name, results) for name in names}, label_frame(results))
+
+
+def _measure_frame(results: Results, measures: Mapping[str, Measure], labels: pd.DataFrame) -> pd.DataFrame:
+    """Return measures with the labels of their groups, and the counts of data sets."""
+    import pandas as pd
+
     failures = pd.Series(results.stored.failures).groupby(results.numbers).agg(["size", "sum"])
     failures = failures.reindex(labels.index, fill_value=0)
-    found = pd.concat([_measured(results, name) for name in names]).sort_index(kind="stable")
+    found = pd.concat([_measured(results, *item) for item in measures.items()]).sort_index(kind="stable")
     counts = pd.DataFrame({"n": failures["size"], "failed": failures["sum"]}).loc[found.index]
     return pd.concat(
         [labels.loc[found.index], found.drop(columns="without_value"), counts, found["without_value"]], axis=1
     )
 
 
-def _measured(results: Results, name: str) -> pd.DataFrame:
+def percentage_frame(
+    results: Results, table: int | str | None = None, fields: Mapping[str, str] | None = None
+) -> pd.DataFrame:
+    """Return how often the estimators of an experiment converged, and other measures of whole estimates, side by side.
+
+    There is a row for each group that was planned.
+    """
+    measures = {"percent": MEASURES["percent"], **_medians(results)}
+    long = _measure_frame(results, measures, label_frame(results, table, fields))
+    first = long[long["measure"] == "percent"]
+    values = {name: long.loc[long["measure"] == name, "value"] for name in measures}
+    converged = (first["value"] * first["n"] / 100).round()
+    frame = with_types(first.drop(columns=[*OF_MEASURES]).assign(converged=converged, **values))
+    return frame[sorted(frame, key=lambda name: str(name).startswith(OF_FREQUENCIES))]
+
+
+def _medians(results: Results) -> dict[str, Measure]:
+    """Return what else tables show of whole estimates: times, and the measures of frequencies that are stored."""
+    clocks = {name: Measure("median time of one estimate", "s", name, quantile) for name in CLOCKS}
+    measured = list(map(str, results.tracks))
+    bases = {base_name(name)[0] for name in measured}
+    slowest = [base for base in ("settling_time", "settling_after_step") if base in bases]
+    names = [*slowest, *(name for name in measured if base_name(name)[0] == "rms")]
+    medians = clocks | {name: Measure(name, MEASURE_UNITS[base_name(name)[0]], "measures", quantile) for name in names}
+    found = {f"median_{name}": measure for name, measure in medians.items()}
+    alarms = {"false_alarms": Measure("false alarms of all data sets", "-", "measures", total)}
+    return found | (alarms if "false_alarms" in bases else {})
+
+
+def with_types(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the counts of cells in their types and order, zero where nothing was run."""
+    counts = frame.reindex(columns=[*COUNTS])
+    empty = counts["n"].fillna(0) == 0
+    for name in ("n", "failed", "converged"):
+        counts[name] = counts[name].mask(empty, 0)
+    counts = counts.astype(COUNTS)
+    return frame.drop(columns=[*COUNTS], errors="ignore").join(counts)
+
+
+def _measured(results: Results, name: str, measure: Measure) -> pd.DataFrame:
     """Return one measure of every planned group, a row for each parameter or status that it is about."""
     import pandas as pd
 
-    measure, values = measure_of(name, results), values_of(results, name)
+    values = values_of(results, name, measure)
     bounds = _bounds(results) if name.partition(":")[0] == "efficiency" else {}
     truths = [true_values(cell) for cell in results.manifest["data_cells"]]
     keys, rows = ["group", "parameter"], []
@@ -230,38 +210,48 @@ def _bounds(results: Results) -> dict[int, dict[str, float]]:
     return {k: least_variances(results.plan, *place) for k, *place in results.groups.iloc[:, :2].itertuples()}
 
 
-def values_of(results: Results, name: str) -> pd.DataFrame:
-    """Return what a measure is computed from, with ``group`` and ``parameter``; NaN where an estimate has no value."""
+def values_of(results: Results, name: str, measure: Measure) -> pd.DataFrame:
+    """Return the estimates as a measure sees them: ``group``, ``parameter``, ``replicate`` and ``value``.
+
+    Of errors, also ``standard_error`` and ``quantile``. NaN marks an estimate without a value.
+    """
     import pandas as pd
 
-    measure, stored, numbers = measure_of(name, results), results.stored, results.numbers
+    stored, numbers = results.stored, results.numbers
     if measure.source == "errors":
-        return _errors_for(results, name)
-    if measure.source == "status":
-        status = np.char.decode(stored.column("status"))
-        counted = sorted({*status.tolist()} - SUCCESSES) or ["FAILED"]
-        hits = [pd.DataFrame({"group": numbers, "parameter": one, "value": 1.0 * (status == one)}) for one in counted]
-        return pd.concat(hits)
+        return _errors_for(results, name, measure)
     values = np.full(len(stored), np.nan)
-    if measure.source == "distance":
-        for group in np.unique(numbers).tolist():
-            system = system_of(results.manifest["data_cells"][results.place(group)[0]], name)
-            values[numbers == group] = distances(system, results.members(group), name)
-    elif measure.source == "converged":
-        # Of a group with an estimate that no rule is about, nothing is said.
-        judged = pd.Series(stored.judged)
-        values = judged.mask(judged.isna().groupby(numbers).transform("any")).to_numpy()
-    elif stored.has(measure.source):
-        values = stored.column(measure.source)
-        if measure.source == "custom_measures":
-            names = stored.export.parts("custom_measures")
-            values = values[:, names.index(name)] if name in names else np.full(len(stored), np.nan)
-        # Where there is no model, it fits a fresh data set infinitely badly.
-        values = np.where(np.isfinite(values), values, -np.inf if measure.source == "fresh_fit_percent" else np.nan)
-    return pd.DataFrame({"group": numbers, "parameter": None, "value": values})
+    estimates = pd.DataFrame({"group": numbers, "parameter": None, "replicate": stored.column("replicate")})
+    match measure.source:
+        case "status":
+            status = np.char.decode(stored.column("status"))
+            counted = sorted({*status.tolist()} - SUCCESSES) or ["FAILED"]
+            return pd.concat([estimates.assign(parameter=one, value=1.0 * (status == one)) for one in counted])
+        case "distance":
+            for group in np.unique(numbers).tolist():
+                system = system_of(results.manifest["data_cells"][results.place(group)[0]], name)
+                values[numbers == group] = distances(system, results.members(group), name)
+        case "converged":
+            # Of a group with an estimate that no rule is about, nothing is said.
+            judged = pd.Series(stored.judged)
+            values = judged.mask(judged.isna().groupby(numbers).transform("any")).to_numpy()
+        case "measures":
+            # Of several tones the last one to settle counts; a track that never does so, later than all others.
+            measured = map(str, results.tracks)
+            tones = [tone for tone in measured if name.removeprefix("median_") in (tone, base_name(tone)[0])]
+            values = results.tracks[tones].fillna(math.inf).max(axis=1).to_numpy()
+        case "custom_measures":
+            parts = stored.export.parts("custom_measures") if stored.has("custom_measures") else []
+            values = stored.column("custom_measures")[:, parts.index(name)] if name in parts else values
+        case source:
+            values = stored.column(source) if stored.has(source) else values
+            if source == "fresh_fit_percent" and stored.has(source):
+                # Where there is no model, it fits a fresh data set infinitely badly.
+                values = np.where(np.isfinite(values), values, -np.inf)
+    return estimates.assign(value=values)
 
 
-def _errors_for(results: Results, name: str) -> pd.DataFrame:
+def _errors_for(results: Results, name: str, measure: Measure) -> pd.DataFrame:
     """Return the errors of every parameter, of one, or of the poles."""
     import pandas as pd
 
@@ -272,7 +262,7 @@ def _errors_for(results: Results, name: str) -> pd.DataFrame:
         errors = pd.concat([pole_errors(k, system_of(cells[k], name), results.members(k)) for k in groups])
     elif argument:
         errors = errors[errors["parameter"] == argument]
-    if measure_of(name, results).of_widths:
+    if measure.of_widths:
         return errors.assign(value=errors["value"].where(errors["standard_error"].notna()))
     return errors
 

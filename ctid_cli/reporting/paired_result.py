@@ -17,10 +17,11 @@ from typing import Any
 import pandas as pd
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.paired import Difference, holm, median_difference, percent_difference, rms_difference
+from ctid_cli.inference.monte_carlo import MEASURES
+from ctid_cli.inference.paired import hit_difference, holm, median_difference, rms_difference
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of
+from ctid_cli.reporting.measures import Row, label_frame, parameter_unit, parts_of, records_of, values_of
 from ctid_cli.reporting.results import Results, out_option
 from ctid_cli.reporting.table_result import TableResult, labels_of, named, notes_of
 from ctid_cli.storage.manifest import true_values
@@ -36,6 +37,7 @@ METHODS = {
     "rmse": "RMSE by the paired bootstrap (BCa)",
     "cpu": "median CPU time by the paired bootstrap (BCa)",
 }
+DIFFERENCES = {"percent": hit_difference, "rmse": rms_difference, "cpu": median_difference}
 #: Keys of a row that are no settings.
 OWN = ("first", "second", "p_value", "adjusted_p_value", "family", "failed_ids")
 
@@ -78,11 +80,17 @@ def paired_rows(results: Results, first: str, second: str) -> list[Row]:
     labels = label_frame(results)
     methods = [named(row["method"], row, options) for row in records_of(labels)]
     shared = records_of(labels.drop(columns=["method", *options]))
+    measured = [name for name in METHODS if name != "rmse" or results.is_simulated]
+    values = {name: values_of(results, name, MEASURES[name]) for name in measured}
+    # Without a rule an estimate succeeds that does not fail.
+    hits = values["percent"]["value"]
+    values["percent"]["value"] = hits.fillna(pd.Series(1.0 * ~results.stored.failures))
     for one, other in _pairs(results, first, second):
         # An estimator without a start goes with the other's.
         label = shared[other if results.place(one)[2] == "none" else one]
         label = label | {"first": methods[one], "second": methods[other]}
-        rows += [label | row for row in (*_percentages(results, one, other), *_values(results, one, other))]
+        for measure, found in values.items():
+            rows += [label | row for row in _differences(results, measure, found, (one, other))]
     for measure in METHODS:
         family = [row for row in rows if row["measure"] == measure]
         name = f"{count(len(family), 'difference')} in {measure}"
@@ -102,44 +110,24 @@ def _pairs(results: Results, first: str, second: str) -> Iterator[tuple[int, int
     yield from pairs.loc[same_start & once, ["index", "index_2"]].itertuples(index=False, name=None)
 
 
-def _percentages(results: Results, *pair: int) -> Iterator[Row]:
-    """How often each succeeds; without a rule an estimate succeeds that does not fail."""
-    sides = []
-    for group in pair:
-        own = results.members(group)
-        hits = ~own.failures if own.converged is None else own.converged
-        sides.append(pd.DataFrame({"hit": hits, "id": own.values("id")}, index=own.column("replicate")))
-    common = pd.concat([sides[0], sides[1].add_suffix("_2")], axis=1, join="inner")
-    if len(common) < FEWEST:
-        return
-    only_first, only_second = common["hit"] & ~common["hit_2"], ~common["hit"] & common["hit_2"]
-    counts = int(only_first.sum()), int(only_second.sum())
-    yield {
-        **_row("percent", None, "%", len(common), percent_difference(*counts, len(common))),
-        **dict(zip(("only_first", "only_second"), counts, strict=True)),
-        "failed_ids": common["id"][only_second].tolist(),
-    }
-
-
-def _values(results: Results, *pair: int) -> Iterator[Row]:
-    """Root mean square errors of the parameters that both estimate, and median processor times."""
-    if results.is_simulated:
-        errors = results.errors[results.errors["group"].isin(pair)]
-        names = [*true_values(results.manifest["data_cells"][results.place(pair[0])[0]])]
-        for (name,), own in parts_of(errors, "parameter"):
-            sides = own.pivot(index="replicate", columns="group", values="value").reindex(columns=pair).dropna()
-            if len(sides) >= FEWEST:
-                found = rms_difference(*sides.to_numpy().T.copy())
-                yield _row("rmse", name, parameter_unit(name, names), len(sides), found)
-    members = [results.members(group) for group in pair]
-    times = [pd.Series(own.column("cpu_seconds"), index=own.column("replicate")) for own in members]
-    both = pd.concat(times, axis=1, join="inner").dropna()
-    if len(both) >= FEWEST:
-        yield _row("cpu", None, "s", len(both), median_difference(*both.to_numpy().T.copy()))
-
-
-def _row(measure: str, parameter: str | None, unit: str, n: int, difference: Difference) -> Row:
-    return {"parameter": parameter, "measure": measure, "unit": unit, **difference._asdict(), "n": n}
+def _differences(results: Results, measure: str, values: pd.DataFrame, pair: tuple[int, int]) -> Iterator[Row]:
+    """Yield the differences of two groups in one measure, from the values of all groups."""
+    one, other = pair
+    names = [*true_values(results.manifest["data_cells"][results.place(one)[0]])]
+    for (parameter,), own in parts_of(values[values["group"].isin(pair)], "parameter"):
+        sides = own.pivot(index="replicate", columns="group", values="value").reindex(columns=pair).dropna()
+        if len(sides) < FEWEST:
+            continue
+        about = {"parameter": parameter if measure == "rmse" else None, "measure": measure}
+        unit = parameter_unit(parameter, names) if measure == "rmse" else MEASURES[measure].unit
+        difference = DIFFERENCES[measure](*sides.to_numpy().T.copy())
+        row = {**about, "unit": unit, **difference._asdict(), "n": len(sides)}
+        if measure == "percent":
+            only_second = sides.index[sides[one] < sides[other]]
+            lost = own.index[(own["group"] == one) & own["replicate"].isin(only_second)]
+            row |= {"only_first": int((sides[one] > sides[other]).sum()), "only_second": len(only_second)}
+            row["failed_ids"] = results.stored.chosen(lost.to_numpy()).values("id")
+        yield row
 
 
 def _table(frame: pd.DataFrame) -> pd.DataFrame:

@@ -85,6 +85,15 @@ class Results:
         """Errors of the parameters of simulated systems: a row for each parameter of each estimate."""
         return error_frame(self.stored, self.numbers)
 
+    @cached_property
+    def tracks(self) -> pd.DataFrame:
+        """What is measured of the frequencies of each estimate, a column for each measure; none of other estimates."""
+        import pandas as pd
+
+        if not self.stored.has("measures"):
+            return pd.DataFrame()
+        return pd.DataFrame(self.stored.column("measures"), columns=self.stored.export.parts("measures"))
+
     def place(self, group: int) -> tuple[int, int, str]:
         """Return the places of data cell and estimator of a group, and its start."""
         cell, estimator, start = self.groups.iloc[group]

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ctid_cli.reporting.document import Result, Section
 from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.study import last_part
 from ctid_cli.studies.catalogue import StudyResults
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

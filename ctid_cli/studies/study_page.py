@@ -7,7 +7,7 @@ import ctid_cli
 from ctid_cli.errors import UsageError
 from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.pages.experiment_page import experiment_page
-from ctid_cli.reporting.pages.page import Chapter, sections_of, write_page
+from ctid_cli.reporting.pages.page import Chapter, sections_of, shown, write_page
 from ctid_cli.reporting.results import experiments_in, out_option, read_results
 from ctid_cli.reporting.study import Study, all_studies
 from ctid_cli.reporting.study_table import environment_of
@@ -24,7 +24,8 @@ def page_of(name: str, out: Path) -> tuple[str, Path]:
     known, studies = experiments_in(out), all_studies()
     if name in known:
         results = read_results(out, name)
-        return experiment_page(results, out), results.folder / "report.html"
+        # The commands on a page that is sent to others name no folder of this machine.
+        return experiment_page(results, Path(shown(str(out)))), results.folder / "report.html"
     if name in studies:
         return study_page(studies[name], out), out / f"{studies[name].folder.name}_report.html"
     hint = did_you_mean(name, [*known, *studies]) or "."

@@ -15,20 +15,21 @@ BIASED = 5.0
 
 def intervals_cover(results: Results) -> Iterator[Claim]:
     """Intervals contain the truth as often as they say, by the formula that is meant for the noise."""
-    for line in coverage(results).to_dict("records"):
-        if not line["misused"]:
-            yield within(f"coverage of {line['parameter']} [%], {line['formula']} formula", line["percent"], *BAND)
+    return _covered(results, "not misused", "coverage of {parameter} [%], {formula} formula", *BAND)
 
 
 def white_formula_is_misused(results: Results) -> Iterator[Claim]:
     """Under coloured noise the formula for white noise covers too seldom."""
-    for line in coverage(results).to_dict("records"):
-        if line["misused"]:
-            yield within(f"coverage of {line['parameter']} [%], white formula misused", line["percent"], high=MISUSED)
+    return _covered(results, "misused", "coverage of {parameter} [%], white formula misused", high=MISUSED)
 
 
 def held_samples_shorten_the_delay(results: Results) -> Iterator[Claim]:
     """An input known by its samples only is held too long, which no interval covers."""
-    for line in coverage(results).to_dict("records"):
-        if line["parameter"] == "delay":
-            yield within("coverage of the delay [%], input known by its samples", line["percent"], high=BIASED)
+    claim = "coverage of the delay [%], input known by its samples"
+    return _covered(results, "parameter == 'delay'", claim, high=BIASED)
+
+
+def _covered(results: Results, lines: str, claim: str, *band: float, **bounds: float) -> Iterator[Claim]:
+    """Yield a claim about the percentage in each of some lines of the table."""
+    for line in coverage(results).query(lines).to_dict("records"):
+        yield within(claim.format(**line), line["percent"], *band, **bounds)

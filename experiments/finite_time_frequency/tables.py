@@ -21,6 +21,12 @@ TITLES = {
     "random": "Section VI-B, sin 2t + sin 3t, noise uniform in ±0.2 (figure 3)",
     "step": "Section VI-C, step of both frequencies at 30 s, no noise (figure 4)",
 }
+#: Formats of the columns that hold numbers.
+RMS = "rms error, 80 to 90 s"
+FORMATS = {
+    **dict.fromkeys(("rms w1", "rms w2", RMS, "standard deviation"), ".2g"),
+    **dict.fromkeys(("valid [%]", "valid, off by 0.05 [s]", "false alarms"), ".3g"),
+}
 
 
 def tables(found: StudyResults) -> list[Section]:
@@ -68,22 +74,17 @@ def paper_tables(results: Results) -> list[Section]:
     )
     after = {"jump": "Phase w(t) t, as printed: it jumps. ", "continuous": "Phase the integral of w(t). "}
     settled[bands] = settled[bands].apply(times)
-    settled["off"] = settled["valid_but_off_by_0.05"].map(partial(number, digits=3))
-    left["rms"], left["valid"] = (
-        left["rms"].map(partial(number, digits=2)),
-        left["valid_share"].map(partial(number, digits=3)),
-    )
     written = []
     for reading, own in left.groupby("reading", sort=False):
         of_reading = settled[settled["reading"] == reading]
         table = across(own, "tone", [1, 2], ["rms"], "rms w{0}")
         within = across(of_reading, "piece", pieces, bands, "{1}, {0}" if several else "{1}")
         within.columns = [name.replace("within_", "within " if f"{BANDS[0]:g}" in name else "") for name in within]
-        first = own.groupby("estimator")["valid"].first()
-        wrong = of_reading.drop_duplicates("estimator").set_index("estimator")["off"]
+        first = own.groupby("estimator")["valid_share"].first()
+        wrong = of_reading.drop_duplicates("estimator").set_index("estimator")["valid_but_off_by_0.05"]
         table = within.reindex(table.index).join(table).assign(**{"valid [%]": first, "valid, off by 0.05 [s]": wrong})
-        table = table.fillna("-").rename(index=named).reset_index()
-        written.append(Section(sentences=[after.get(reading, "") + explained], frame=table))
+        table = table.rename(index=named).reset_index()
+        written.append(Section(sentences=[after.get(reading, "") + explained], frame=table, formats=FORMATS))
     return written
 
 
@@ -105,11 +106,11 @@ def noisy_recovery_table(results: Results) -> Section:
         "over all data sets; rms error: median of the worse tone."
     )
     shown = pd.DataFrame({"median [s]": times(rows["median"]), "longest [s]": times(rows["longest"])})
-    shown["never"], shown["false alarms"] = rows["never"].map(str), rows["false_alarms"].map(partial(number, digits=3))
-    shown["rms error, 80 to 90 s"] = rows["rms"].map(partial(number, digits=2))
+    shown = shown.assign(**{"never": rows["never"].map(str), "false alarms": rows["false_alarms"], RMS: rows["rms"]})
     table = across(shown.join(rows[["estimator", "reading", "derived"]]), "reading", READINGS, [*shown], "{0}: {1}")
     table.columns = [name if name.endswith(": median [s]") else name.partition(": ")[2] for name in table]
-    return Section("Beyond the paper: recovery from the step in noise", [said], table.rename(index=named).reset_index())
+    table = table.rename(index=named).reset_index()
+    return Section("Beyond the paper: recovery from the step in noise", [said], table, FORMATS)
 
 
 def efficiency_table(results: Results) -> Section:
@@ -122,18 +123,15 @@ def efficiency_table(results: Results) -> Section:
         "the 20 s, for whole records share of the data sets."
     )
     shown = pd.DataFrame({"rms error / bound": _pairs(rows, "ratio", 3, 2), "bias": _pairs(rows, "bias", 2, 1)})
-    shown["standard deviation"] = rows["deviation"].map(partial(number, digits=2))
+    shown["standard deviation"] = rows["deviation"]
     table = across(shown.join(rows[["estimator", "tone", "derived"]]), "tone", [1, 2], [*shown], "w{0}: {1}")
     table.columns = [name if name.endswith("bound") else name.partition(": ")[2] for name in table]
-    valid = rows.drop_duplicates("estimator").set_index("estimator")["valid_share"].map(partial(number, digits=3))
+    valid = rows.drop_duplicates("estimator").set_index("estimator")["valid_share"]
     table = table.assign(**{"valid [%]": valid}).rename(index=named).reset_index()
-    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [said], table)
+    return Section("Beyond the paper: errors after 20 s of the noise of section VI-B", [said], table, FORMATS)
 
 
 def _pairs(rows: pd.DataFrame, name: str, digits: int, of_error: int) -> pd.Series:
     """Return values with their Monte Carlo errors as text."""
-    values, errors = (
-        rows[name].map(partial(number, digits=digits)),
-        rows[f"{name}_error"].map(partial(number, digits=of_error)),
-    )
-    return values + " ± " + errors
+    values, errors = rows[name], rows[f"{name}_error"]
+    return values.map(partial(number, digits=digits)) + " ± " + errors.map(partial(number, digits=of_error))

@@ -6,7 +6,7 @@ from importlib import resources
 import pytest
 import typer
 
-from ctid_cli.cli.init_command import TEMPLATES
+from ctid_cli.cli.experiment_commands import TEMPLATES
 from ctid_cli.cli.main import app
 from ctid_cli.specification.load import load_spec
 

@@ -9,7 +9,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.reporting.study import all_studies, find_study
+from ctid_cli.reporting.study import find_study
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.studies.catalogue import find_figures, require_results
@@ -151,12 +151,3 @@ def test_results_that_are_missing_are_named_before_anything_is_drawn(tmp_path, m
     with pytest.raises(UsageError, match=r"run first: ctid run configs/additive/open_loop\.yaml$"):
         figures[1].svg(Path("results"))
     require_results([figures[0], figures[3], *find_figures(["2"])], out)
-
-
-def test_names_of_figures():
-    names = [name for name, study in all_studies().items() if study.figures]
-    assert names == ["additive", "finite-time-frequency", "useful-redundancy"]
-    with pytest.raises(UsageError, match=r"additive has no figure 9; it has 2, 3, 4, 6$"):
-        find_figures(["additive/9"])
-    with pytest.raises(UsageError, match=r"'aditive/2' is neither.*did you mean 'additive/2'\?"):
-        find_figures(["aditive/2"])

@@ -1,12 +1,15 @@
 """Differences on the same data sets: published examples, defining equations, and how often they hold the truth."""
 
+import itertools
+from math import comb
+
 import numpy as np
 import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
 from ctid_cli.inference import paired
-from ctid_cli.inference.paired import bootstrap_difference, mcnemar, tango_interval
+from ctid_cli.inference.paired import bootstrap_difference, fisher, holm, mcnemar, smallest_detectable, tango_interval
 
 
 def root_of_mean(squares):
@@ -70,3 +73,34 @@ def test_the_p_value_of_no_difference_keeps_its_level(monkeypatch):
     assert stats.kstest(found, "uniform").pvalue > 0.01
     # The interval of so few data sets is a little short: 6 %, and what 400 of them can be off.
     assert stats.binom.cdf(np.sum(found < 0.05) - 1, 400, 0.06) < 0.999
+
+
+def hypergeometric_p(k1, n1, k2, n2):
+    """Two-sided p-value as the definition has it: all tables that are no more likely than the one found."""
+    likely = [comb(n1, k) * comb(n2, k1 + k2 - k) for k in range(max(0, k1 + k2 - n2), min(n1, k1 + k2) + 1)]
+    found = comb(n1, k1) * comb(n2, k2)
+    return sum(value for value in likely if value <= found) / sum(likely)
+
+
+@pytest.mark.parametrize(("fresh", "committed"), [((20, 20), (80, 100)), ((3, 7), (99, 100)), ((0, 5), (100, 100))])
+def test_the_p_value_is_that_of_fisher(fresh, committed):
+    assert fisher(*fresh, *committed) == pytest.approx(hypergeometric_p(*fresh, *committed))
+
+
+def test_holm_is_the_closure_of_bonferroni():
+    p = [0.001, 0.2, 0.004, 0.012, 0.012, 0.9]
+    for k, adjusted in enumerate(holm(p)):
+        subsets = (s for size in range(1, 7) for s in itertools.combinations(range(6), size) if k in s)
+        assert adjusted == pytest.approx(max(min(1.0, len(s) * min(p[j] for j in s)) for s in subsets))
+    assert list(holm([])) == []
+
+
+@pytest.mark.parametrize(("n", "reference", "m"), [(100, 100, 100), (20, 97, 100), (300, 50, 100)])
+def test_the_detectable_difference_is_found_with_80_percent_probability(n, reference, m):
+    from scipy.stats import binom
+
+    level = 1e-3
+    drop = smallest_detectable(n, reference, m, level, rise=False)
+    q = reference / m - drop / 100
+    significant = [k for k in range(n + 1) if fisher(k, n, reference, m) < level and k / n < reference / m]
+    assert binom.pmf(significant, n, q).sum() == pytest.approx(0.8, abs=1e-6)

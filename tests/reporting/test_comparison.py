@@ -1,13 +1,9 @@
 """Tables beside the committed ones and those of the article: what differs by more than chance."""
 
-import itertools
-from math import comb
-
 import pandas as pd
 import pytest
 
 from ctid_cli.errors import UsageError
-from ctid_cli.inference.paired import fisher, holm, smallest_detectable
 from ctid_cli.reporting.comparison_result import LEVEL, check_tables, compare
 from ctid_cli.reporting.study import find_study
 
@@ -35,29 +31,6 @@ def row(converged=100, n=100, **changes):
         "published_percent": None,
         "median_seconds": 0.02,
     } | changes
-
-
-def hypergeometric_p(k1, n1, k2, n2):
-    """Two-sided p-value as the definition has it: all tables that are no more likely than the one found."""
-    likely = [comb(n1, k) * comb(n2, k1 + k2 - k) for k in range(max(0, k1 + k2 - n2), min(n1, k1 + k2) + 1)]
-    found = comb(n1, k1) * comb(n2, k2)
-    return sum(value for value in likely if value <= found) / sum(likely)
-
-
-@pytest.mark.parametrize(("fresh", "committed"), [((20, 20), (80, 100)), ((3, 7), (99, 100)), ((0, 5), (100, 100))])
-def test_the_p_value_is_that_of_fisher(fresh, committed):
-    (cell,) = compare(table(row(*fresh)), table(row(*committed)), STUDY).content()["cells"]
-    assert cell["p_value"] == pytest.approx(hypergeometric_p(*fresh, *committed))
-    percents = 100 * fresh[0] / fresh[1], 100 * committed[0] / committed[1]
-    assert (cell["percent"], cell["reference_percent"]) == pytest.approx(percents)
-
-
-def test_holm_is_the_closure_of_bonferroni():
-    p = [0.001, 0.2, 0.004, 0.012, 0.012, 0.9]
-    for k, adjusted in enumerate(holm(p)):
-        subsets = (s for size in range(1, 7) for s in itertools.combinations(range(6), size) if k in s)
-        assert adjusted == pytest.approx(max(min(1.0, len(s) * min(p[j] for j in s)) for s in subsets))
-    assert list(holm([])) == []
 
 
 def test_the_same_tables_agree_cell_by_cell():
@@ -132,14 +105,3 @@ def test_without_any_results_it_says_what_to_run(tmp_path):
     with pytest.raises(UsageError, match="none of these cells was run") as error:
         check_tables([], tmp_path)
     assert "ctid run configs/useful_redundancy/case1_regular.yaml" in str(error.value)
-
-
-@pytest.mark.parametrize(("n", "reference", "m"), [(100, 100, 100), (20, 97, 100), (300, 50, 100)])
-def test_the_detectable_difference_is_found_with_80_percent_probability(n, reference, m):
-    from scipy.stats import binom
-
-    level = 1e-3
-    drop = smallest_detectable(n, reference, m, level, rise=False)
-    q = reference / m - drop / 100
-    significant = [k for k in range(n + 1) if fisher(k, n, reference, m) < level and k / n < reference / m]
-    assert binom.pmf(significant, n, q).sum() == pytest.approx(0.8, abs=1e-6)

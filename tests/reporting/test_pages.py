@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ctid_cli.reporting.document import Section, render_markdown
+from ctid_cli.reporting.document import Section, render_markdown, render_text
 from ctid_cli.reporting.pages.experiment_page import experiment_page
 from ctid_cli.reporting.pages.page import ROWS, Chapter, inline, sections_of, write_page
 from ctid_cli.reporting.pages.question import formula_of, polynomial
@@ -88,3 +88,13 @@ def test_styles_are_those_of_print_and_phones():
     assert "@media print" in css
     assert "overflow-x: auto" in css
     assert "http" not in css
+
+
+def test_a_table_that_is_too_wide_goes_on_below_with_what_tells_its_rows_apart():
+    frame = pd.DataFrame(
+        {"SNR": ["5 dB", "", "15 dB"], "start": ["3 s", "7 s", "3 s"], "%": [1, 2, 3], "time": [4, 5, 6]}
+    )
+    assert render_text([Section(frame=frame)], 17).splitlines() == [
+        *("  SNR  start  %", "---------------", " 5 dB    3 s  1", "         7 s  2", "15 dB    3 s  3", ""),
+        *("  SNR  start  time", "------------------", " 5 dB    3 s     4", "         7 s     5", "15 dB    3 s     6"),
+    ]

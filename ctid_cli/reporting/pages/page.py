@@ -11,9 +11,9 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import ctid_cli
-from ctid_cli.reporting import markup
 from ctid_cli.reporting.document import Result, Section, aligned_lines, pairs
 from ctid_cli.reporting.figures.style import Drawing
+from ctid_cli.reporting.layout import html_paragraphs, html_table
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -58,7 +58,7 @@ def _template() -> Template:
 def _paragraphs(sentences: Sequence[str], style: str = "") -> Markup:
     from markupsafe import Markup
 
-    return Markup(markup.paragraphs(sentences, style))
+    return Markup(html_paragraphs(sentences, style))
 
 
 def _table(section: Section) -> Markup:
@@ -66,7 +66,7 @@ def _table(section: Section) -> Markup:
     from markupsafe import Markup
 
     lines, sides = aligned_lines(section)
-    return Markup(markup.table(lines[: ROWS + 1], sides))
+    return Markup(html_table(lines[: ROWS + 1], sides))
 
 
 def _drawn(drawing: Drawing | bytes, name: str) -> Markup:
