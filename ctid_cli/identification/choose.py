@@ -122,7 +122,7 @@ class _Choosing:
         given, treated = self.given, ranking.best.options
         degrees: Any = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
         options = replace(treated, **degrees, delay_bounds=delays, inputs=given.inputs)
-        said = sentences.of_range(ranking, delays, given, self.time_unit)
+        said = sentences.of_range(delays, given, self.time_unit)
         return self._chosen(options, setting, ranking, said)
 
     def _chosen(self, options: DelayProfile, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
