@@ -124,7 +124,7 @@ class _Choosing:
         degrees = {"poles": given.poles, "zeros": given.zeros or 0, "integrators": given.integrators or 0}
         own: Any = {**degrees, "delay_bounds": delays, "inputs": given.inputs}
         options = replace(treated, **own)
-        said = sentences.of_range(ranking, delays, given, self.time_unit)
+        said = sentences.of_range(delays, given, self.time_unit)
         return self._chosen(options, setting, ranking, said)
 
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:

@@ -5,7 +5,6 @@ from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.criterion import PENALTY, Candidate, Ranking, Searched
-from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.text import count, listed
 
 #: What is said where the beginning of a record is not looked at.
@@ -94,15 +93,14 @@ def of_grid(ranking: Ranking, delays: tuple[float, float], given: Given, time_un
     found = []
     if other is not None:
         found.append(f"Structure: {spelled(best.options)}; {_below(ranking, other, other.name)}.")
-    return found + _too_large(ranking) + of_range(ranking, delays, given, time_unit)
+    return found + _too_large(ranking) + of_range(delays, given, time_unit)
 
 
-def of_range(ranking: Ranking, delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
+def of_range(delays: tuple[float, float], given: Given, time_unit: str) -> list[str]:
     """Return the range of the delay where it was chosen."""
     if given.delays_given is not None:
         return []
-    at = listed(f"{delay:.4g}" for delay in delays_of(ranking.best.fit.model))
-    return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay), found at {at} {time_unit}."]
+    return [f"Delay: searched from 0 to {delays[1]:g} {time_unit} (--delay)."]
 
 
 def _too_large(ranking: Ranking) -> list[str]:
