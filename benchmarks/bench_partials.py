@@ -126,11 +126,10 @@ def compare(file, windows):
         kept_in, kept_at = near[inside].any(axis=(0, 1)), near[middle].any(axis=0)
         for name, which in (("20 dB", decibels >= STRONG_DB), ("10 to 20 dB", decibels < STRONG_DB)):
             close = which & ~kept_in & (apart.min(axis=1) < CLOSE_HZ)
-            print(
-                f"  from {begin * record.interval:.2f} s, {name:11}: {which.sum():3} partials, kept {(which & kept_in).sum():3}"
-                f" ({(which & kept_at).sum():3} at the middle); lost within {CLOSE_HZ:g} Hz of another {close.sum():3}",
-                flush=True,
-            )
+            kept = f"kept {(which & kept_in).sum():3} ({(which & kept_at).sum():3} at the middle)"
+            lost = f"lost within {CLOSE_HZ:g} Hz of another {close.sum():3}"
+            start = f"from {begin * record.interval:.2f} s"
+            print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}; {lost}", flush=True)
 
 
 def main():
