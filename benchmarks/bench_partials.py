@@ -2,10 +2,11 @@
 
     python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4]
 
-In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra. Peaks
-of what is left join where they are 10 dB above the local floor, a running median. Of the partials that stand 10 dB above
-the floor in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or anywhere in
-it. No two valid readings of one row should be within one bin of their windows. A window takes up to two minutes.
+In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
+Peaks of what is left join where they are 10 dB above the local floor, a running median. Of the partials that stand 10
+dB above the floor in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or
+anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up to two
+minutes.
 """
 
 import argparse
