@@ -9,7 +9,7 @@ from numba.core import event
 
 #: Compilation that takes longer than this in all is announced [s].
 SILENT = 2.0
-ANNOUNCEMENT = "ctid: compiling numerical routines, about 20 s; this happens once after an installation or an update"
+ANNOUNCEMENT = "ctid: compiling numerical routines, up to 20 s; this happens once after an installation or an update"
 
 
 class CompilationNotice(event.Listener):

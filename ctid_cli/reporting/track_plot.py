@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 TURN = 2.0 * np.pi
 #: Up to this number of tones get a panel each, which shows how far they move; more share one.
 MOST_PANELS = 5
+#: A legend of more tones would be longer than the figure.
+MOST_NAMED = 16
 #: The axis of a panel shows the central part of the valid rows, and so much more on both sides.
 SHOWN_PERCENT = 98.0
 MARGIN = 0.35
@@ -94,7 +96,7 @@ def _draw_amplitudes(axes: Any, track: Track, t: Array, colours: list[Any]) -> N
         axes.set_ylim(bottom=0.5 * float(seen.min()))
     elif seen.size:
         axes.set_ylim(0.0, 1.1 * float(seen.max()))
-    if len(colours) > 1:
+    if 1 < len(colours) <= MOST_NAMED:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=7)
     _shade(axes, t, np.asarray(~track.valid.any(axis=1)))
 

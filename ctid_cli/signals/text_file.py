@@ -128,7 +128,10 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
             head = content.read(HEAD_BYTES)
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    # The mark of UTF-32 begins with that of UTF-16.
+    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
+        encodings = ["utf-32"]
+    elif head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encodings = ["utf-16"]
     else:
         encodings = ["utf-8-sig", "cp1252"] if b"\0" not in head else []

@@ -32,6 +32,7 @@ READ = {
     "commas, quoted decimal commas": ('t,u,y\n"0","1","0,25"\n"0,5","-1,5",""\n"1","2","3"\n', (COMMA,)),
     "UTF-8 with its mark": (POINTS.format(",").encode("utf-8-sig"), ()),
     "UTF-16": (POINTS.format(",").encode("utf-16"), ()),
+    "UTF-32": (POINTS.format(",").encode("utf-32"), ()),
     "Windows-1252": ("t [s],u [°C],y\n0,1,.25\n0.5,-1.5,\n1,2,3".encode("cp1252"), (ANSI,)),
     "CRLF, no end of the last line": (POINTS.format(",").replace("\n", "\r\n").rstrip(), ()),
     "CR": (POINTS.format(",").replace("\n", "\r"), ()),

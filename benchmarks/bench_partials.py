@@ -1,0 +1,146 @@
+"""Partials of recorded notes: those of an independent fit, and how many of them a track keeps.
+
+    python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4]
+
+In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
+Peaks of what is left join where they are 10 dB above the local floor, a running median. Of the partials that stand 10
+dB above the floor in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or
+anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up to two
+minutes.
+"""
+
+import argparse
+
+import numpy as np
+
+from ctid_cli.signals.sampled_signal import read_sampled_signal
+from ctid_cli.tones.track import track
+
+#: Least power above the floor [dB], bins of the running median and on either side of a joining peak that wait for the
+#: next round, peaks that join at once, and points of the periodogram for each bin.
+LEAST_DB, FLOOR_BINS, WAITING, TOGETHER, PADDING = 10.0, 51, 10, 8, 4
+ROUNDS, STEPS = 25, 10
+MOST_GROWTH, MOST_BEND, LONGEST_STEP = 4.0, 8.0, 2.0
+KEPT_HZ, CLOSE_HZ, STRONG_DB = 0.3, 2.0, 20.0
+EVERY = 0.005
+
+
+def model(u, parameters):
+    """Sum of the tones ``exp(g u) (a cos + b sin)(w u + c u^2)``, and its derivatives, shape (N, 5 n)."""
+    a, b, g, w, c = parameters
+    angle, grown = np.outer(u, w) + np.outer(u**2, c), np.exp(np.outer(u, g))
+    cosine, sine = grown * np.cos(angle), grown * np.sin(angle)
+    value, turned = a * cosine + b * sine, b * cosine - a * sine
+    u = u[:, None]
+    return value.sum(axis=1), np.concatenate((cosine, sine, u * value, u * turned, u**2 * turned), axis=1)
+
+
+def fit(y, parameters):
+    """Return fitted parameters, shape (5, n), and what they leave."""
+    u = np.linspace(-1.0, 1.0, y.size)
+    value, slopes = model(u, parameters)
+    left, damping = y - value, 1e-3
+    for _ in range(STEPS):
+        gram, right = slopes.T @ slopes, slopes.T @ left
+        while damping < 1e6:
+            step = np.linalg.solve(gram + damping * np.diag(np.diag(gram) + 1e-30), right).reshape(5, -1)
+            trial = parameters + step
+            trial[2] = np.clip(trial[2], -MOST_GROWTH, MOST_GROWTH)
+            trial[4] = np.clip(trial[4], -MOST_BEND, MOST_BEND)
+            value, new = model(u, trial)
+            rest = y - value
+            if np.abs(step[3]).max() < LONGEST_STEP and rest @ rest < left @ left:
+                break
+            damping *= 10.0
+        else:
+            break
+        gained = 1.0 - (rest @ rest) / (left @ left)
+        parameters, slopes, left, damping = trial, new, rest, max(0.1 * damping, 1e-9)
+        if gained < 1e-6:
+            break
+    return parameters, left
+
+
+def floor_at(left, bins):
+    """Return the local floor of a periodogram at some places [bins]."""
+    power = np.abs(np.fft.rfft(left)) ** 2 / left.size
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(power, FLOOR_BINS // 2, mode="reflect"), FLOOR_BINS)
+    return np.interp(bins, np.arange(power.size), np.median(windows, axis=1) / np.log(2.0))
+
+
+def joining(left, there):
+    """Return the strongest peaks [bins] that are 10 dB above the floor, not within a bin of what is there."""
+    power = np.abs(np.fft.rfft(left, PADDING * left.size)) ** 2 / left.size
+    bins = np.arange(power.size) / PADDING
+    ratio = power / floor_at(left, bins)
+    ratio[bins < 2.0] = 0.0
+    for place in there:
+        ratio[np.abs(bins - place) <= 1.0] = 0.0
+    found = []
+    while len(found) < TOGETHER and ratio.max() > 10.0 ** (0.1 * LEAST_DB):
+        found.append(bins[ratio.argmax()])
+        ratio[np.abs(bins - found[-1]) <= WAITING] = 0.0
+    return np.array(found)
+
+
+def partials(y):
+    """Return frequencies [bins] and powers over the floor [dB] of the partials of a window."""
+    y = y - y.mean()
+    left, parameters = y, np.zeros((5, 0))
+    for _ in range(ROUNDS):
+        found = joining(left, parameters[3] / np.pi)
+        if not found.size:
+            break
+        new = np.zeros((5, found.size))
+        new[3] = np.pi * found
+        parameters, left = fit(y, np.concatenate((parameters, new), axis=1))
+    bins, twice = parameters[3] / np.pi, 2.0 * parameters[2] + 1e-9
+    mean_square = 0.5 * (parameters[0] ** 2 + parameters[1] ** 2) * np.sinh(twice) / twice
+    decibels = 10.0 * np.log10(mean_square * y.size / 2.0 / floor_at(left, bins))
+    return bins[decibels > LEAST_DB], decibels[decibels > LEAST_DB]
+
+
+def readings_twice(hertz, valid, window):
+    """Return how many valid readings of one row are within one bin of another."""
+    count = 0
+    for row, here in enumerate(valid):
+        order = np.flatnonzero(here)[np.argsort(hertz[row, here])]
+        shorter = np.minimum(window[row, order[1:]], window[row, order[:-1]])
+        count += int((np.diff(hertz[row, order]) * shorter < 1.0).sum())
+    return count
+
+
+def compare(file, windows):
+    """Print, for each window of a record, the partials of the fit and those that the track keeps."""
+    record = read_sampled_signal(file).in_seconds()
+    found = track(record, every=EVERY)
+    hertz = np.where(found.valid, found.omega / (2.0 * np.pi), np.nan)
+    twice = readings_twice(hertz, found.valid, found.window)
+    print(f"{file}: {hertz.shape[1]} tones, {int(found.valid.sum())} valid readings, {twice} of them twice")
+    size = round(1.0 / record.interval)
+    for begin in np.linspace(0, record.samples.size - size, windows).astype(int):
+        bins, decibels = partials(record.samples[begin : begin + size])
+        apart = np.abs(bins[:, None] - bins) + np.where(np.eye(bins.size), np.inf, 0.0)
+        instants = found.t - begin * record.interval
+        inside, middle = (instants >= 0.0) & (instants <= 1.0), int(np.abs(instants - 0.5).argmin())
+        near = np.abs(hertz[:, :, None] - bins) < KEPT_HZ
+        kept_in, kept_at = near[inside].any(axis=(0, 1)), near[middle].any(axis=0)
+        for name, which in (("20 dB", decibels >= STRONG_DB), ("10 to 20 dB", decibels < STRONG_DB)):
+            close = which & ~kept_in & (apart.min(axis=1) < CLOSE_HZ)
+            kept = f"kept {(which & kept_in).sum():3} ({(which & kept_at).sum():3} at the middle)"
+            lost = f"lost within {CLOSE_HZ:g} Hz of another {close.sum():3}"
+            start = f"from {begin * record.interval:.2f} s"
+            print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}; {lost}", flush=True)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="+")
+    parser.add_argument("--windows", type=int, default=4)
+    given = parser.parse_args()
+    for file in given.files:
+        compare(file, given.windows)
+
+
+if __name__ == "__main__":
+    main()
