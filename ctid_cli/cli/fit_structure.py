@@ -333,8 +333,7 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
             raise UsageError(f"{option} is not available for {_what(asked)}; {remedy}")
     needing = [("--loop", asked.simulated), ("--reference", asked.iterated)]
     for option in [name for name, given in needing if given][:1] if model.terms is None and model.poles is None else ():
-        missing = "--poles" if model.model == "fraction" else "--terms"
-        raise UsageError(f"{missing} is missing: with {option} it must be given")
+        raise UsageError(f"{_degrees(model)} is missing: with {option} it must be given")
     state: Any = treatment.initial_state or "rest"
     offset: Any = treatment.offset or "none"
     bounds = model.bounds or (0.0, 0.0)
@@ -359,6 +358,11 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
     return _given(asked)
 
 
+def _degrees(model: ModelOptions) -> str:
+    """Return the option that gives the degrees of a model."""
+    return "--poles" if model.model == "fraction" else "--terms"
+
+
 def _given(asked: Asked) -> Given:
     """Return what is given of the choice, and of each of several inputs; its delay may be known by ``--fix`` too."""
     model, treatment = asked.model, asked.treatment
@@ -375,7 +379,7 @@ def _given(asked: Asked) -> Given:
     poles = model.poles if model.poles is not None else max(own_poles, default=None)
     for option, needed in {"--fix": bool(model.fix), "the zeros of single inputs": own_zeros}.items():
         if needed and poles is None:
-            raise UsageError(f"--poles is missing: with {option} it must be given")
+            raise UsageError(f"{_degrees(model)} is missing: with {option} it must be given")
     # The names of known parameters are those of a number of zeros.
     zeros = 0 if model.zeros is None and (model.fix or own_poles or own_zeros) else model.zeros
     given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed)

@@ -27,7 +27,7 @@ class ExternalFit(Estimator):
     patience: float = 60.0
 
     def fit(self, record, start):
-        table, columns = io.StringIO(), (record.t, record.inputs[0].at(record.t), record.y)
+        table, columns = io.StringIO(), (record.t, record.input.at(record.t), record.y)
         np.savetxt(table, np.column_stack(columns), delimiter=",", header="t,u,y", comments="")
         done = subprocess.run(TOOL, input=table.getvalue(), capture_output=True, text=True, timeout=self.patience)
         if done.returncode:

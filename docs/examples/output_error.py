@@ -27,7 +27,7 @@ class OutputError(Estimator):
 
         def error(theta):
             b0, a1, delay = theta
-            x = simulate(TransferFunction([b0], [1.0, a1], delay), record.inputs[0], record.t)
+            x = simulate(TransferFunction([b0], [1.0, a1], delay), record.input, record.t)
             return x[used] - record.y[used]
 
         delay = 0.5 * self.greatest_delay if start is None else start.delay

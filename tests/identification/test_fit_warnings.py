@@ -82,7 +82,7 @@ MENDED = {
         "The delay lies at the end of its range, 1 s: with --delay ",
     ),
     "the wrong hold": (record_of(hold="foh", read_as="zoh", interval=0.8), KNOWN, "with --hold foh the held-back"),
-    "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4, ... s)"),
+    "outliers": (spoilt(CLEAN, FEW, 50 * NOISE), KNOWN, "15 output samples are outliers (t = 8, 20.2, 32.4 s, ...)"),
     "an offset": (changed(CLEAN, CLEAN.y + 0.3), KNOWN, "with --offset estimate the held-back fit is"),
     "a drift": (DRIFTING, KNOWN, "with --offset drift the held-back fit is"),
     "a step of one pole too few": (step_of(20.0), FIRST_ORDER, "with --poles 2 --zeros 0 BIC is"),

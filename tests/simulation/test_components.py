@@ -101,7 +101,7 @@ def set_flags(record):
 
 
 def write(record):
-    record.inputs[0].values[:] = 0.0
+    record.input.values[:] = 0.0
 
 
 def replaced(record):
