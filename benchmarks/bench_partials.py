@@ -3,8 +3,8 @@
     python benchmarks/bench_partials.py guitar_E2.csv [more.csv] [--windows 4]
 
 In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
-Peaks of what is left join where they are 10 dB above the local floor, a running median. Of the partials that stand 10
-dB above the floor in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or
+Peaks of what is left join where they are 10 dB above the noise floor, a running median. Of the partials that stand 10
+dB above it in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or
 anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up to two
 minutes.
 """
@@ -16,8 +16,8 @@ import numpy as np
 from ctid_cli.signals.sampled_signal import read_sampled_signal
 from ctid_cli.tones.track import track
 
-#: Least power above the floor [dB], bins of the running median and on either side of a joining peak that wait for the
-#: next round, peaks that join at once, and points of the periodogram for each bin.
+#: Least power above the noise floor [dB], bins of the running median and on either side of a joining peak that wait for
+#: the next round, peaks that join at once, and points of the periodogram for each bin.
 LEAST_DB, FLOOR_BINS, WAITING, TOGETHER, PADDING = 10.0, 51, 10, 8, 4
 ROUNDS, STEPS = 25, 10
 MOST_GROWTH, MOST_BEND, LONGEST_STEP = 4.0, 8.0, 2.0
@@ -61,18 +61,18 @@ def fit(y, parameters):
     return parameters, left
 
 
-def floor_at(left, bins):
-    """Return the local floor of a periodogram at some places [bins]."""
+def noise_floor(left, bins):
+    """Return the noise floor of a periodogram at some places [bins]."""
     power = np.abs(np.fft.rfft(left)) ** 2 / left.size
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(power, FLOOR_BINS // 2, mode="reflect"), FLOOR_BINS)
     return np.interp(bins, np.arange(power.size), np.median(windows, axis=1) / np.log(2.0))
 
 
 def joining(left, there):
-    """Return the strongest peaks [bins] that are 10 dB above the floor, not within a bin of what is there."""
+    """Return the strongest peaks [bins] that are 10 dB above the noise floor, not within a bin of what is there."""
     power = np.abs(np.fft.rfft(left, PADDING * left.size)) ** 2 / left.size
     bins = np.arange(power.size) / PADDING
-    ratio = power / floor_at(left, bins)
+    ratio = power / noise_floor(left, bins)
     ratio[bins < 2.0] = 0.0
     for place in there:
         ratio[np.abs(bins - place) <= 1.0] = 0.0
@@ -84,7 +84,7 @@ def joining(left, there):
 
 
 def partials(y):
-    """Return frequencies [bins] and powers over the floor [dB] of the partials of a window."""
+    """Return frequencies [bins] and powers over the noise floor [dB] of the partials of a window."""
     y = y - y.mean()
     left, parameters = y, np.zeros((5, 0))
     for _ in range(ROUNDS):
@@ -96,7 +96,7 @@ def partials(y):
         parameters, left = fit(y, np.concatenate((parameters, new), axis=1))
     bins, twice = parameters[3] / np.pi, 2.0 * parameters[2] + 1e-9
     mean_square = 0.5 * (parameters[0] ** 2 + parameters[1] ** 2) * np.sinh(twice) / twice
-    decibels = 10.0 * np.log10(mean_square * y.size / 2.0 / floor_at(left, bins))
+    decibels = 10.0 * np.log10(mean_square * y.size / 2.0 / noise_floor(left, bins))
     return bins[decibels > LEAST_DB], decibels[decibels > LEAST_DB]
 
 

@@ -507,10 +507,8 @@ def _period(record: Record) -> float:
 
 def _one_period(data: FilterData, period: float) -> FilterData:
     """Return the record with the breaks of its input within one period."""
-    within, data = (
-        data.tu < data.tu[0] + period * (1 - 1e-9),
-        data._replace(further=tuple(_one_period(one, period) for one in data.further)),
-    )
+    data = data._replace(further=tuple(_one_period(one, period) for one in data.further))
+    within = data.tu < data.tu[0] + period * (1 - 1e-9)
     if within.all():
         return data
     # A regular pass takes a break for each sample.

@@ -11,8 +11,11 @@ from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.identification.criterion import Candidate, Ranking, in_order
 from ctid_cli.inference.criteria import percent_from_r_squared
+from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record
 
+#: Where a fit begins: a denominator without integrators, and a delay [s].
+Near = tuple[Array, float]
 #: Blocks of all records that are held back, each once, and groups in which they are: the last group is what comes at
 #: the end. The standard error of ten differences has a relative error of 24 %.
 BLOCKS, FOLDS = 10, 5
@@ -84,7 +87,12 @@ def long_enough(records: Sequence[Record]) -> bool:
     return float(np.mean(moving)) >= MOVING
 
 
-def held_back_errors(options: DelayProfile, records: Sequence[Record], near: tuple[Array, float]) -> list[Array]:
+def near_model(model: TransferFunction, integrators: int) -> Near:
+    """Return where a fit begins that starts from a model."""
+    return model.denominator[: model.denominator.size - integrators], model.delay
+
+
+def held_back_errors(options: DelayProfile, records: Sequence[Record], near: Near) -> list[Array]:
     """Return the output errors of all blocks, each from a fit without its outputs; NaN elsewhere, each of shape (N,).
 
     The input and the state are carried through a block that is held back. Fits begin at the denominator and delay of
@@ -132,11 +140,10 @@ def standing(ranking: Ranking, records: Sequence[Record]) -> Ranking:
 
 def _unseen(candidate: Candidate, records: Sequence[Record]) -> float:
     """Return the mean squared error of blocks that are held back, over that of the fit; infinity where it fails."""
-    model, fit = candidate.fit.model, candidate.fit
-    assert isinstance(candidate.options, DelayProfile)
-    alone = model.denominator[: model.denominator.size - candidate.options.integrators]
+    options, fit = candidate.options, candidate.fit
+    assert isinstance(options, DelayProfile)
     try:
-        errors = np.concatenate(held_back_errors(candidate.options, records, (alone, model.delay)))
+        errors = np.concatenate(held_back_errors(options, records, near_model(fit.model, options.integrators)))
     except CtidError:
         return float("inf")
     return float(np.nanmean(errors**2)) / max(fit.cost, np.finfo(float).tiny)

@@ -17,7 +17,7 @@ from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.candidates import with_hold
 from ctid_cli.identification.criterion import noise_of, penalised
-from ctid_cli.identification.held_back import compared, held_back_errors, long_enough
+from ctid_cli.identification.held_back import Near, compared, held_back_errors, long_enough, near_model
 from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.signal_features import input_moves, residual_outliers
 from ctid_cli.models.additive import Term, terms_text
@@ -45,8 +45,6 @@ DAMPING = 0.3
 #: Estimators of sums of submodels.
 SUMS = MeasuredSubmodels | AdditiveOutputError
 Kind = Literal["loss", "structure", "delay", "hold", "treatment"]
-#: Where a local search begins: a denominator without its integrators, and a delay [s].
-Near = tuple[Array, float]
 
 
 @dataclass(frozen=True)
@@ -101,8 +99,7 @@ class Trial:
     @property
     def near(self) -> Near:
         """Where its model is."""
-        model = self.fit.model
-        return model.denominator[: model.denominator.size - self.options.integrators], model.delay
+        return near_model(self.fit.model, self.options.integrators)
 
     @property
     def starts(self) -> tuple[Near, ...]:

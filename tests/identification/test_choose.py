@@ -111,7 +111,7 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
 
 @pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
 def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
-    # Blocks are predicted by a model with an error that is so many times that of its fit.
+    # Blocks are predicted with this ratio of the squared error to that of the fit.
     record = record_of(SECOND)
     best = choose(record).ranking.best
     sizes = {4: unseen, 3: 1.2, 2: 1.0}
