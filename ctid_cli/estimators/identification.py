@@ -159,7 +159,7 @@ class Identification(DeferredFields, FittedModel, Shown):
     @property
     def driver(self) -> str:
         """What residuals are tested against: the input, or the reference of a loop."""
-        return self.tests[0].driver if self.tests else "input"
+        return "reference" if any(test.driver == "reference" for test in self.tests) else "input"
 
     def predict(self, record: Record, ahead: int = 1) -> Array:
         """Predict the output of a record from its input and from outputs that are some samples old.
@@ -331,9 +331,10 @@ def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> t
     for record, eps, psi, use in zip(records, fit.residuals, fit.sensitivities, fit.used, strict=True):
         if eps.size >= FEWEST_TESTED:
             acting = options._acting(record)
-            for signal, delay in zip(acting.held.values(), delays, strict=True):
+            role = "input" if acting is record else "reference"
+            for (name, signal), delay in zip(acting.held.items(), delays, strict=True):
                 tests = residual_tests(eps, signal.at(record.t[use] - delay), level=level, sensitivities=psi)
-                found.append(tests if acting is record else replace(tests, driver="reference"))
+                found.append(replace(tests, driver=f"{role} {name}" if acting.several else role))
     return tuple(found)
 
 

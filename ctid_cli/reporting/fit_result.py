@@ -74,8 +74,6 @@ LOSSES = {"huber": "Huber's", "tukey": "Tukey's biweight"}
 class FitResult(PagedResult):
     """A fit with the records that it was made from."""
 
-    fine = "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."
-
     fitted: Identification
     records: Records
     #: How many samples ahead predictions are judged besides.
@@ -86,6 +84,14 @@ class FitResult(PagedResult):
         """Return the result of a fit that was made in Python, whose records are in memory."""
         other = None if fitted.validation is None else Measurement.of(fitted.validation.record)
         return cls(fitted, Records([Measurement.of(record) for record in fitted.records], other))
+
+    @property
+    def fine(self) -> str:
+        """What is said where nothing is to be warned of."""
+        fit = self.fitted.fit
+        if isinstance(fit, MultiInputFit) or fit.noise is not None:
+            return "The search ended well, and the residuals pass their tests; changes of the model were not tried."
+        return "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."
 
     @property
     def units(self) -> Units:
@@ -119,7 +125,8 @@ class FitResult(PagedResult):
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and how well the model simulates."""
         fit, validation = self.fitted.fit, self.fitted.validation
-        lead = f"{spelled(self.fitted.options)}: simulates {number(fit.fit_percent, 4)} % of "
+        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures())
+        lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
         lead += count(fit.count, "sample")
         if validation is not None:
             lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
@@ -189,15 +196,21 @@ class FitResult(PagedResult):
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
+    def _structures(self) -> list[tuple[str, Options]]:
+        """Return what was asked of each of several inputs, by its name; of one input without a name."""
+        fit, options = self.fitted.fit, self.fitted.options
+        if isinstance(fit, MultiInputFit) and isinstance(options, DelayProfile):
+            names = list(fit.model.parts)
+            return list(zip(names, options._each(names), strict=True))
+        return [("", options)]
+
     def structure(self) -> Iterator[tuple[str, str]]:
         """Return the structure of the model, and what of it was known."""
-        fit, options, units = self.fitted.fit, self.fitted.options, self.units
-        if isinstance(fit, MultiInputFit) and isinstance(options, DelayProfile):
+        options = self.fitted.options
+        if isinstance(self.fitted.fit, MultiInputFit) and isinstance(options, DelayProfile):
             yield "model", "common denominator" if options.common else "a denominator for each input"
-            for name, own in zip(fit.model.parts, options._each(list(fit.model.parts)), strict=True):
-                yield f"input {name}", f"{spelled(own)}; delay {_searched(own, units)}"
-        else:
-            yield "model", f"{spelled(options)}; delay {_searched(options, units)}"
+        for name, own in self._structures():
+            yield f"input {name}" if name else "model", f"{spelled(own)}; delay {_searched(own, self.units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
@@ -229,11 +242,10 @@ class FitResult(PagedResult):
         if isinstance(fit, SubmodelsFit):
             yield from fit.conditions
         yield from self.search()
-        names = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
+        inputs = len(fractions_of(fit.model))
         for k, test in enumerate(self.fitted.tests):
-            record, place = divmod(k, len(names))
-            number_of = f" {record + 1}" * (len(fit.residuals) > 1)
-            yield f"{fit.left_over}{number_of}", _tested(test, f"{test.driver} {names[place]}".strip())
+            number_of = f" {k // inputs + 1}" * (len(fit.residuals) > 1)
+            yield f"{fit.left_over}{number_of}", _tested(test)
 
     def search(self) -> Iterator[tuple[str, str]]:
         """Return how the search went, and the bounds of the admissible models where it ended at them."""
@@ -367,10 +379,10 @@ def _loss_text(fit: MeasuredFit, weighting: Weighting, records: Sequence[Record]
     return f"{text}; {samples}, at {'; '.join(listed)}; fit {without} % without them"
 
 
-def _tested(test: ResidualTests, driver: str) -> str:
+def _tested(test: ResidualTests) -> str:
     """Return the outcome of the tests of residuals; the warnings say what to do."""
     white = "white" if test.white else "not white"
-    free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {driver}"
+    free = f"{'independent of' if test.uncorrelated else 'dependent on'} the {test.driver}"
     return f"{white} ({probability(test.whiteness_p_value)}), {free} ({probability(test.cross_p_value)})"
 
 

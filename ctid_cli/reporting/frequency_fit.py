@@ -42,7 +42,10 @@ FIT_DEFINITION = "100 (1 - ||W (G - M)|| / ||W G||)"
 class FrequencyFitResult(FitResult):
     """A fit to a frequency response."""
 
-    fine = "The search ended well, and the residuals agree with what is known of the data."
+    @property
+    def fine(self) -> str:
+        """What is said where nothing is to be warned of."""
+        return "The search ended well, and the residuals agree with what is known of the data."
 
     @classmethod
     def of(cls, fitted: Identification) -> FrequencyFitResult:

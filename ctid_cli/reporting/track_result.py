@@ -34,12 +34,18 @@ class TrackResult(PagedResult):
     """Tones over time, with the signal that they were found in, where it is known."""
 
     schema = "ctid-track-1"
-    fine = "Nothing that was tested speaks against these tones: nearly all rows are valid, and no line is left over."
 
     track: Track
     signal: SampledSignal | None = None
     #: Largest standard error of a valid row that was asked for [Hz].
     accuracy: float | None = None
+
+    @property
+    def fine(self) -> str:
+        """What is said where nothing is to be warned of."""
+        return (
+            "Nothing that was tested speaks against these tones: nearly all rows are valid, and no line is left over."
+        )
 
     def sections(self) -> list[Section]:
         """Return what was read and chosen, the tones, and warnings."""

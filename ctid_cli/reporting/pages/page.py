@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ctid_cli
 from ctid_cli.reporting.document import Result, Section, aligned_lines, pairs
@@ -102,8 +102,10 @@ def shown_command(command: str | None) -> str:
 class PagedResult(Result):
     """A result of a record that has a page: what it is, whether to believe it, and how to get it again."""
 
-    #: What stands in the place of warnings.
-    fine: ClassVar[str]
+    @property
+    @abstractmethod
+    def fine(self) -> str:
+        """What stands in the place of warnings."""
 
     @abstractmethod
     def page_head(self) -> tuple[str, str]:
