@@ -170,7 +170,7 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
     gain = AdditiveModel([Submodel([2.0], [1.0])])
     accuracy = limiting_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
     assert accuracy.covariance.item() == pytest.approx(0.01 * (1.5 / 0.25) ** 2)
-    with pytest.raises(DataError, match="react at once, so that the input is correlated with the noise"):
+    with pytest.raises(DataError, match="direct feedthrough, so that the input is correlated with the noise"):
         require_uncorrelated_input(gain, INTERVAL, DiscreteController([0.25], [1.0]), WHITE)
     with pytest.raises(DataError, match="no solution"):
         limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
