@@ -52,7 +52,7 @@ def condition_number(hessian: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
 
-#: A clock counts as regular for the noise if 95 % of its intervals deviate from their median by less than this fraction.
+#: A clock counts as regular for the noise if 95 % of its intervals are within this fraction of their median.
 NEARLY_REGULAR = 0.05
 
 

@@ -281,7 +281,7 @@ class FittedModel(ABC):
             If the name, the kind or the unit of time is not valid in MATLAB.
         """
         if not re.fullmatch(r"[A-Za-z]\w{0,62}", name, re.ASCII):
-            raise UsageError(f"a MATLAB variable name is a letter followed by letters, digits and underscores; got {name!r}")
+            raise UsageError(f"a MATLAB variable must be a letter, then letters, digits and underscores; got {name!r}")
         if kind not in DELAYS:
             raise UsageError(f"the kind of a MATLAB model must be {' or '.join(DELAYS)}; got {kind!r}")
         unit = MATLAB_UNITS.get(time_unit)
@@ -327,7 +327,7 @@ class FittedModel(ABC):
             If the name is not a valid identifier, or the order is not positive.
         """
         if not name.isidentifier() or keyword.iskeyword(name):
-            raise UsageError(f"a Python variable name is a letter followed by letters, digits and underscores; got {name!r}")
+            raise UsageError(f"a Python variable must be a letter, then letters, digits and underscores; got {name!r}")
         _check_pade(pade)
         found = self._estimated()
         model = found.parametric.fraction

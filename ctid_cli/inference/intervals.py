@@ -142,7 +142,8 @@ class CostOfDelay:
 
         A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N -
         p)``, c the inflation. The interval is unreliable if the square root of the actual rise, which determines its
-        length, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above 97 %.
+        length, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above
+        97 %.
         """
         if self.count <= self.parameters or not (0 < standard_error < np.inf and self.inflation > 0):
             return True

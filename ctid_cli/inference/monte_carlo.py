@@ -271,7 +271,7 @@ def requested(name: str, custom: Mapping[str, Measure] = MappingProxyType({})) -
         if not usable:
             raise UsageError(f"{name!r} needs a frequency [rad/s] above zero, such as response:1.5")
     elif colon and (measure.source != "errors" or not argument):
-        raise UsageError(f"{base!r} has no values for single parameters; use {base!r} instead of {name!r}")
+        raise UsageError(f"{name!r} must not have a parameter; use {base}")
     return measure
 
 
