@@ -136,13 +136,9 @@ class _Sentences:
             text = f"The output was recorded in steps of {self.y(f.output_quantum)}"
             level: Level = "warning" if share > 0.1 else "note"
             yield Finding(level, "resolution", f"{text}, {100 * share:.2g} % of its standard deviation.")
-        if f.decomposition.outliers:
-            where = ", ".join(self.t(t) for t in f.decomposition.outliers[:3]) + (
-                ", ..." if len(f.decomposition.outliers) > 3 else ""
-            )
-            lies = count(len(f.decomposition.outliers), "output sample") + (
-                " lies" if len(f.decomposition.outliers) == 1 else " lie"
-            )
+        if f.parts.outliers:
+            where = ", ".join(self.t(t) for t in f.parts.outliers[:3]) + (", ..." if len(f.parts.outliers) > 3 else "")
+            lies = count(len(f.parts.outliers), "output sample") + (" lies" if len(f.parts.outliers) == 1 else " lie")
             yield Finding("warning", "outliers", f"{lies} farther from the others than noise explains (t = {where}).")
 
     def _response(self) -> Finding:
@@ -154,7 +150,7 @@ class _Sentences:
             )
             few = f.n_samples - f.n_masked < FEWEST_SAMPLES
             return Finding("warning" if few else "problem", "response", text)
-        ratio, time, delay = f.decomposition.signal_to_noise, f.decomposition.response_time, f.decomposition.delay
+        ratio, time, delay = f.parts.signal_to_noise, f.parts.response_time, f.parts.delay
         parts = [f"The output responds to the input ({p})"]
         if not math.isnan(ratio.value):
             parts.append(f"signal-to-noise ratio {self._interval(ratio, 'dB')}")
@@ -173,7 +169,7 @@ class _Sentences:
 
     def _tests(self) -> Iterator[Finding]:
         """What stands beside the response, and what of it is not detected."""
-        parts = self.facts.decomposition
+        parts = self.facts.parts
         if parts.offset is None or parts.drift is None or parts.start is None:
             return
         rest = f"an input of {self.u(parts.input_at_rest)}"

@@ -160,7 +160,7 @@ class _Spectra:
 
     @classmethod
     def of(cls, grid: Grid, shift: int, narrowest: int) -> _Spectra:
-        """Return spectra of the input and of the output ``shift`` samples later, in bands of ``narrowest`` or more bins.
+        """Return spectra of input, and of output ``shift`` samples later, in bands of ``narrowest`` bins or more.
 
         Without the shift, a delay comparable with the averaging time would reduce the coherence.
         """

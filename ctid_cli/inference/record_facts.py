@@ -125,7 +125,7 @@ class RecordFacts:
     output_bandwidth: float
     #: p-value of the test for a response to the input [-].
     answer_p_value: float = math.nan
-    decomposition: Decomposition = field(default_factory=Decomposition)
+    parts: Decomposition = field(default_factory=Decomposition)
 
 
 def record_facts(record: Record) -> RecordFacts:
@@ -169,7 +169,7 @@ def record_facts(record: Record) -> RecordFacts:
         saturated=saturated(present),
         output_bandwidth=response.bandwidth,
         answer_p_value=p_value,
-        decomposition=parts,
+        parts=parts,
         **_range("input", record.input.at(t)),
         **_range("output", present),
     )

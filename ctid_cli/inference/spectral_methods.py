@@ -431,8 +431,8 @@ def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: st
     variance = (1.0 - coherence) * yy / uu / (count - 1.0)
     note = (
         f"Averages over {segments} segments of {size} samples under Hann windows with half "
-        f"overlap. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened and "
-        "leakage remains, neither visible in the scatter of the segments; --method local-polynomial gives intervals."
+        f"overlap. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened "
+        "and leakage remains, neither visible in their scatter; --method local-polynomial gives intervals."
     )
     frequencies: Array = 2 * np.pi / (size * interval) * np.flatnonzero(kept).astype(np.float64)
     freedom = np.full(frequencies.size, count - 1.0)

@@ -69,7 +69,7 @@ class RecordCheckResult(Result):
         facts, time = self.facts, self.measurement.time_unit or "s"
         none, frequency, output = np.nan, f"rad/{time}", self.measurement.output_unit
         jitter = 0.0 if facts.regular else facts.interval_deviation
-        parts = facts.decomposition
+        parts = facts.parts
         terms = [
             (name, term) for name, term in (("offset", parts.offset), ("drift over the record", parts.drift)) if term
         ]
@@ -89,7 +89,7 @@ class RecordCheckResult(Result):
     def content(self) -> dict[str, Any]:
         """Return facts and command for JSON."""
         content = asdict(self.facts)
-        parts = content.pop("decomposition")
+        parts = content.pop("parts")
         for name, keys in KEYS.items():
             parts.update(zip(keys, parts.pop(name), strict=True))
         columns = {
