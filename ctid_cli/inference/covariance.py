@@ -137,7 +137,7 @@ def describe_conditioning(
     singular = not condition_number <= NEARLY_SINGULAR
     if singular or not defined:
         group = [names[i] for i in _singular_direction(hessian)]
-        what = listed(group) if 0 < len(group) < len(names) else "all the parameters together"
+        what = listed(group) if 0 < len(group) < len(names) else "the parameters"
         number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
         start = f"These data do not determine {what} separately ({number})"
         if len(group) == 1:

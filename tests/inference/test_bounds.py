@@ -195,7 +195,7 @@ def test_refusals_say_why():
     with pytest.raises(DataError, match=r"loop, is not stable.*magnitude 1\."):
         limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(5 * PID.numerator, PID.denominator), **CLOSED)
     limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(2 * PID.numerator, PID.denominator), **CLOSED)
-    with pytest.raises(DataError, match="forgets too slowly"):
+    with pytest.raises(DataError, match="too slow for the limit of long records"):
         limiting_accuracy(TransferFunction([1.0], [1.0, 1e-4]), INTERVAL, **OPEN)
     with pytest.raises(DataError, match=r"coloured, so that .* \(closed_loop instruments are not\)"):
         require_uncorrelated_input(TWO_MODES, INTERVAL, PID, COLOURED)

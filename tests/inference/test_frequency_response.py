@@ -198,12 +198,12 @@ def flat_or_short(n, u=None):
     ("record", "options", "words"),
     [
         (random_record(0), {"method": "welch", "segment": 1900}, "segments of 1900 samples are too long"),
-        (random_record(0), {"method": "periodic"}, "the input does not repeat itself"),
-        (random_record(0), {"period": 1500}, "hold no two periods of 1500"),
+        (random_record(0), {"method": "periodic"}, "the input is not periodic"),
+        (random_record(0), {"period": 1500}, "less than two periods of 1500"),
         (random_record(0), {"half_width": 2}, "half_width"),
         (flat_or_short(200, 1.0), {}, "the input is constant"),
         (flat_or_short(10), {}, "at least"),
-        ([random_record(0), random_record(1)], {}, "do not all repeat"),
+        ([random_record(0), random_record(1)], {}, "do not all have the same period"),
         (Record.from_arrays(T200**1.01, np.sin(T200**2), np.cos(T200)), {"method": "welch"}, "the clock is irregular"),
     ],
 )
