@@ -7,8 +7,8 @@ continuous time the loop is one linear system, driven by the held reference on a
 The matrices of the plant, or of the whole loop in continuous time, are analytic in theta: their derivatives are the
 imaginary parts at ``theta + i step``, without cancellation (W. Squire and G. Trapp, *Using complex variables to
 estimate derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and
-input, the derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and
-with ``dc z + dd u`` added to the output.
+input, the derivatives ``dz`` of the signals are those of the loop without reference, with ``dF z + dg u`` added to the
+next states and ``dc z + dd u`` added to the output.
 """
 
 from dataclasses import dataclass, replace
@@ -70,7 +70,7 @@ class LoopResponse:
         sample.
         """
         if state is not None:
-            # That of the plant is p^(n-1)/A u … 1/A u in seconds, whatever the time unit of its companion form.
+            # That of the plant is p^(n-1)/A u … 1/A u in seconds, independent of the time unit of its companion form.
             n = self.poles + self.integrators
             state = np.concatenate((state[:n] * self._scale(theta) ** np.arange(1.0, n + 1.0), state[n:]))
         return self._continuous(theta, count, state) if self.continuous else self._discrete(theta, count, cell, state)

@@ -359,7 +359,7 @@ class MeasuredSource:
             r = measured.reference_values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
-                # A record of a loop is refused where its clock is not regular.
+                # A record of a loop with an irregular clock raises an error elsewhere.
                 controller = self.loop.at(regular_interval(t[:count]) or 1.0).controller
                 loop = Loop(r - mean, controller, self.loop.enters, "foh" if self.hold == "foh" else "zoh")
         if self.offset == "remove":
