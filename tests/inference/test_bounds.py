@@ -202,7 +202,7 @@ def test_refusals_say_why():
     silent = AdditiveModel([Submodel([0.0], [0.25, 0.25, 1.0])])
     cancelling = TransferFunction([1.0, 1.0], [1.0, 3.0, 2.0])
     for model in (silent, cancelling):
-        with pytest.raises(DataError, match="some have no effect of their own"):
+        with pytest.raises(DataError, match="some have no separate effect"):
             limiting_accuracy(model, INTERVAL, **OPEN)
 
 
