@@ -10,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from ctid_cli.storage.status import experiment_status
 from tests.running import run_toys
 from tests.running.fakes import Toy, exported, run, toy_plan
 
+Start = Callable[..., subprocess.Popen[str]]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -42,11 +44,19 @@ def snapshot(place: Path) -> dict[str, tuple[str, int]]:
     }
 
 
-def start(place: Path, jobs: int, *more: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "tests.running.run_toys", str(place), str(jobs), *more]
-    return subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a run of toys in a process group of its own, which ends with the test."""
+    with ExitStack() as stack:
+
+        def started(place: Path, jobs: int, *more: str) -> subprocess.Popen[str]:
+            command = [sys.executable, "-m", "tests.running.run_toys", str(place), str(jobs), *more]
+            pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+            process = stack.enter_context(subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipes))
+            stack.callback(process.kill)
+            return process
+
+        yield started
 
 
 def read_ids(process: subprocess.Popen[str], lines: int) -> list[str]:
@@ -217,7 +227,7 @@ def test_workers_use_one_blas_thread(tmp_path: Path, jobs: int, monkeypatch: pyt
 # Interruptions
 
 
-def test_killed_three_times_and_resumed_gives_the_same_bytes(tmp_path: Path, undisturbed: bytes) -> None:
+def test_killed_three_times_and_resumed_gives_the_same_bytes(tmp_path: Path, undisturbed: bytes, start: Start) -> None:
     place = tmp_path / "toys"
     acknowledged: set[str] = set()
     draw = random.Random()
@@ -234,7 +244,7 @@ def test_killed_three_times_and_resumed_gives_the_same_bytes(tmp_path: Path, und
     assert exported(place) == undisturbed
 
 
-def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path) -> None:
+def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path, start: Start) -> None:
     process = start(tmp_path / "toys", 2)
     read_ids(process, 3)
     process.kill()
@@ -243,7 +253,9 @@ def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_exports_what_is_finished(tmp_path: Path, undisturbed: bytes, number: int, code: int) -> None:
+def test_a_signal_exports_what_is_finished(
+    tmp_path: Path, undisturbed: bytes, number: int, code: int, start: Start
+) -> None:
     place = tmp_path / "toys"
     process = start(place, 2)
     reported = read_ids(process, 4)
@@ -260,7 +272,7 @@ def test_a_signal_exports_what_is_finished(tmp_path: Path, undisturbed: bytes, n
     assert exported(place) == undisturbed
 
 
-def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path, start: Start) -> None:
     process = start(tmp_path / "toys", 2, "--seconds=30")
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -332,7 +344,7 @@ def test_refused_folders_stay_as_they_are(
     assert snapshot(tmp_path) == before
 
 
-def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path) -> None:
+def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path, start: Start) -> None:
     place = tmp_path / "toys"
     process = start(place, 2, "--runs=500")
     read_ids(process, 2)
@@ -387,7 +399,7 @@ def test_mixing_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 # Storage
 
 
-def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed: bytes) -> None:
+def test_a_full_disk_loses_nothing_that_was_reported(tmp_path: Path, undisturbed: bytes, start: Start) -> None:
     place = tmp_path / "toys"
     process = start(place, 2, "--file-size=90000")
     ids, errors = finish(process)
