@@ -1,6 +1,6 @@
-"""Worker processes: jobs go through joblib, and what a process died of is computed again, alone in a process.
+"""Worker processes: jobs go through joblib's loky, and what a process died of is computed again, alone in a process.
 
-joblib gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
+loky gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
 which estimates it has begun and finished, so that nothing is lost with it and the suspects are known: one for each
 worker. Every suspect is computed again in a process of its own, whose exit code decides.
 """
@@ -12,7 +12,7 @@ import faulthandler
 import itertools
 import os
 import pickle
-import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,8 +37,10 @@ from ctid_cli.storage.manifest import Key, Outcome
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: Files beside the records: one tells workers to begin nothing more, the other is there while anything is to be done.
-_STOP, _GOING = "stop", "going"
+#: How long workers without a job live [s].
+IDLE = 300.0
+#: File beside the folders of jobs that tells workers to begin nothing more.
+_STOP = "stop"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
 #: With more threads, linear algebra has other last bits.
@@ -110,6 +112,7 @@ def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
     # The traceback of a process that dies would garble the terminal; loky has asked for it.
     faulthandler.disable()
     try:
+        record.parent.mkdir(exist_ok=True)
         with record.open("wb", buffering=0) as file, _late(record).open("wb") as late:
             file.write(pickle.dumps(os.getpid()))
             # The code of custom components is imported here.
@@ -130,15 +133,9 @@ def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
     return found
 
 
-def _compute_named(record: Path, task: Task, limits: Limits) -> tuple[Path, list[Entry]]:
-    """Compute a job unless the run is to stop, and say of which record it is."""
-    return record, [] if record.with_name(_STOP).exists() else compute(task, record, limits)
-
-
-def _wait(going: Path) -> None:
-    """Keep a worker from taking jobs until nothing is left to be done."""
-    while going.exists():
-        time.sleep(TICK)
+def compute_unless_stopped(task: Task, limits: Limits, folder: Path) -> Ending:
+    """Compute a job unless the run is to stop."""
+    return Ending([] if folder.with_name(_STOP).exists() else compute(task, folder / "record", limits))
 
 
 def main() -> None:
@@ -260,16 +257,25 @@ def task_of(job: Job) -> Task | Ending:
 
 
 @cache
-def _joblib_thread(process: int) -> ThreadPoolExecutor:
+def _loky_thread(process: int) -> ThreadPoolExecutor:
     """Return the one thread of this process that starts workers, for as long as the process lives.
 
     Workers end with the thread that started them, and inherit that it leaves signals to others.
     """
-    return ThreadPoolExecutor(1, "joblib", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
+    return ThreadPoolExecutor(1, "loky", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS))
+
+
+def _submit_to_loky(count: int, *call: Any) -> Future[Ending]:
+    """Give a call to the workers of this process, which are started if they are not there."""
+    from joblib.externals.loky import get_reusable_executor
+
+    start = {"initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
+    future: Future[Ending] = get_reusable_executor(count, timeout=IDLE, **start).submit(*call)
+    return future
 
 
 class LocalWorkers:
-    """Worker processes on this machine; joblib keeps them for the next run."""
+    """Worker processes on this machine; loky keeps them for the next run."""
 
     def __init__(self, count: int, limits: Limits) -> None:
         self.count, self._limits = count, limits
@@ -277,11 +283,9 @@ class LocalWorkers:
         self.trouble = ""
         self._made = TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._folder = Path(self._made.name)
-        self._stop, self._going = self._folder / _STOP, self._folder / _GOING
         self._numbers = itertools.count()
-        #: What is in work, by the place of its record, and whether nothing follows.
-        self._at_work: dict[Path, Job] = {}
-        self._last = False
+        #: The records of what is in work, and what will come of it.
+        self._at_work: dict[Job, tuple[Path, Future[Ending]]] = {}
 
     def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
@@ -289,128 +293,79 @@ class LocalWorkers:
         If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
         job that waits for the next free worker, so that none waits for this process, is not computed after a stop.
         """
-        self._stop.unlink(missing_ok=True)
-        self._last = False
-        # Without it both workers of a single job take turns, which is slower and no worse.
-        with suppress(OSError):
-            self._going.touch()
-        news: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        working = _joblib_thread(os.getpid()).submit(self._work, jobs, news)
-        working.add_done_callback(news.put)
-        try:
-            while True:
-                if stopping():
-                    self._stop.touch()
-                try:
-                    item = news.get(timeout=TICK)
-                except queue.Empty:
-                    self._watch()
-                    yield None
-                    continue
-                if item is working:
-                    break
-                if isinstance(item, BaseException):
-                    raise item
-                record, entries = item
-                yield self._over(record), Ending(entries)
-            error = working.exception()
-            if error is not None and not isinstance(error, BrokenExecutor | OSError | MemoryError):
+        stop = self._folder / _STOP
+        stop.unlink(missing_ok=True)
+        self.trouble = ""
+
+        def submit(*call: Any) -> Future[Ending]:
+            try:
+                return _loky_thread(os.getpid()).submit(_submit_to_loky, self.count, *call).result()
+            except Exception as error:
+                failed: Future[Ending] = Future()
+                # Its frames hold what descriptors there are.
+                failed.set_exception(error.with_traceback(None))
+                return failed
+
+        def died(job: Job, error: Exception) -> Ending:
+            if not isinstance(error, BrokenExecutor | OSError | MemoryError):
                 raise error
-            how = self.trouble = str(error or "").strip().partition("\n")[0]
-            for record in list(self._at_work):
-                ending = _remains(record, how)
-                yield self._over(record), ending
-        finally:
-            self._going.unlink(missing_ok=True)
-            self._abandon(working.done)
+            self.trouble = str(error).strip().partition("\n")[0] or type(error).__name__
+            return _remains(self._at_work[job][0], self.trouble)
 
-    def _work(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> None:
-        """Put what comes of jobs into a queue: what the thread of joblib does."""
-        from joblib import Parallel, parallel_config
+        def at_once() -> int:
+            if stopping():
+                stop.touch()
+            return 0 if self.trouble else self.count + 1
 
-        settings = {"initializer": initialise, "initargs": (os.getpid(),)}
-        with parallel_config("loky", inner_max_num_threads=1, **settings):
-            # With one worker joblib would compute in this very process: there are two, of which one waits for the end.
-            ahead = self.count + 1 if self.count > 1 else 2
-            how = {"n_jobs": max(self.count, 2), "pre_dispatch": ahead, "batch_size": 1, "max_nbytes": None}
-            parallel = Parallel(return_as="generator_unordered", **how)
-            for found in parallel(self._calls(jobs, news)):
-                if found is not None:
-                    news.put(found)
-
-    def _calls(self, jobs: Iterator[Job], news: queue.SimpleQueue[Any]) -> Iterator[Any]:
-        """Yield what joblib is to call; it asks for the next when a worker is free, in whichever thread."""
-        from joblib import delayed
-
-        try:
-            if self.count == 1:
-                yield delayed(_wait)(self._going)
-            for job in jobs:
-                record, task = self._folder / str(next(self._numbers)), task_of(job)
-                self._at_work[record] = job
-                if isinstance(task, Ending):
-                    news.put((record, task.entries))
-                else:
-                    yield delayed(_compute_named)(record, task, self._limits)
-        except Exception as error:
-            # joblib would wait for ever.
-            news.put(error)
-        finally:
-            self._last = True
-            self._note_end()
-
-    def _over(self, record: Path) -> Job:
-        """Forget a job that is over."""
-        for path in (record, _late(record)):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
-        job = self._at_work.pop(record)
-        self._note_end()
-        return job
-
-    def _note_end(self) -> None:
-        if self._last and not self._at_work:
-            self._going.unlink(missing_ok=True)
+        yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died)
 
     def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
-        threads = ThreadPoolExecutor(at_once)
-        started: list[Future[Ending]] = []
-
-        def submit(job: Job, task: Task) -> Future[Ending]:
-            folder = self._folder / f"alone-{next(self._numbers)}"
-            self._at_work[folder / "record"] = job
-            started.append(threads.submit(compute_alone, task, self._limits, folder))
-            return started[-1]
 
         def died(job: Job, error: Exception) -> Ending:
             raise error
 
+        with ThreadPoolExecutor(at_once) as threads:
+            yield from self._computed(jobs, compute_alone, threads.submit, lambda: at_once, died)
+
+    def _computed(
+        self,
+        jobs: Iterator[Job],
+        function: Callable[..., Ending],
+        submit: Callable[..., Future[Ending]],
+        at_once: Callable[[], int],
+        died: Callable[[Job, Exception], Ending],
+    ) -> Results:
+        """Compute jobs, each with a folder for its record, and end what exceeds its time."""
+
+        def begin(job: Job, task: Task) -> Future[Ending]:
+            folder = self._folder / str(next(self._numbers))
+            future = submit(function, task, self._limits, folder)
+            self._at_work[job] = folder / "record", future
+            return future
+
         try:
-            for over in in_parallel(jobs, submit, lambda: at_once, died):
+            for over in in_parallel(jobs, begin, at_once, died):
                 if over is None:
                     self._watch()
-                else:
-                    self._at_work = {record: job for record, job in self._at_work.items() if job is not over[0]}
+                elif over[0] in self._at_work:
+                    record, _ = self._at_work.pop(over[0])
+                    shutil.rmtree(record.parent, ignore_errors=True)
                 yield over
         finally:
-            self._abandon(lambda: all(future.done() for future in started))
-            threads.shutdown()
-
-    def _abandon(self, ended: Callable[[], bool]) -> None:
-        """Kill what is in work, which would be waited for otherwise, until all has ended."""
-        while not ended():
-            for record in list(self._at_work):
-                _kill(record)
-            time.sleep(TICK)
-        self._at_work.clear()
+            # What is in work would be waited for.
+            while not all(future.done() for _, future in self._at_work.values()):
+                for record, _ in self._at_work.values():
+                    _kill(record)
+                time.sleep(TICK)
+            self._at_work.clear()
 
     def _watch(self) -> None:
         """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
         limit = self._limits.wall_seconds
         if limit is None:
             return
-        for record in list(self._at_work):
+        for record, _ in self._at_work.values():
             with suppress(OSError):
                 seconds = time.time() - record.stat().st_mtime
                 # What it imports before its first estimate counts for none.
