@@ -142,7 +142,7 @@ def _export_fit(path: Path, tool: Tool | None, pade: int | None, file: Path | No
 def _export_all(experiment: str, form: Format, out: Path, file: Path | None) -> None:
     """Write every estimate, piece by piece, however many there are."""
     from ctid_cli.reporting.results import read_results
-    from ctid_cli.storage.estimate_text import csv_lines, json_lines
+    from ctid_cli.storage.estimates import csv_lines, json_lines
 
     results = read_results(out, experiment)
     lines = csv_lines(results.stored) if form == "csv" else json_lines(results.stored)

@@ -20,10 +20,9 @@ from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.inference.criteria import percent_from_r_squared
-from ctid_cli.inference.fit import DeferredFields, Fit, Status
+from ctid_cli.inference.fit import DeferredFields, Fit, InputFit, Status
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
-from ctid_cli.inference.of_input import InputFit
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of

@@ -22,13 +22,12 @@ from ctid_cli.inference import criteria as criteria_of
 from ctid_cli.inference.covariance import CLOSE_TO_ONE, LARGE_STANDARD_ERROR, NEARLY_SINGULAR, condition_number
 from ctid_cli.inference.criteria import fit_percent, r_squared
 from ctid_cli.inference.derived import derived_parameters
-from ctid_cli.inference.fit import DeferredFields
+from ctid_cli.inference.fit import DeferredFields, InputFit
 from ctid_cli.inference.fitted_model import FittedModel
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.intervals import BIASED, CostOfDelay, DelayInterval, UncertainValue
 from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
-from ctid_cli.inference.of_input import InputFit
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
 from ctid_cli.inference.response_test import ResponseTest, response_test
 from ctid_cli.inference.sensitivities import Parametric

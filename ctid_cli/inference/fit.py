@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -17,6 +18,9 @@ from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.text import Shown, wrapped
+
+#: Names of the parameters of one transfer function.
+_OF_INPUT = r"[ab]\d+|delay"
 
 
 class Status(Enum):
@@ -180,3 +184,24 @@ class Fit(FittedModel, Shown):
         """Return the model with the joint distribution of its parameters."""
         law = self.law or Uncertainty.known(self.covariance)
         return Estimated(Parametric(self.parametrised, self.parameter_names), law)
+
+
+@dataclass(frozen=True, eq=False)
+class InputFit(FittedModel):
+    """Part of a fit with several inputs that belongs to one of them."""
+
+    model: TransferFunction
+    #: Names of all parameters of the fit; those that this transfer function does not have begin with "other".
+    parameter_names: tuple[str, ...]
+    #: Covariance of all of them.
+    law: Uncertainty
+
+    @classmethod
+    def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
+        """Return the transfer function of an input; parameters of a common denominator have no prefix."""
+        own = [(each.removeprefix(f"{name}_"), each) for each in names]
+        return cls(model, tuple(bare if re.fullmatch(_OF_INPUT, bare) else f"other {each}" for bare, each in own), law)
+
+    def _estimated(self) -> Estimated:
+        """Return the transfer function with the joint distribution of all parameters."""
+        return Estimated(Parametric(self.model, self.parameter_names), self.law)

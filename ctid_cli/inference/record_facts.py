@@ -17,8 +17,7 @@ from ctid_cli.inference.response_estimates import (
     signal_to_noise,
     step_responses,
 )
-from ctid_cli.inference.response_layout import Signals
-from ctid_cli.inference.response_model import fit_response
+from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
 from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated

@@ -7,17 +7,14 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.inference.intervals import normal_quantile, robust_deviation, student_quantile
-from ctid_cli.inference.residual_tests import normal_tail
-from ctid_cli.inference.response_layout import CONSTANT, LINE, START
-from ctid_cli.inference.response_model import ResponseModel, whitened
+from ctid_cli.inference.residual_tests import feedback_p_value, feedback_score
+from ctid_cli.inference.response_model import CONSTANT, LINE, START, ResponseModel, whitened
 
 #: False-alarm probability of each test, if the noise model is correct. With it 2.5 % of 400 clean records had a false
 #: alarm (`benchmarks/bench_facts.py`).
 LEVEL = 0.001
-#: Earlier inputs and responses from which the next input is predicted, and lags of the response of a controller.
-ORDER, CONTROLLER_LAGS = 6, 3
-#: Steps of the robust regression, and limit at which residuals are clipped [robust standard deviations].
-REWEIGHTED, CLIPPED = 8, 1.5
+#: Earlier inputs and responses from which the next input is predicted.
+ORDER = 6
 #: Largest share of outliers among the samples.
 MOST_OUTLIERS = 0.02
 #: Smaller errors, as a share of the deviation of the output, may come from the discretised impulse response.
@@ -127,26 +124,8 @@ def _deviation(sizes: Array) -> float:
 
 
 def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> float:
-    """Return the p-value of the correlation of the input with past noise under the hypothesis of no feedback.
-
-    The input is predicted from earlier inputs and responses. Prediction errors are clipped, because rare large changes
-    of a held reference would mask the response to the noise. Without feedback, the innovations of the noise are
-    independent of any function of the input.
-    """
+    """Return the p-value of the correlation of the input with past noise under the hypothesis of no feedback."""
     windows = np.lib.stride_tricks.sliding_window_view
     before = np.column_stack([windows(u, ORDER + 1)[:, :-1], windows(response, ORDER + 1), np.ones(u.size - ORDER)])
-    scale = np.abs(before).max(axis=0)
-    before, now = before[:, scale > 0] / scale[scale > 0], u[ORDER:]
-    weight, moves = np.ones(now.size), now
-    for _ in range(REWEIGHTED):
-        root = np.sqrt(weight)
-        moves = now - before @ np.linalg.lstsq(before * root[:, None], now * root, rcond=1e-10)[0]
-        spread = robust_deviation(moves)
-        if not spread > 1e-9 * float(np.ptp(now)):
-            return 1.0
-        weight = 1.0 / np.maximum(np.abs(moves) / spread, 1.0)
-    moves = np.clip(moves / spread, -CLIPPED, CLIPPED)
     white = whitened(rest[:, None], model.noise)[:, 0]
-    products = [moves * white[ORDER - k : white.size - k] for k in range(CONTROLLER_LAGS)]
-    scores = [abs(float(each.sum())) / max(float(np.sqrt(each @ each)), np.finfo(float).tiny) for each in products]
-    return min(1.0, 2 * CONTROLLER_LAGS * normal_tail(max(scores)))
+    return feedback_p_value(feedback_score(before, u[ORDER:], white))

@@ -328,25 +328,24 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
     found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
     if not first:
-        z = _feedback_score(regression_residuals(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
-        found.append((2 * CONTROLLER_LAGS * normal_tail(z), z * z / e.size))
+        u, outputs = inputs(0.0, range(0, -ORDER - 1, -1))[ORDER:], np.lib.stride_tricks.sliding_window_view(x, ORDER)
+        before = Concatenated((constant(len(u)), u[:, 1:], outputs[1:]))
+        rest = regression_residuals(e, known)
+        z = feedback_score(before, u[:, 0], fit_noise_model([rest]).innovations(rest))
+        found.append((feedback_p_value(z), z * z / e.size))
     least, explained = min(found, default=(1.0, 0.0))
     return InputDependence(pole.p_value, share, min(1.0, len(found) * least), explained)
 
 
-def _feedback_score(e: Array, x: Array, u: Array) -> float:
-    """Return the standardised correlation of the input with the last residuals.
+def feedback_score(before: Rows, now: Array, white: Array) -> float:
+    """Return the standardised correlation of the input now with the last innovations.
 
-    The input is predicted from earlier inputs and simulated outputs. Prediction errors are clipped, because rare large
-    changes of a held reference would mask the response to the noise. Without feedback, innovations of the residuals are
-    independent of any function of the input.
+    The input is predicted from what was before: inputs and responses. Prediction errors are clipped, because rare large
+    changes of a held reference would mask the response to the noise. Without feedback, innovations are independent of
+    any function of the input. There are more of them than inputs: those before the first one come first.
     """
-    blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]
-    outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
-    before = Concatenated((constant(len(inputs)), inputs[:, 1:], outputs))
-    weights = orthonormal(before, 1e-10)
-    now = rest = inputs[:, 0]
-    weight = np.ones(now.size)
+    blocks, weights = list(row_blocks(now.size)), orthonormal(before, 1e-10)
+    rest, weight = now, np.ones(now.size)
     for _ in range(REWEIGHTED):
         gram, products = np.zeros((weights.shape[1],) * 2), np.zeros(weights.shape[1])
         for rows in blocks:
@@ -360,10 +359,14 @@ def _feedback_score(e: Array, x: Array, u: Array) -> float:
         if not scale > 1e-9 * float(np.ptp(now)):
             return 0.0
         weight = 1.0 / np.maximum(np.abs(rest) / scale, 1.0)
-    moves = np.clip(rest / scale, -CLIPPED, CLIPPED)
-    white = fit_noise_model([e]).innovations(e)
-    scores = [moves * white[ORDER - k : e.size - k] for k in range(CONTROLLER_LAGS)]
-    return max(abs(float(score.sum())) / float(np.sqrt(score @ score)) for score in scores)
+    moves, first = np.clip(rest / scale, -CLIPPED, CLIPPED), white.size - now.size
+    scores = [moves * white[first - k : white.size - k] for k in range(CONTROLLER_LAGS)]
+    return max(abs(float(score.sum())) / max(math.sqrt(score @ score), np.finfo(float).tiny) for score in scores)
+
+
+def feedback_p_value(score: float) -> float:
+    """Return the p-value of the largest score of all lags under the hypothesis of no feedback."""
+    return min(1.0, 2 * CONTROLLER_LAGS * normal_tail(score))
 
 
 def _behind_a_pole(x: Array, time_constants: Array) -> Array:

@@ -8,8 +8,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel
-from ctid_cli.inference.response_layout import INTEGRAL, prior_factor
-from ctid_cli.inference.response_model import Directions, ResponseModel
+from ctid_cli.inference.response_model import INTEGRAL, Directions, ResponseModel, prior_factor
 
 #: Tails of the intervals [-].
 TAILS = (0.025, 0.975)

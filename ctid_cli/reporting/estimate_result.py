@@ -15,7 +15,7 @@ from ctid_cli.reporting.document import Column, Result, Section, pairs
 from ctid_cli.reporting.estimate import PARAMETER, parameter_rows, parameters
 from ctid_cli.reporting.layout import delay_label, number, seconds
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name, measure_names
-from ctid_cli.storage.estimate_text import as_object
+from ctid_cli.storage.estimates import as_object
 
 if TYPE_CHECKING:
     from ctid_cli.storage.status import FoundEstimate

@@ -7,8 +7,8 @@ from ctid_cli.inference.bounds import cramer_rao_bound, limiting_accuracy
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.running.expectations import expectations
 from ctid_cli.running.plan import build_plan
+from ctid_cli.running.theory import expectations
 from ctid_cli.specification.load import load_spec
 from tests.running.accuracy_cases import specification
 

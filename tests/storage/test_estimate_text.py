@@ -1,6 +1,6 @@
 """Estimates as other programs get them."""
 
-from ctid_cli.storage.estimate_text import ESTIMATE_KEYS, as_object
+from ctid_cli.storage.estimates import ESTIMATE_KEYS, as_object
 
 
 def test_the_documented_keys_come_first_and_parameters_before_their_errors():
