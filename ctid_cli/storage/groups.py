@@ -1,27 +1,21 @@
 """Estimates by data cell, estimator and start, and the errors of their parameters, as tidy tables.
 
 Every estimate with a value for each parameter of the system counts, whether its iterations converged or not. An
-estimate that failed, or cannot be written in these parameters, has no error. Errors of poles and responses follow.
+estimate that failed, or cannot be written in these parameters, has no error.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
-from ctid_cli.errors import UsageError
 from ctid_cli.inference import monte_carlo
-from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.models.distances import h2_distance, hinf_distance, matched_poles, response_distance
-from ctid_cli.models.factoring import unfactored
-from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.storage.estimates import Estimates
-from ctid_cli.storage.manifest import Manifest, simulated_model, true_values
+from ctid_cli.storage.manifest import Manifest, true_values
 from ctid_cli.storage.truth import Found
 
 if TYPE_CHECKING:
@@ -136,50 +130,3 @@ def _given_delays(groups: pd.DataFrame, truths: Sequence[dict[str, float]], foun
         if np.isnan(errors).all() and (known == known[:1]).all():
             given.add(estimator)
     return given
-
-
-# --- poles and responses ----------------------------------------------------------------------------------------------
-
-Distance = Callable[[TransferFunction, TransferFunction], float]
-
-
-def system_of(cell: Mapping[str, Any], name: str) -> TransferFunction:
-    """Return the system that a data cell simulates, as one fraction, for a measure that needs it."""
-    found = simulated_model(cell)
-    if found is None:
-        raise UsageError(f"{name} needs a linear system of poles and zeros that is simulated, and there is none here")
-    model = unfactored(found) if isinstance(found, AdditiveModel) else found
-    if name in ("h2", "hinf") and not model.is_stable:
-        raise UsageError(f"{name} is infinite for a system that integrates; use response:FREQUENCY")
-    return model
-
-
-def distances(system: TransferFunction, rows: Estimates, name: str) -> Array:
-    """Return the distances of estimates that a measure is about [%]; where there is no model, it is infinitely far."""
-    base, _, argument = name.partition(":")
-    known: dict[str, Distance] = {"h2": h2_distance, "hinf": hinf_distance}
-    distance = partial(response_distance, frequency=float(argument)) if base == "response" else known[base]
-    models = rows.rows("numerator", "denominator", "delay")
-    return np.array([100.0 * distance(system, _model(row)) if row["denominator"] else np.inf for row in models])
-
-
-def _model(row: Mapping[str, Any]) -> TransferFunction:
-    return TransferFunction(row["numerator"], row["denominator"], max(row["delay"] or 0.0, 0.0))
-
-
-def pole_errors(group: int, system: TransferFunction, rows: Estimates) -> pd.DataFrame:
-    """Return errors of poles in the place of parameters, each with the true one that it goes with [rad/s].
-
-    ``pole_1`` ..., fastest first; of two complex ones ``pole_1_real`` and ``pole_1_imag``. Of a model with another
-    number of poles there are none.
-    """
-    true = system.poles
-    found = np.array([true, *(matched_poles(true, denominator) for denominator in rows.values("denominator"))])
-    columns: dict[str, Array] = {}
-    for number, k in enumerate(np.flatnonzero(true.imag >= 0).tolist(), start=1):
-        if true[k].imag:
-            columns |= {f"pole_{number}_real": found[:, k].real, f"pole_{number}_imag": found[:, k].imag}
-        else:
-            columns[f"pole_{number}"] = found[:, k].real
-    values = np.column_stack([*columns.values()])
-    return errors_of_group(group, rows.column("replicate"), [*columns], values[0], values[1:])

@@ -12,15 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import lcm
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, NoReturn, Self
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
 from ctid_cli.written_files import EXPERIMENT
-
-if TYPE_CHECKING:
-    from ctid_cli.models.additive import AdditiveModel
-    from ctid_cli.models.transfer_function import TransferFunction
 
 Manifest = dict[str, Any]
 #: Estimates that one plan may ask for.
@@ -238,30 +234,22 @@ def swept_names(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
-def simulated_model(cell: Mapping[str, Any]) -> "AdditiveModel | TransferFunction | None":
-    """Return the linear system that a data cell simulates; None for another one, a measured record or a signal."""
-    from ctid_cli.models.additive import AdditiveModel, Submodel
-    from ctid_cli.models.transfer_function import TransferFunction
-
-    system = cell["content"].get("system") or {}
-    if not {"additive", "denominator"} & system.keys():
-        return None
-    delay = float(system.get("delay") or 0.0)
-    if "additive" in system:
-        return AdditiveModel([Submodel(**item) for item in system["additive"]], delay)
-    return TransferFunction(system["numerator"], system["denominator"], delay)
-
-
 def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
     """Return True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
 
     ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
     parameters of the submodels of a sum, and its delay; the true values that a custom system gives.
     """
-    from ctid_cli.models.additive import AdditiveModel
+    from ctid_cli.models.additive import AdditiveModel, Submodel
+    from ctid_cli.models.transfer_function import TransferFunction
 
-    model = simulated_model(cell)
-    if model is None:
-        return dict((cell["content"].get("system") or {}).get("truth") or {})
-    values = model.sorted().parameters if isinstance(model, AdditiveModel) else model.parameters
-    return values | {"delay": model.delay}
+    system = cell["content"].get("system")
+    if not system:
+        return {}
+    if "additive" in system:
+        values = AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters
+    elif "denominator" in system:
+        values = TransferFunction(system["numerator"], system["denominator"]).parameters
+    else:
+        return dict(system.get("truth") or {})
+    return values | {"delay": float(system.get("delay") or 0.0)}
