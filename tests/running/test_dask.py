@@ -30,7 +30,7 @@ def plan() -> Plan:
 def cluster() -> Iterator[Any]:
     from distributed import LocalCluster
 
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None, "memory_limit": 0}
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0", "memory_limit": 0}
     with LocalCluster(silence_logs=60, **options) as made:
         yield made
 
@@ -62,7 +62,7 @@ def test_a_worker_of_another_platform_is_refused_and_named(
 def test_a_worker_of_several_threads_is_refused(tmp_path: Path) -> None:
     from distributed import LocalCluster
 
-    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": None, "silence_logs": 60}
+    options = {"n_workers": 1, "threads_per_worker": 2, "dashboard_address": ":0", "silence_logs": 60}
     with LocalCluster(**options) as made, pytest.raises(RefusedError, match="2 threads; start it with --nthreads 1"):
         run(plan(), tmp_path, dask=made.scheduler_address)
 
