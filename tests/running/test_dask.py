@@ -23,7 +23,7 @@ from tests.running.fakes import Toy, exported, run, toy_plan
 def plan() -> Plan:
     hostile = (Toy("leave", at=3, order=6), Toy("grow", at=4, order=7))
     limits = {"cpu_seconds": 2, "memory_mb": 300}
-    return toy_plan(Toy(seconds=0.05), *hostile, Toy("raise", at=2), levels=(5,), runs=7, limits=limits)
+    return toy_plan(Toy(seconds=0.05), *hostile, Toy("raise", at=2), levels=(5,), runs=5, limits=limits)
 
 
 @pytest.fixture(scope="module")

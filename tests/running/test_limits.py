@@ -47,15 +47,13 @@ def test_what_takes_too_long_is_ended_and_all_else_is_stored(tmp_path: Path, mon
 
 def test_processor_time_and_memory_are_limited_too(tmp_path: Path) -> None:
     hostile = [Toy("hang in preparation", at=1, order=5), Toy(order=6), Toy("grow", at=2, order=8)]
-    hostile += [Toy(order=9), Toy("ask for too much", at=0, order=7)]
-    run(toys(*hostile, limits={"cpu_seconds": 3, "memory_mb": 300}), tmp_path)
+    run(toys(*hostile, limits={"cpu_seconds": 1.5, "memory_mb": 300}), tmp_path)
     assert failures(tmp_path) == {
         ("toy1", 1, "none"): "TIMEOUT",
         ("toy3", 2, "none"): "MEMORY",
-        ("toy5", 0, "none"): "MEMORY",
     }
     assert messages(tmp_path) == {
-        "not finished after 3 s of processor time (limits.cpu_seconds)",
+        "not finished after 1.5 s of processor time (limits.cpu_seconds)",
         "needed more than 300 MB (limits.memory_mb)",
     }
 
@@ -93,8 +91,6 @@ def test_a_higher_limit_is_a_reason_to_try_again(tmp_path: Path) -> None:
     assert preview(plan(wall_seconds=0.5, cpu_seconds=9), place).estimates == 0
     assert preview(plan(memory_mb=9000), place).again == 1
     assert preview(plan(wall_seconds=2), place).again == 1
-    assert run(plan(wall_seconds=1.5), place).computed == 1
-    assert preview(plan(wall_seconds=1.5), place).estimates == 0
     marker.touch()
     summary = run(plan(), place)
     assert (summary.computed, summary.failed) == (1, 0)
