@@ -4,9 +4,9 @@
 
 In windows of one second, exponentially growing chirps are fitted by Gauss-Newton steps with dense linear algebra.
 Peaks of what is left join where they are 10 dB above the noise floor, a running median. Of the partials that stand 10
-dB above it in the end, one is kept if the track has a valid row within .3 Hz: at the middle of the window, or
-anywhere in it. No two valid readings of one row should be within one bin of their windows. A window takes up to two
-minutes.
+dB above it in the end, one is kept if a tone of the track has a row within .3 Hz, and valid if that row is: at the
+middle of the window, or anywhere in it. No two valid readings of one row should be within one bin of their windows. A
+window takes up to two minutes.
 """
 
 import argparse
@@ -114,7 +114,7 @@ def compare(file, windows):
     """Print, for each window of a record, the partials of the fit and those that the track keeps."""
     record = read_sampled_signal(file).in_seconds()
     found = track(record, every=EVERY)
-    hertz = np.where(found.valid, found.omega / (2.0 * np.pi), np.nan)
+    hertz = found.omega / (2.0 * np.pi)
     twice = readings_twice(hertz, found.valid, found.window)
     print(f"{file}: {hertz.shape[1]} tones, {int(found.valid.sum())} valid readings, {twice} of them twice")
     size = round(1.0 / record.interval)
@@ -124,13 +124,16 @@ def compare(file, windows):
         instants = found.t - begin * record.interval
         inside, middle = (instants >= 0.0) & (instants <= 1.0), int(np.abs(instants - 0.5).argmin())
         near = np.abs(hertz[:, :, None] - bins) < KEPT_HZ
-        kept_in, kept_at = near[inside].any(axis=(0, 1)), near[middle].any(axis=0)
+        right = near & found.valid[:, :, None]
+        kept_in, valid_in = (each[inside].any(axis=(0, 1)) for each in (near, right))
+        kept_at, valid_at = (each[middle].any(axis=0) for each in (near, right))
         for name, which in (("20 dB", decibels >= STRONG_DB), ("10 to 20 dB", decibels < STRONG_DB)):
             close = which & ~kept_in & (apart.min(axis=1) < CLOSE_HZ)
             kept = f"kept {(which & kept_in).sum():3} ({(which & kept_at).sum():3} at the middle)"
+            valid = f"valid {(which & valid_in).sum():3} ({(which & valid_at).sum():3})"
             lost = f"lost within {CLOSE_HZ:g} Hz of another {close.sum():3}"
             start = f"from {begin * record.interval:.2f} s"
-            print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}; {lost}", flush=True)
+            print(f"  {start}, {name:11}: {which.sum():3} partials, {kept}, {valid}; {lost}", flush=True)
 
 
 def main():

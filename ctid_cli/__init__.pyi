@@ -87,7 +87,6 @@ from .frequency.flags import Flag as Flag
 from .frequency.base import FrequencyEstimator as FrequencyEstimator, FrequencyTrack as FrequencyTrack
 from .frequency.drem import DremGradient as DremGradient, DremFiniteTime as DremFiniteTime, DremWindow as DremWindow
 from .frequency.restarting_least_squares import RestartingLeastSquares as RestartingLeastSquares
-from .frequency.amplitudes import Sinusoids as Sinusoids, fit_sinusoids as fit_sinusoids
 
 # Tones of recorded signals
 from .tones.track import MissingLine as MissingLine, Track as Track, track as track

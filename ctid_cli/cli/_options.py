@@ -100,10 +100,10 @@ class RecordOptions:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of several inputs, else none."""
-        from ctid_cli.signals.measurement import input_name
+        from ctid_cli.signals.table import split_header
 
         several = self.input if self.input and len(self.input) > 1 else ()
-        return tuple(input_name(name) for name in several)
+        return tuple(split_header(name)[0] for name in several)
 
     def read(self, file: Path, hold: Any, **others: Any) -> Measurement:
         """Read a record, between the instants that are given."""

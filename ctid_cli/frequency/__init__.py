@@ -6,6 +6,5 @@ with the same numbers up to rounding. Every row carries flags that say why it mu
 for each.
 
 The recommended tracker is :class:`RestartingLeastSquares` with a prefilter. :class:`DremGradient`,
-:class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones. :func:`fit_sinusoids` finds
-amplitudes, phases and the bias once the frequencies are known.
+:class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones.
 """

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.frequency.flags import Flag
-from ctid_cli.signals.checks import require_integer, require_not_negative, require_positive
+from ctid_cli.signals.checks import require_integer, require_positive
 from ctid_cli.text import Shown
 
 #: More tones than this cannot be told apart in double precision.
@@ -91,7 +91,7 @@ class FrequencyEstimator(ABC):
     #: Whether the flag CHANGED is an alarm, so that false alarms are counted.
     raises_alarms: ClassVar[bool] = False
 
-    tones: int
+    tones: Annotated[int, require_integer, 1, MOST_TONES]
 
     def __post_init__(self) -> None:
         require_integer("tones", self.tones, 1, MOST_TONES)
@@ -183,14 +183,3 @@ def series_of(samples: ArrayLike) -> Array:
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) <= LARGEST_SAMPLE, values, np.nan)
-
-
-def require_bounds(lowest: float, highest: float | None) -> None:
-    """Refuse bounds of frequencies that leave nothing between them."""
-    require_not_negative("lowest_frequency", lowest, "rad/s")
-    if highest is None:
-        return
-    require_positive("highest_frequency", highest, "rad/s")
-    if lowest >= highest:
-        order = f"lowest_frequency ({lowest:g} rad/s) must be below highest_frequency ({highest:g} rad/s)."
-        raise OptionError("lowest_frequency", order)

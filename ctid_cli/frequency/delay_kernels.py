@@ -52,9 +52,6 @@ class Clock(NamedTuple):
     #: A second delay, at which the frequencies are checked, likewise.
     second_lag: int
     second_delay: float
-    #: Cosines of the highest and of the lowest frequency times h [-].
-    bottom: float
-    top: float
     #: Samples from one verdict to the next.
     every: int
 
@@ -199,8 +196,8 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
     if n > 2 or flags:
         roots[:] = np.sort(roots)[::-1]
     for i in range(n):
-        if roots[i] < clock.bottom or roots[i] > clock.top:
-            roots[i] = min(max(roots[i], clock.bottom), clock.top)
+        if abs(roots[i]) > 1.0:
+            roots[i] = 1.0 if roots[i] > 0.0 else -1.0
             flags |= OUT_OF_BOUNDS
         omega[i] = np.arccos(roots[i]) / clock.delay
     return flags

@@ -12,16 +12,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import comb, gcd
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import OptionError
-from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack, require_bounds, series_of
+from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack, series_of
 from ctid_cli.frequency.delay_kernels import Clock
-from ctid_cli.signals.checks import require_not_negative, require_positive
+from ctid_cli.signals.checks import Checked, require_not_negative, require_positive
 
 #: Longest delay in sampling intervals: the samples of twice n delays are kept.
 LONGEST_DELAY = 10_000_000
@@ -43,21 +43,18 @@ BLOCK = 1 << 15
 
 
 @dataclass(frozen=True, kw_only=True)
-class DelayRegression(FrequencyEstimator):
+class DelayRegression(Checked, FrequencyEstimator):
     """Options of all estimators on the delay regression.
 
     Parameters
     ----------
     h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals.
+        Delay of the regression [s], below pi over the highest frequency, as frequencies above pi/h are seen as lower
+        ones; rounded to whole sampling intervals.
     prefilter : float, default 0.0
         Length of a Hann low-pass in front of the regression [s]; 0 for none.
     difference : float, default 0.0
         If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi/h, beyond which they cannot be told apart.
 
     Raises
     ------
@@ -68,18 +65,9 @@ class DelayRegression(FrequencyEstimator):
     #: Further options that say for how long samples are kept [s].
     _kept: ClassVar[tuple[str, ...]] = ()
 
-    h: float
-    prefilter: float = 0.0
-    difference: float = 0.0
-    lowest_frequency: float = 0.0
-    highest_frequency: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive("h", self.h, "s")
-        require_not_negative("prefilter", self.prefilter, "s")
-        require_not_negative("difference", self.difference, "s")
-        self._highest(self.h)
+    h: Annotated[float, require_positive, "s"]
+    prefilter: Annotated[float, require_not_negative, "s"] = 0.0
+    difference: Annotated[float, require_not_negative, "s"] = 0.0
 
     @property
     def _stacked_over(self) -> float:
@@ -127,9 +115,7 @@ class DelayRegression(FrequencyEstimator):
         """Return the regression at a sampling interval [s]."""
         lag = whole_delay("h", self.h, interval)
         second, every = second_lag(lag), max(1, min(lag // VERDICTS_PER_DELAY, MOST_BETWEEN))
-        delay = lag * interval
-        bottom, top = float(np.cos(self._highest(delay) * delay)), float(np.cos(self.lowest_frequency * delay))
-        return Clock(float(interval), lag, delay, second, second * interval, bottom, top, every)
+        return Clock(float(interval), lag, lag * interval, second, second * interval, every)
 
     def weights(self, interval: float) -> Array:
         """Return the impulse response in front of the regression, shape (L + 1,).
@@ -155,17 +141,6 @@ class DelayRegression(FrequencyEstimator):
         if samples < needed:
             few = f"{samples:.3g} samples of {interval:g} s, fewer than the {needed} that {self.tones} tones need."
             raise OptionError("memory", f"memory = {memory:g} s holds {few}")
-
-    def _highest(self, delay: float) -> float:
-        """Upper bound of the frequencies at a delay [s], if the bounds make sense."""
-        unique = np.pi / delay
-        highest = unique if self.highest_frequency is None else float(self.highest_frequency)
-        if highest > unique * (1.0 + 1e-12):
-            seen = f"frequencies above pi/h = {unique:g} rad/s are seen as lower ones"
-            asked = f"highest_frequency is {highest:g} rad/s; use an h below {np.pi / highest:g} s."
-            raise OptionError("h", f"with h = {delay:g} s, {seen}, but {asked}")
-        require_bounds(self.lowest_frequency, highest)
-        return min(highest, unique)
 
 
 class Online(ABC):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numba import njit
@@ -36,13 +36,8 @@ class MixingOptions(DelayRegression):
 
     _kept: ClassVar[tuple[str, ...]] = ("d",)
 
-    d: float
-    first_row: int = 1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive("d", self.d, "s")
-        require_integer("first_row", self.first_row, 0, 1000)
+    d: Annotated[float, require_positive, "s"]
+    first_row: Annotated[int, require_integer, 0, 1000] = 1
 
     @property
     def _stacked_over(self) -> float:
@@ -62,7 +57,7 @@ class DremGradient(MixingOptions):
     gamma : float or tuple of float, default 1.0
         Adaptation gain, one for all parameters or one for each.
     initial_frequencies : tuple of float, optional
-        Frequencies to begin with [rad/s]; by default spread over the bounds. Above pi/h they alias, which only moves
+        Frequencies to begin with [rad/s]; by default spread over zero to pi/h. Above it they alias, which only moves
         the beginning.
     power : int or "literal", default 1
         Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
@@ -85,7 +80,7 @@ class DremGradient(MixingOptions):
     kind: ClassVar[str] = "drem_gradient"
     finite_time: ClassVar[bool] = False
 
-    epsilon: float = 1.0
+    epsilon: Annotated[float, require_positive, "-"] = 1.0
     gamma: float | tuple[float, ...] = 1.0
     initial_frequencies: tuple[float, ...] | None = None
     power: int | Literal["literal"] = 1
@@ -93,7 +88,6 @@ class DremGradient(MixingOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive("epsilon", self.epsilon, "-")
         if isinstance(self.gamma, Sequence):
             self.keep_one_for_each("gamma", "-")
         else:
@@ -116,7 +110,7 @@ class DremFiniteTime(DremGradient):
     Parameters
     ----------
     initial_frequencies : tuple of float, optional
-        Frequencies shown before there is an estimate [rad/s]; by default spread over the bounds. Above pi/h they alias.
+        Frequencies shown before there is an estimate [rad/s]; by default spread over zero to pi/h. Above it they alias.
 
     Notes
     -----
@@ -183,7 +177,7 @@ class DremWindow(MixingOptions):
     kind: ClassVar[str] = "drem_window"
     _kept: ClassVar[tuple[str, ...]] = ("d", "memory")
 
-    memory: float
+    memory: Annotated[float, require_positive, "s"]
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""
@@ -252,10 +246,8 @@ class OnlineGradient(OnlineMixing):
         n, lag = options.tones, whole_delay("h", options.h, interval)
         super().__init__(options, interval, JUDGED_SPANS * n * lag, np.nan if options.gated else 0.0)
         self.scale = float(options.epsilon) ** (n if options.power == "literal" else int(options.power))
-        initial = options.initial_frequencies
-        if initial is None:
-            lowest, highest = np.arccos((self.clock.top, self.clock.bottom)) / self.clock.delay
-            initial = lowest + (highest - lowest) * np.arange(1, n + 1) / (n + 1)
+        spread = np.pi / self.clock.delay * np.arange(1, n + 1) / (n + 1)
+        initial = spread if options.initial_frequencies is None else options.initial_frequencies
         gains = np.full(n, interval) * np.asarray(options.gamma, dtype=float)
         self._descent = gains, theta_of(initial, self.clock.delay), options.finite_time, np.zeros((2, n))
 

@@ -46,7 +46,7 @@ MEANINGS: dict[Flag, str] = {
         "use a prefilter, more tones or a longer record."
     ),
     Flag.COMPLEX_ROOTS: "The estimated parameters belong to no set of real frequencies.",
-    Flag.OUT_OF_BOUNDS: "A frequency beyond lowest_frequency or highest_frequency was put on the bound.",
+    Flag.OUT_OF_BOUNDS: "A frequency beyond the bounds, zero and pi/h if none are given, was put on the bound.",
     Flag.INCONSISTENT: (
         "The frequencies do not explain the signal at a second delay: a tone above pi/h is seen as another one (use a "
         "smaller h), or the estimate lags behind a change."

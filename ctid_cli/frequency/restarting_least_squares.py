@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ctid_cli.arrays import Array
 from ctid_cli.frequency.delay_kernels import Fit, Restarting, restarting_fits
 from ctid_cli.frequency.delay_regression import ROWS_PER_TONE, DelayRegression, Online
-from ctid_cli.signals.checks import require_choice, require_positive
+from ctid_cli.signals.checks import require_positive
 
 Solution = Literal["least_squares", "total_least_squares"]
 
@@ -72,14 +72,8 @@ class RestartingLeastSquares(DelayRegression):
     kind: ClassVar[str] = "restarting_least_squares"
     raises_alarms: ClassVar[bool] = True
 
-    memory: float | None = None
+    memory: Annotated[float, require_positive, "s"] | None = None
     solution: Solution = "least_squares"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_choice("solution", self.solution, get_args(Solution))
-        if self.memory is not None:
-            require_positive("memory", self.memory, "s")
 
     def start(self, interval: float) -> Online:
         """Begin an estimation before its first sample, with the sampling interval [s]."""

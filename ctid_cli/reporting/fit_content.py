@@ -49,7 +49,7 @@ def fit_content(
     fit, options, criteria = fitted.fit, fitted.options, fitted.criteria
     profile, validation = fit.profile, fitted.validation
     measurements, units = records.measurements, units or records.units
-    hold = measurements[0].hold if measurements else None
+    hold = measurements[0].record.hold if measurements else None
     content = {
         "model": _model_object(fitted),
         "parameters": parameter_rows(parameters_of(fitted, units)),

@@ -188,11 +188,10 @@ class FitResult(PagedResult):
             f"{TREATMENTS[options.initial_state]}{_before(self.fitted, options.initial_state)}",
         )
         yield "offset", f"{_offset(self.fitted, units)} (--offset {options.offset})"
-        holds = [first.hold] if isinstance(first.hold, str) else first.hold
-        signals = list(first.record.held.values())
-        for hold, text, signal in zip(holds, first.record.hold_options, signals, strict=False):
+        record = first.record
+        for text, signal in zip(record.hold_options, record.held.values(), strict=False):
             of, _, _ = text.rpartition("=")
-            yield f"input {of}".strip(), f"{HOLDS[hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
+            yield f"input {of}".strip(), f"{HOLDS[signal.hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 

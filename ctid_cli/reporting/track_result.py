@@ -108,7 +108,7 @@ class TrackResult(PagedResult):
     def chapters(self) -> Iterator[Chapter]:
         """Return the signal, its tones, and what they leave."""
         track, signal = self.track, self.shown_signal
-        bands = ", with bands of one standard error" if track.states_errors and track.omega.size else ""
+        bands = ", with bands of one standard error" if np.isfinite(track.error).any() else ""
         caption = f"Frequencies and amplitudes over time{bands}; grey where no tone that is drawn is valid."
         drawn = track_drawing(track, signal.start, signal.unit, "")
         yield Chapter("Data", [Section(sentences=[signal_line(signal), *signal.notes, *self.chosen()])])

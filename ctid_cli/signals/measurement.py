@@ -16,16 +16,10 @@ from ctid_cli.signals.held import HeldSignal, Hold
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.table import ROLES, Table, split_header
 from ctid_cli.signals.text_file import read_text_table
-from ctid_cli.signals.treatment import Holds
 
 Offset = Literal["none", "remove"]
 #: What stands between the units of several inputs.
 SEPARATOR = ", "
-
-
-def input_name(column: str) -> str:
-    """Return the name of an input: that of its column without the unit."""
-    return split_header(column)[0]
 
 
 @dataclass(frozen=True)
@@ -61,11 +55,6 @@ class Measurement:
     def columns(self) -> str | list[str]:
         """Column of the input, or of each of several."""
         return list(self.inputs) or self.input
-
-    @property
-    def hold(self) -> Holds:
-        """The hold of the inputs, or that of each where they differ."""
-        return self.record.hold
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:
@@ -150,7 +139,7 @@ def read_measurement(
         span = f"from {t[used.start]:.6g} to {t[used.stop - 1]:.6g} {columns.unit('time') or 's'}"
         part = f"Only the {count} of {t.size} samples {span} are used; the input before them is not."
         notes = (*notes, part)
-    names = [input_name(columns.names[role]) for role in roles]
+    names = [split_header(columns.names[role])[0] for role in roles]
     each = zip(names, roles, holds, strict=True)
     inputs = {name: HeldSignal(t[used], columns.input(used, role), own) for name, role, own in each}
     y = columns.output(used)

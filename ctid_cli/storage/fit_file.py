@@ -60,7 +60,7 @@ def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
     return {
         **path_and_sum(measurement.path, folder),
         "columns": {"time": measurement.time, "input": measurement.columns, "output": measurement.output},
-        "hold": measurement.hold,
+        "hold": measurement.record.hold,
         "from": measurement.start,
         "to": measurement.stop,
         **_loop(measurement),

@@ -62,25 +62,23 @@ def condition(samples: Array, interval: float) -> Conditioned:
 
 
 def low_pass(factor: int) -> Array:
-    """Return the impulse response of the filter before one of so many samples is kept, by Kaiser's formulas."""
-    # What would fold into the kept band is stopped; width of the transition [rad].
-    width = 2.0 * np.pi * (1.0 - c.KEPT_BAND) / factor
-    taps = int(np.ceil((c.STOP_BAND - 7.95) / (2.285 * width) + 1.0)) | 1
-    beta = 0.1102 * (c.STOP_BAND - 8.7)
-    weights = np.sinc((np.arange(taps) - 0.5 * (taps - 1)) / factor) * np.kaiser(taps, beta)
-    return np.asarray(weights / weights.sum())
+    """Return the impulse response of the filter before one of so many samples is kept, an odd number of taps."""
+    from scipy.signal import firwin, kaiserord  # slow to import
+
+    # What would fold into the kept band is stopped.
+    taps, beta = kaiserord(c.STOP_BAND, 2.0 * (1.0 - c.KEPT_BAND) / factor)
+    return np.asarray(firwin(taps | 1, 1.0 / factor, window=("kaiser", beta)))
 
 
 def thinned_by(samples: Array, weights: Array, factor: int) -> Array:
     """Return every so many-th sample of a filtered record, where the filter does not reach beyond it."""
-    parts = -(-weights.size // factor)
-    pieces = np.append(weights[::-1], np.zeros(parts * factor - weights.size)).reshape(parts, factor)
-    count = (samples.size - weights.size) // factor + 1
-    samples = np.append(samples, np.zeros(factor))
-    thinned = np.zeros(count)
-    for k, piece in enumerate(pieces):
-        thinned += samples[k * factor : (k + count) * factor].reshape(count, factor) @ piece
-    return thinned
+    from scipy.signal import upfirdn  # slow to import
+
+    # Later by so many samples, the first output that the whole filter has entered is one of those kept.
+    later = -(weights.size - 1) % factor
+    first = (weights.size - 1 + later) // factor
+    thinned = upfirdn(np.pad(weights, (later, 0)), samples, down=factor)
+    return np.asarray(thinned[first:][: (samples.size - weights.size) // factor + 1])
 
 
 def refuse_unusable(samples: Array) -> None:

@@ -1,7 +1,6 @@
 """Tones over time: of each instant the longest sound windows, followed from each instant to the next."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -57,14 +56,6 @@ def _windows(lengths: list[int], count: int, places: Array) -> list[IndexArray]:
     return chosen[::-1]
 
 
-@dataclass
-class _Path:
-    """Readings of one tone, ascending in time, and the row of the last one."""
-
-    readings: list[int] = field(default_factory=list)
-    last: int = 0
-
-
 def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     """Return the readings of each tone, the strongest tone first."""
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
@@ -104,25 +95,24 @@ def _centre(found: Readings, path: IndexArray) -> float:
 
 def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
     """Pair readings of adjacent rows so that the sum of their misfits is least."""
-    ended: list[_Path] = []
-    open_: list[_Path] = []
+    ended: list[list[int]] = []
+    open_: list[list[int]] = []
     bounds = np.searchsorted(found.row, np.arange(places.size + 1))
     for row in range(places.size):
-        still = [p for p in open_ if row - p.last <= max(c.PATIENCE, found.window[p.readings[-1]] / step)]
-        ended += [p for p in open_ if p not in still]
-        open_ = still
+        pause = [row - found.row[path[-1]] - max(c.PATIENCE, found.window[path[-1]] / step) for path in open_]
+        ended += [path for path, late in zip(open_, pause, strict=True) if late > 0]
+        open_ = [path for path, late in zip(open_, pause, strict=True) if late <= 0]
         here = np.arange(bounds[row], bounds[row + 1])
         free = np.ones(here.size, np.bool_)
         if open_ and here.size:
-            before = np.array([p.readings[-1] for p in open_])
+            before = np.array([path[-1] for path in open_])
             misfit = np.minimum(_misfit(found, before, here, places), 1.0)
             for old, new in zip(*linear_sum_assignment(misfit), strict=True):
                 if misfit[old, new] < 1.0:
-                    open_[old].readings.append(int(here[new]))
-                    open_[old].last = row
+                    open_[old].append(int(here[new]))
                     free[new] = False
-        open_ += [_Path([int(k)], row) for k in here[free]]
-    return [np.array(p.readings) for p in ended + open_]
+        open_ += [[int(k)] for k in here[free]]
+    return [np.array(path) for path in ended + open_]
 
 
 def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array) -> Array:

@@ -154,11 +154,6 @@ class Track:
         """Where a tone is there or may be, shape (N, n)."""
         return np.asarray((self.flags & int(Flag.ABSENT)) == 0)
 
-    @property
-    def states_errors(self) -> bool:
-        """Whether any standard error of a frequency is known, or there is none to be known."""
-        return not self.omega.size or bool(np.isfinite(self.error).any())
-
     def of_accuracy(self, accuracy: float | None) -> Track:
         """Return the track, not valid where a standard error exceeds an accuracy.
 

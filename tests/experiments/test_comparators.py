@@ -104,9 +104,9 @@ def test_the_observer_converges_from_nearby(n):
 
 
 def test_the_observer_keeps_its_bounds_and_says_so():
-    options = Observer(tones=2, initial_frequencies=(2.0, 5.0), highest_frequency=6.0)
+    options = Observer(tones=2, initial_frequencies=(2.0, 5.0))
     track = options.track(np.sin(9.5 * T), INTERVAL)
-    assert ((track.frequencies >= 0.2) & (track.frequencies <= 6.0)).all()
+    assert ((track.frequencies >= 0.2) & (track.frequencies <= 8.0)).all()
     assert (np.diff(track.frequencies, axis=1) >= 0.3 - 1e-12).all()
     assert (track.flags & Flag.OUT_OF_BOUNDS).any()
     assert not track.valid.any()
@@ -143,9 +143,9 @@ def test_no_estimate_is_valid_where_there_are_no_two_tones(options, name):
     assert not options.track(NO_TWO_TONES[name], INTERVAL).valid.any()
 
 
-def test_too_few_iterations_are_reported():
-    options = Nonlinear(tones=2, initial_frequencies=(1.1, 1.9), max_iterations=1)
-    track = options.track(tones(2, 1500).sum(axis=1), INTERVAL)
+def test_too_few_iterations_are_reported(monkeypatch):
+    monkeypatch.setattr(whole, "MOST_STEPS", 0)
+    track = Nonlinear(tones=2).track(tones(2, 1500).sum(axis=1) + 0.1 * NOISE[:1500], INTERVAL)
     assert track.flags[0] & Flag.NOT_CONVERGED
 
 
@@ -155,12 +155,10 @@ def test_too_few_iterations_are_reported():
         (Observer, {"initial_frequencies": (2.0,)}, "initial_frequencies"),
         (Observer, {"initial_frequencies": (2.0, 2.1)}, "initial_frequencies"),
         (Observer, {"initial_frequencies": (2.0, 5.0), "ratio": 0.9}, "ratio"),
-        (Observer, {"initial_frequencies": (2.0, 5.0), "highest_frequency": 0.4}, "highest_frequency"),
+        (Observer, {"initial_frequencies": (2.0, 9.0)}, "initial_frequencies"),
         (Filter, {"pole": 0.0}, "pole"),
         (Filter, {"pole": 3.0, "gains": (1.0,)}, "gains"),
-        (Filter, {"pole": 3.0, "lowest_frequency": 3.0, "highest_frequency": 2.0}, "lowest_frequency"),
         (Esprit, {"averaging": -1.0}, "averaging"),
-        (Nonlinear, {"initial_frequencies": (2.0, 2.0)}, "initial_frequencies"),
     ],
 )
 def test_impossible_options_are_refused(kind, options, field):
@@ -172,13 +170,10 @@ def test_impossible_options_are_refused(kind, options, field):
 @pytest.mark.parametrize(
     ("options", "count", "interval", "message"),
     [
-        (Observer(tones=2, initial_frequencies=(2.0, 5.0)), 1000, 0.5, "fastest pole of the observer, 3.456 rad/s"),
-        (Filter(tones=2, pole=4.0, hold=1e307), 1000, 0.01, "hold = 1e\\+307 s is longer than the record, 10 s"),
+        (Observer(tones=2, initial_frequencies=(2.0, 5.0)), 1000, 0.5, "fastest rate of the observer, 3.456 rad/s"),
         (Filter(tones=2, pole=320.0), 1000, 0.01, "one below 314.159 rad/s"),
         (Esprit(tones=2, averaging=29.0), 3000, 0.01, "1 samples, after the averaging, are too few for 2 tones"),
-        (Esprit(tones=1, averaging=1.0, highest_frequency=10.0), 3000, 0.01, "show frequencies up to 3.14159 rad/s"),
         (Esprit(tones=1), 200_000, 0.01, "200,000 samples are more than the 100,000 .* at least 0.02 s"),
-        (Nonlinear(tones=2, initial_frequencies=(2.0, 5000.0)), 3000, 0.01, "must be below 314.2 rad/s"),
     ],
 )
 def test_records_that_do_not_fit_are_refused_before_there_are_any(options, count, interval, message):

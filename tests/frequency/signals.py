@@ -67,14 +67,13 @@ def regression_rows(y, n, lag):
     return rows[:, n], rows[:, :n]
 
 
-def frequencies_of(theta, delay, *, lowest=0.0, highest=None):
+def frequencies_of(theta, delay):
     """Frequencies that belong to the parameters of the delay regression, and their flags."""
     theta = np.ascontiguousarray(theta, dtype=float)
     omega = np.empty(theta.size)
-    return omega, Flag(decode(theta, clock_of(delay, lowest, highest), np.empty(theta.size), omega))
+    return omega, Flag(decode(theta, clock_of(delay), np.empty(theta.size), omega))
 
 
-def clock_of(delay, lowest=0.0, highest=None):
-    """A regression of which only the delay and the bounds matter."""
-    bottom = -1.0 if highest is None else float(np.cos(highest * delay))
-    return Clock(1.0, 1, float(delay), 1, 1.0, bottom, float(np.cos(lowest * delay)), 1)
+def clock_of(delay):
+    """A regression of which only the delay matters."""
+    return Clock(1.0, 1, float(delay), 1, 1.0, 1)

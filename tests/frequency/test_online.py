@@ -94,7 +94,6 @@ def test_estimates_explain_themselves():
         ),
         (DremWindow, {"d": 0.3, "memory": 0.05}, 0.01, r"memory = 0.05 s holds 5 samples of 0.01 s, fewer than the 8"),
         (DremFiniteTime, {"d": 0.1}, 0.5, r"d = 0.1 s is shorter than half a sampling interval of 0.5 s"),
-        (DremFiniteTime, {"h": 0.44, "d": 0.5, "highest_frequency": 7.0}, 0.5, "above pi/h = 6.28319 .* is 7 rad/s"),
     ],
 )
 def test_options_that_a_clock_cannot_have_are_refused(kind, options, interval, message):

@@ -10,6 +10,13 @@ from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
 from .common import complete_samples, is_certain, require_positive, scaled_inverses
 
+#: Rate of the adaptation [1/s], and the time before which there is none [s].
+RATE = 0.3
+HOLD = 2.0
+#: Frequencies are kept within bounds, and apart from each other [rad/s].
+LOWEST = 0.2
+HIGHEST = 8.0
+SMALLEST_GAP = 0.3
 #: Ridge of the Gauss-Newton matrix, as a fraction of its trace.
 TRACE_RIDGE = 1e-4
 
@@ -23,21 +30,11 @@ class AdaptiveObserver(FrequencyEstimator):
     tones : int
         Number of sinusoids n, 1 to 8.
     initial_frequencies : tuple of float
-        Frequencies to begin with [rad/s], ascending and at least ``smallest_gap`` apart.
+        Frequencies to begin with [rad/s], ascending 0.3 apart, from 0.2 to 8.
     pole : float, default 2.0
         Slowest rate of the observer [rad/s], near the frequencies.
     ratio : float, default 1.2
         Ratio of one rate to the next [-], 1 or more.
-    rate : float, default 0.3
-        Rate of the adaptation [1/s].
-    hold : float, default 2.0
-        No adaptation before this time [s].
-    smallest_gap : float, default 0.3
-        Frequencies are kept this far apart [rad/s].
-    lowest_frequency : float, default 0.2
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, default 8.0
-        Upper bound of the frequencies [rad/s].
 
     Notes
     -----
@@ -54,27 +51,16 @@ class AdaptiveObserver(FrequencyEstimator):
     initial_frequencies: tuple[float, ...]
     pole: float = 2.0
     ratio: float = 1.2
-    rate: float = 0.3
-    hold: float = 2.0
-    smallest_gap: float = 0.3
-    lowest_frequency: float = 0.2
-    highest_frequency: float = 8.0
 
     def __post_init__(self):
         super().__post_init__()
-        require_positive(self, "pole", "rate", "smallest_gap", "lowest_frequency", "highest_frequency")
+        require_positive(self, "pole")
         if self.ratio < 1.0:
             raise DataError(f"ratio must be 1 or more, not {self.ratio!r}", "ratio")
-        if self.hold < 0.0:
-            raise DataError(f"hold must not be negative, not {self.hold!r}", "hold")
-        if self.highest_frequency < self.lowest_frequency + (self.tones - 1) * self.smallest_gap:
-            bounds = f"between {self.lowest_frequency:g} and {self.highest_frequency:g} rad/s"
-            apart = f"{self.tones} frequencies, {self.smallest_gap:g} rad/s apart,"
-            raise DataError(f"{apart} do not fit {bounds}", "highest_frequency")
         self.keep_one_for_each("initial_frequencies", "rad/s")
-        edges = np.concatenate(([self.lowest_frequency - self.smallest_gap], self.initial_frequencies))
-        if (np.diff(edges) < self.smallest_gap - 1e-12).any() or edges[-1] > self.highest_frequency:
-            rising = "must rise from lowest_frequency to highest_frequency in steps of at least smallest_gap"
+        edges = np.concatenate(([LOWEST - SMALLEST_GAP], self.initial_frequencies))
+        if (np.diff(edges) < SMALLEST_GAP - 1e-12).any() or edges[-1] > HIGHEST:
+            rising = f"must rise from {LOWEST:g} to {HIGHEST:g} rad/s in steps of at least {SMALLEST_GAP:g} rad/s"
             raise DataError(f"initial_frequencies {rising}, not {self.initial_frequencies!r}", "initial_frequencies")
 
     @property
@@ -83,28 +69,23 @@ class AdaptiveObserver(FrequencyEstimator):
         return self.pole * self.ratio ** np.arange(2 * self.tones, dtype=float)
 
     def check(self, count, interval):
-        """Refuse records that are shorter than the hold, and clocks that are too slow."""
-        if self.hold > count * interval:
-            raise DataError(f"hold = {self.hold:g} s is longer than the record, {count * interval:g} s", "hold")
-        fastest = self.poles[-1]
-        if fastest * interval > 1.0:
+        """Refuse clocks that are too slow."""
+        fastest = max(float(self.poles[-1]), RATE)
+        if fastest * interval >= 1.0:
             needed = f"needs a sampling interval below {1.0 / fastest:g} s"
-            raise DataError(f"the fastest pole of the observer, {fastest:g} rad/s, {needed}", "pole")
-        if self.rate * interval >= 1.0:
-            needed = f"needs a sampling interval below {1.0 / self.rate:g} s"
-            raise DataError(f"rate = {self.rate:g} 1/s {needed}", "rate")
+            raise DataError(f"the fastest rate of the observer, {fastest:g} rad/s, {needed}", "pole")
 
     def track(self, samples, interval):
         """Return the estimate at every sample of the record."""
         y = complete_samples(samples)
         self.check(y.size, interval)
         n, count = self.tones, y.size
-        hold = round(self.hold / interval)
+        hold = round(HOLD / interval)
         initial = np.asarray(self.initial_frequencies, dtype=float)
-        bounds = np.array([self.smallest_gap, self.lowest_frequency, self.highest_frequency])
+        bounds = np.array([SMALLEST_GAP, LOWEST, HIGHEST])
         omega, prediction = np.empty((count, n)), np.zeros((count, n + 1))
         bounded = np.zeros(count, np.bool_)
-        observe(y, interval, self.poles, self.rate, hold, bounds, initial, omega, prediction, bounded)
+        observe(y, interval, self.poles, RATE, hold, bounds, initial, omega, prediction, bounded)
 
         flags = np.where(np.arange(count) < max(hold, 1), Flag.STARTING, 0)
         flags[bounded] |= Flag.OUT_OF_BOUNDS
@@ -112,7 +93,7 @@ class AdaptiveObserver(FrequencyEstimator):
         flags[~determined & (np.arange(count) >= hold)] |= Flag.UNDETERMINED
         # The effective length of an exponential window, and the delay of the observer.
         elapsed = interval * np.arange(1, count + 1)
-        span = np.minimum(elapsed, 2.0 / self.rate + 1.0 / self.pole)
+        span = np.minimum(elapsed, 2.0 / RATE + 1.0 / self.pole)
         flags[determined & ~is_certain(omega, error, span, elapsed)] |= Flag.UNCERTAIN
         return FrequencyTrack(interval * np.arange(count), omega, flags.astype(np.uint16))
 
@@ -121,7 +102,7 @@ class AdaptiveObserver(FrequencyEstimator):
 
         What an estimate still moves is added: it is not where it will be.
         """
-        forget = self.rate * interval
+        forget = RATE * interval
         error, xi = prediction[:, 0], prediction[:, 1:]
         smoothed = ([forget], [1.0, forget - 1.0])
         moments = lfilter(*smoothed, xi[:, :, None] * xi[:, None, :], axis=0)

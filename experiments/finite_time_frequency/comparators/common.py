@@ -29,14 +29,6 @@ def require_positive(options, *names):
             raise DataError(f"{name} must be a positive number, not {value!r}", name)
 
 
-def require_ordered_bounds(options):
-    """Refuse bounds of frequencies that leave nothing between them."""
-    lowest, highest = options.lowest_frequency, options.highest_frequency
-    if lowest < 0.0 or (highest is not None and not lowest < highest):
-        above = "must not be negative" if highest is None else f"must be 0 or more, and below {highest:g} rad/s"
-        raise DataError(f"lowest_frequency {above}, not {lowest:g} rad/s", "lowest_frequency")
-
-
 def is_certain(omega, error, span, elapsed, rounding=0.0):
     """Return whether rows of frequencies are certain, shape (N,).
 

@@ -11,8 +11,10 @@ from scipy.signal import lfilter
 
 from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
-from .common import complete_samples, is_certain, require_ordered_bounds, require_positive, scaled_inverses
+from .common import complete_samples, is_certain, require_positive, scaled_inverses
 
+#: Before this time there is no estimate [s].
+HOLD = 1.0
 #: The estimate is decoded anew every so many samples.
 REFRESH = 5
 #: Second moments summed over many samples carry relative errors of about this size.
@@ -37,12 +39,6 @@ class FilterRegression(FrequencyEstimator):
         Gains of the gradient algorithm, one for each parameter; 1 if not given.
     initial_frequencies : tuple of float, optional
         Frequencies to begin with [rad/s]; by default spread up to ``pole``.
-    hold : float, default 1.0
-        Least squares shows no estimate before this time [s].
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s].
 
     Notes
     -----
@@ -67,23 +63,15 @@ class FilterRegression(FrequencyEstimator):
     algorithm: Literal["least_squares", "gradient"] = "least_squares"
     gains: tuple[float, ...] | None = None
     initial_frequencies: tuple[float, ...] | None = None
-    hold: float = 1.0
-    lowest_frequency: float = 0.0
-    highest_frequency: float | None = None
 
     def __post_init__(self):
         super().__post_init__()
         require_positive(self, "pole", "forgetting")
-        require_ordered_bounds(self)
-        if self.hold < 0.0:
-            raise DataError(f"hold must not be negative, not {self.hold!r}", "hold")
         for name, unit in (("gains", "-"), ("initial_frequencies", "rad/s")):
             self.keep_one_for_each(name, unit)
 
     def check(self, count, interval):
-        """Refuse records that are shorter than the hold, and clocks that are too slow."""
-        if self.hold > count * interval:
-            raise DataError(f"hold = {self.hold:g} s is longer than the record, {count * interval:g} s", "hold")
+        """Refuse clocks that are too slow."""
         if self.pole * interval > np.pi:
             beyond = f"pole = {self.pole:g} rad/s is beyond what samples every {interval:g} s can show"
             raise DataError(f"{beyond}; use one below {np.pi / interval:g} rad/s", "pole")
@@ -99,7 +87,7 @@ class FilterRegression(FrequencyEstimator):
         rows[0] = 0.0
 
         # Estimates are decoded at these samples, and hold until the next one; before the first the initial ones do.
-        hold = round(self.hold / interval)
+        hold = round(HOLD / interval)
         decoded = np.arange(max(hold, REFRESH), count, REFRESH)
         keep = np.exp(-self.forgetting * interval)
         moments = lfilter([1.0], [1.0, -keep], rows[:, :, None] * rows[:, None, :], axis=0)[decoded]
@@ -128,8 +116,7 @@ class FilterRegression(FrequencyEstimator):
         inverses = inverses / (scales[:, :, None] * scales[:, None, :])
         if coefficients is None:
             coefficients = np.einsum("mij,mj->mi", inverses, moments[:, :n, n])
-        highest = np.inf if self.highest_frequency is None else self.highest_frequency**2
-        roots, flags = bounded_roots(coefficients, self.lowest_frequency**2, highest)
+        roots, flags = positive_roots(coefficients)
         omega = np.sqrt(roots)
 
         # The misfit of the equations moves a frequency by at most sqrt(g' G^-1 g e'e), with g its derivatives to the
@@ -178,8 +165,8 @@ def filter_chain(y, pole, order, interval):
     return chain
 
 
-def bounded_roots(coefficients, lowest, highest):
-    """Return the real parts of the roots of ``x^n + a_1 x^(n-1) + ... + a_n`` within bounds, ascending, and flags."""
+def positive_roots(coefficients):
+    """Return the real parts of the roots of ``x^n + a_1 x^(n-1) + ... + a_n``, ascending from zero, and flags."""
     count, n = coefficients.shape
     companions = np.zeros((count, n, n))
     companions[:, 0] = -np.where(np.isfinite(coefficients), coefficients, 0.0)
@@ -187,9 +174,8 @@ def bounded_roots(coefficients, lowest, highest):
     roots = np.linalg.eigvals(companions)
     flags = np.where((np.imag(roots) != 0.0).any(axis=1), Flag.COMPLEX_ROOTS, 0)
     real = np.sort(np.real(roots), axis=1)
-    clipped = np.clip(real, lowest, highest)
-    flags[(clipped != real).any(axis=1)] |= Flag.OUT_OF_BOUNDS
-    return clipped, flags
+    flags[(real < 0.0).any(axis=1)] |= Flag.OUT_OF_BOUNDS
+    return np.maximum(real, 0.0), flags
 
 
 def root_derivatives(roots):

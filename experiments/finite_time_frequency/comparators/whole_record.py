@@ -7,7 +7,7 @@ import numpy as np
 
 from ctid_cli import DataError, Flag, FrequencyEstimator, FrequencyTrack
 
-from .common import complete_samples, is_certain, require_ordered_bounds, require_positive
+from .common import complete_samples, is_certain
 
 #: Rows of ESPRIT's Hankel matrix as a fraction of the samples, and the largest number of them.
 ROWS_FRACTION = 0.4
@@ -22,6 +22,9 @@ SINGULAR = 1e-10
 ROUNDING = 1e-13
 #: Probability with which white noise alone has a tone that is called one.
 FALSE_TONE = 1e-6
+#: Gauss-Newton steps end when one turns no phase by more than this over the record [rad], or after so many.
+TOLERANCE = 1e-8
+MOST_STEPS = 50
 #: Halvings of a step that raises the cost by more than these fractions of itself and of the signal's square.
 HALVINGS = 20
 COST_ROUNDING = 1e-12
@@ -39,10 +42,6 @@ class Esprit(FrequencyEstimator):
     averaging : float, default 0.0
         Blocks of this length are averaged first [s], so that some hundred samples are left; 0 for none. Frequencies
         must lie below pi over this time.
-    lowest_frequency : float, default 0.0
-        Lower bound of the frequencies [rad/s].
-    highest_frequency : float, optional
-        Upper bound of the frequencies [rad/s]; by default pi over the interval of the averages.
 
     Notes
     -----
@@ -58,30 +57,19 @@ class Esprit(FrequencyEstimator):
     whole_record: ClassVar[bool] = True
 
     averaging: float = 0.0
-    lowest_frequency: float = 0.0
-    highest_frequency: float | None = None
 
     def __post_init__(self):
         super().__post_init__()
         if self.averaging < 0.0:
             raise DataError(f"averaging must not be negative, not {self.averaging!r}", "averaging")
-        require_ordered_bounds(self)
 
     def check(self, count, interval):
-        """Refuse averages that hide the frequencies, and records that leave too few of them or too many."""
+        """Refuse records of which too few averages are left, or too many."""
         self._blocks(count, interval)
 
     def _blocks(self, count, interval):
-        """Return samples in an average, rows of the Hankel matrix, and the upper bound of the frequencies [rad/s]."""
+        """Return samples in an average, and rows of the Hankel matrix."""
         block = max(1, round(min(self.averaging / interval, float(count))))
-        highest = np.pi / (block * interval)
-        if self.highest_frequency is not None:
-            if self.highest_frequency > highest * (1.0 + 1e-12):
-                shown = f"averages over {block * interval:g} s show frequencies up to {highest:g} rad/s"
-                asked = f"highest_frequency is {self.highest_frequency:g} rad/s"
-                remedy = f"use an averaging below {np.pi / self.highest_frequency:g} s"
-                raise DataError(f"{shown}, but {asked}; {remedy}", "averaging")
-            highest = self.highest_frequency
         averages = count // block
         rows = min(int(ROWS_FRACTION * averages), MOST_ROWS)
         if rows < 2 * self.tones + 1:
@@ -91,13 +79,13 @@ class Esprit(FrequencyEstimator):
             many = f"{averages:,} samples are more than the {MOST_AVERAGES:,} that ESPRIT takes"
             least = f"{count / MOST_AVERAGES * interval:.2g} s"
             raise DataError(f"{many}; use an averaging of at least {least}, or a part of the record", "averaging")
-        return block, rows, highest
+        return block, rows
 
     def track(self, samples, interval):
         """Return the rotation of the signal space of the averaged record."""
         y = complete_samples(samples)
         n = self.tones
-        block, rows, highest = self._blocks(y.size, interval)
+        block, rows = self._blocks(y.size, interval)
         averages = y[: y.size // block * block].reshape(-1, block).mean(axis=1)
         hankel = np.lib.stride_tricks.sliding_window_view(averages, averages.size - rows + 1)
         vectors, singular_values, _ = np.linalg.svd(hankel, full_matrices=False)
@@ -111,36 +99,26 @@ class Esprit(FrequencyEstimator):
             # Real eigenvalues: a constant, an alternating or a vanishing part instead of a sinusoid.
             flags |= Flag.COMPLEX_ROOTS
             angles = np.sort(np.abs(np.angle(rotations)))[::2]
-        omega = angles / (block * interval)
-        bounded = np.clip(omega, self.lowest_frequency, highest)
-        if (bounded != omega).any():
-            flags |= Flag.OUT_OF_BOUNDS
-        return whole_track(y, interval, bounded, flags)
+        return whole_track(y, interval, angles / (block * interval), flags)
 
 
 @dataclass(frozen=True, kw_only=True)
-class NonlinearLeastSquares(FrequencyEstimator):
+class NonlinearLeastSquares(Esprit):
     r"""Frequencies of a whole record by nonlinear least squares: maximum likelihood in white Gaussian noise.
 
     Parameters
     ----------
     tones : int
         Number of sinusoids n, 1 to 8.
-    initial_frequencies : tuple of float, optional
-        Start [rad/s]; by default that of :class:`Esprit`.
     averaging : float, default 0.0
-        Blocks that ESPRIT averages for the start [s]; 0 for none.
-    max_iterations : int, default 50
-        Largest number of iterations.
-    tolerance : float, default 1e-8
-        Stop when a step turns no phase by more than this over the record [rad].
+        Blocks that :class:`Esprit` averages for the start [s]; 0 for none.
 
     Notes
     -----
     Minimises the sum of squares over frequencies and amplitudes. The amplitudes are eliminated in every step (variable
     projection), and the Gauss-Newton step of the frequencies is halved until it lowers the cost. In white Gaussian
     noise the estimate reaches the Cramer-Rao bound. The cost has many minima about 2 pi/T apart, T the length of the
-    record, so the start must be close.
+    record, so the start must be close: ESPRIT is.
 
     References
     ----------
@@ -148,50 +126,17 @@ class NonlinearLeastSquares(FrequencyEstimator):
     Technical Journal* 55 (1976) 1389-1410. doi:10.1002/j.1538-7305.1976.tb02941.x
     """
 
-    whole_record: ClassVar[bool] = True
-
-    initial_frequencies: tuple[float, ...] | None = None
-    averaging: float = 0.0
-    max_iterations: int = 50
-    tolerance: float = 1e-8
-
-    def __post_init__(self):
-        super().__post_init__()
-        require_positive(self, "max_iterations", "tolerance")
-        self.keep_one_for_each("initial_frequencies", "rad/s")
-        initial = self.initial_frequencies or ()
-        if len(set(initial)) < len(initial):
-            raise DataError(f"initial_frequencies must differ, not {initial!r}", "initial_frequencies")
-
-    @property
-    def start(self):
-        """Estimator of the start."""
-        return Esprit(tones=self.tones, averaging=self.averaging)
-
-    def check(self, count, interval):
-        """Refuse a start that the clock cannot show, and records that are too short."""
-        if self.initial_frequencies is None:
-            self.start.check(count, interval)
-            return
-        highest = np.pi / interval
-        if max(self.initial_frequencies) >= highest:
-            beyond = f"must be below {highest:.4g} rad/s, pi over the sampling interval"
-            raise DataError(f"initial_frequencies {beyond}", "initial_frequencies")
-        if count < 3 * self.tones:
-            raise DataError(f"{count} samples are too few for {self.tones} tones; use a longer record", "tones")
-
     def track(self, samples, interval):
-        """Return the end of Gauss-Newton steps from the given frequencies, or from those of ESPRIT."""
+        """Return the end of Gauss-Newton steps from the frequencies of ESPRIT."""
         y = complete_samples(samples)
-        self.check(y.size, interval)
         flags = Flag(0)
-        omega = np.sort(self.initial_frequencies or self.start.track(y, interval).frequencies[0])
+        omega = super().track(y, interval).frequencies[0]
         t = centred_times(y.size, interval)
         negligible = SIGNAL_ROUNDING * float(y @ y)
         try:
             step, _, cost = frequency_step(y, t, omega)
-            for _ in range(self.max_iterations):
-                if np.abs(step).max() * (t[-1] - t[0]) <= self.tolerance:
+            for _ in range(MOST_STEPS):
+                if np.abs(step).max() * (t[-1] - t[0]) <= TOLERANCE:
                     break
                 for _ in range(HALVINGS):
                     trial = omega + step
