@@ -16,7 +16,7 @@ from ctid_cli.inference.bounds import (
     require_uncorrelated_input,
 )
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.models.controller import DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Gaussian
@@ -44,6 +44,8 @@ def expected_accuracy(
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
+    if source.loop is not None and isinstance(source.loop.controller, ContinuousController):
+        raise DataError("the controller acts in continuous time, and theory is given here for discrete ones")
     if (estimated.model.poles.real > 0.0).any():
         raise DataError("the system is unstable, and theory is given here for stable ones")
     why_not = _why_no_limit(source, estimated)
