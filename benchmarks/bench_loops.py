@@ -14,8 +14,8 @@ noise: ``runs`` records of each of the twelve, by ``LoopOutputError``: how many 
 their intervals hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A.
 González et al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025),
 arXiv:2401.01263, with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes'
-frequencies, beside CLSRIVC that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance, by what is
-known of the loop: reference and controller, the reference alone, or nothing (the direct method).
+frequencies, beside CLSRIVC that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance,
+by what is known of the loop: reference and controller, the reference alone, or nothing (the direct method).
 """
 
 import argparse
