@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
+from ctid_cli.arrays import Array
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import (
     MODAL_CONDITION_LIMIT,
@@ -33,7 +33,6 @@ from ctid_cli.filtering.bank import (
     chain_pass,
     modal_form,
     modal_pass,
-    to_steady_state,
 )
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.loop import law_of, loop_pass
@@ -42,7 +41,7 @@ from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import DiscreteController
 
 #: State of the filters at the first sample.
-InitialState = Literal["rest", "periodic", "estimated"]
+InitialState = Literal["rest", "estimated"]
 
 
 class LoopData(NamedTuple):
@@ -144,12 +143,9 @@ class SubmodelFilter:
         self.terms = tuple(terms)
         self.delay = float(delay)
         self.loop = loop
-        self.periodic = initial_state == "periodic"
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
         self.size = sum(term.size for term in terms)
         self._controller = DiscreteController(loop.numerator, loop.denominator)
-        if self.periodic and data.interval == 0.0:
-            raise ValueError("initial_state periodic needs input and output on one regular clock")
 
     def moments(self, theta: Array) -> Equations | None:
         """Return the second moments at one parameter vector; None where they are not finite."""
@@ -211,8 +207,6 @@ class SubmodelFilter:
         modal = [each for each in forms if each is not None]
         if len(modal) == len(parts):
             return pooled_forms(parts, modal, pooled_modes(modal, direct), self.loop.closed)
-        if self.periodic:
-            return None
         chains = Chains(tuple(part.chain() for part in parts), direct)
         return pooled_forms(parts, chains.forms, chains, self.loop.closed)
 
@@ -223,10 +217,7 @@ class SubmodelFilter:
         if isinstance(model, Chains):
             found = chain_pass(data, model, delay, instruments)
             return found if rows else found[:, :leading].T @ found
-        states = None
-        if self.periodic:
-            data, delay, states = self._in_steady_state(data, model)
-        return modal_pass(data, model, delay, rows=rows, leading=leading, states=states, instruments=instruments)
+        return modal_pass(data, model, delay, rows=rows, leading=leading, instruments=instruments)
 
     def instrument_input(self, theta: Array) -> Array | None:
         """Return what drives the instruments: the input, or that of the noise-free loop."""
@@ -246,27 +237,6 @@ class SubmodelFilter:
             return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop[:4]))
         plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
         return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
-
-    def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
-        """Return the record with its input late by whole intervals, the delay left, and states that come back."""
-        count, interval = data.y.size, data.interval
-        period = interval * count
-        shift, fraction = split_delay(self.delay, interval)
-        rolled = np.roll(data.u, shift)
-        # Two samples more: the last interval leads back to the first sample, where the next slope begins.
-        data, delay = data._replace(u=np.concatenate((rolled, rolled[:2]))), -fraction * interval
-        nothing = data._replace(use=np.zeros(count, dtype=bool))
-        initial = np.zeros((modes.poles.size, 5), np.complex128)
-        modal_pass(nothing, modes, delay, states=initial)
-        initial[:, 2:] = 0.0
-        to_steady_state(modes.poles, period, initial)
-        # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
-        # the first sample.
-        states, once_round = initial.copy(), np.append(data.y, data.y[0])
-        whole = nothing._replace(y=once_round, use=np.zeros(count + 1, dtype=bool))
-        modal_pass(whole, modes, delay, states=states)
-        initial[:, 2] = states[:, 2] / -np.expm1(modes.poles * period)
-        return data, delay, initial
 
 
 def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:

@@ -9,9 +9,8 @@ from scipy.signal import cont2discrete
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, without_feedback
 from ctid_cli.estimators.srivc import Srivc
-from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.loop import loop_radius, simulate_continuous_loop, simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
