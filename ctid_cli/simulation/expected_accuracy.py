@@ -110,7 +110,8 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> Esti
     if estimator.poles > fraction.order:
         raise DataError(f"the model has {has}: no data determine the poles in excess")
     weighed = getattr(estimator, "noise_model", "white") != "white"
-    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed)
+    simulated = estimator.kind == "loop_output_error"
+    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed, simulated)
 
 
 def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
@@ -158,6 +159,8 @@ def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
         return "the clock is irregular"
     if estimated.weighed:
         return "the noise is estimated too"
+    if estimated.simulated:
+        return "the output error of a simulated loop is least"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
         return f"the {name} is not white Gaussian noise held from sample to sample"
     if sampling.samples < LONG:
