@@ -19,7 +19,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.filtering import kernels
 from ctid_cli.filtering.bank import (
     MODAL_CONDITION_LIMIT,
     MOST_MODAL_INTEGRATORS,
@@ -34,7 +33,7 @@ from ctid_cli.filtering.bank import (
     modal_form,
     modal_pass,
 )
-from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
+from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.loop import law_of, loop_pass
 from ctid_cli.filtering.simulate import sampled_chains
 from ctid_cli.models.additive import Term
@@ -47,14 +46,12 @@ InitialState = Literal["rest", "estimated"]
 class LoopData(NamedTuple):
     """The feedback around a record."""
 
-    #: Reference at the sampling instants; empty in open loop, shape (N,).
+    #: Reference at the sampling instants, or where the controller is not known what of the input follows it; empty in
+    #: open loop, shape (N,).
     reference: Array
-    #: Controller in descending powers of q, monic, both of one length, shape (nc + 1,).
-    numerator: Array
-    denominator: Array
-    at_controller: bool
-    #: Whether the reference is the instruments' input itself, and the controller is not known.
-    direct: bool = False
+    controller: DiscreteController | None = None
+    #: Whether the reference enters before the controller.
+    at_controller: bool = True
 
     @property
     def closed(self) -> bool:
@@ -63,7 +60,7 @@ class LoopData(NamedTuple):
 
 
 #: No feedback.
-OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
+OPEN_LOOP = LoopData(np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +142,6 @@ class SubmodelFilter:
         self.loop = loop
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
         self.size = sum(term.size for term in terms)
-        self._controller = DiscreteController(loop.numerator, loop.denominator)
 
     def moments(self, theta: Array) -> Equations | None:
         """Return the second moments at one parameter vector; None where they are not finite."""
@@ -213,7 +209,7 @@ class SubmodelFilter:
     def _pass(self, data: FilterData, pooled: "Pooled", *, rows: bool, leading: int | None) -> Array:
         """Return the rows of the pass, or their moments."""
         model, delay = pooled.model, self.delay
-        instruments = self._loop_input(model) if self.loop.closed else None
+        instruments = self._loop_input(pooled.parts) if self.loop.closed else None
         if isinstance(model, Chains):
             found = chain_pass(data, model, delay, instruments)
             return found if rows else found[:, :leading].T @ found
@@ -223,20 +219,17 @@ class SubmodelFilter:
         """Return what drives the instruments: the input, or that of the noise-free loop."""
         if not self.loop.closed:
             return self.data.u
-        pooled = self._pooled(theta)
-        return None if pooled is None else self._loop_input(pooled.model)
+        parts = _parts(theta[: self.size], self.terms)
+        return None if parts is None else self._loop_input(parts)
 
-    def _loop_input(self, model: Modes | Chains) -> Array:
-        """Return the input of the noise-free loop of a model."""
-        interval, reference = self.data.interval, self.loop.reference
-        if self.loop.direct:
+    def _loop_input(self, parts: Sequence[Part]) -> Array:
+        """Return the input of the noise-free loop of submodels."""
+        reference, controller, at_controller = self.loop
+        if controller is None:
             return reference
-        if isinstance(model, Modes):
-            clock = (interval, *split_delay(self.delay, interval))
-            direct = float(model.direct.sum())
-            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop[:4]))
-        plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
-        return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
+        chains = Chains(tuple(part.chain() for part in parts), np.array([part.direct for part in parts]))
+        plant = sampled_chains(chains, self.data.interval, self.delay)
+        return loop_pass(plant, law_of(controller), reference, np.zeros(reference.size), at_controller)[0]
 
 
 def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
@@ -255,6 +248,7 @@ def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
 class Pooled(NamedTuple):
     """All submodels in one pass, and psi, phi and the model output driven by z as maps of its rows."""
 
+    parts: Sequence[Part]
     model: Modes | Chains
     #: Number of rows of z.
     width: int
@@ -302,7 +296,7 @@ def pooled_forms(
         )
         output += part.output(driven[:, :order], driven[:, order])
         first += own
-    return Pooled(model, n, np.hstack(psi), np.hstack(phi), output)
+    return Pooled(parts, model, n, np.hstack(psi), np.hstack(phi), output)
 
 
 # --- free responses -------------------------------------------------------------------------------------------------

@@ -57,10 +57,7 @@ def record(seed=1, n=300, hold="zoh", interval=INTERVAL, masked=()):
 
 def feedback(controller, n, enters="controller", seed=7):
     """A loop laid out for the pass."""
-    padded = np.zeros(controller.denominator.size)
-    padded[padded.size - controller.numerator.size :] = controller.numerator
-    reference = np.random.default_rng(seed).standard_normal(n)
-    return LoopData(reference, padded, np.array(controller.denominator), enters == "controller")
+    return LoopData(np.random.default_rng(seed).standard_normal(n), controller, enters == "controller")
 
 
 def assert_rows(rows, expected, tolerance):
