@@ -4,6 +4,8 @@ The modes, the clock and the start are those of ``configs/additive/flexible_beam
 searched between 0 and 2 ms. Found: the squared output error is below 1.2 times that of the noise.
 
     python benchmarks/bench_beam.py SEED RUNS SNR_DB
+
+Each record is printed to stderr when it is done.
 """
 
 import sys
@@ -42,7 +44,11 @@ def one(rng: np.random.Generator, snr_db: float) -> tuple[float, float]:
 def main(seed: int = 20261126, runs: int = 20, snr_db: float = 100.0) -> None:
     """Print how often the beam, and its delay, is found."""
     rng = np.random.default_rng(seed)
-    ratios, errors = np.array([one(rng, snr_db) for _ in range(runs)]).T
+    records = []
+    for k in range(runs):
+        records.append(one(rng, snr_db))
+        print(k, *records[-1], file=sys.stderr, flush=True)
+    ratios, errors = np.array(records).T
     found, close = int((ratios < FOUND).sum()), int((np.abs(errors) < CLOSE).sum())
     print(f"seed {seed}, {snr_db:g} dB: found {found} of {runs}, delay within {CLOSE:g} s {close} of {runs}; ", end="")
     print(f"largest error of the delay {np.abs(errors).max():.2g} s")

@@ -1,21 +1,31 @@
 """Are plants found in their loops, unstable ones too, and do the errors hold? Simulated records, controller known.
 
     python benchmarks/bench_loops.py [--runs 17] [--seed 1] [--samples 4000] [--paper 60] [--unknown 60]
+    python benchmarks/bench_loops.py --known controller [--records 300] [--length 600] [--snr-db 15] [--seed 1]
 
-First 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output noise:
-``runs`` records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of their
-intervals hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A. González et
-al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025), arXiv:2401.01263,
-with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes' frequencies, beside CLSRIVC
-that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance, by what is known of the
-loop: reference and controller, the reference alone, or nothing (the direct method).
+With ``--known`` the plant ``4 exp(-.537 s)/(s^2 + 2.8 s + 4)``, sampled every .1 s in a loop with a PI controller, by
+what is known: ``controller`` and reference (the delay searched in 0 to 2 s, white noise), the ``reference`` (the delay
+told), or ``nothing`` (the direct method, the delay searched, noise (1 + .5 q^-1)/(1 - 1.5 q^-1 + .7 q^-2) e, which
+``--noise-model`` estimates: right, chosen, or too small). Errors are in standard deviations by theory, from the
+sensitivities at the truth with the record's own signals. Each record is printed to stderr when it is done.
+
+Without it, first 4/(p^2 - 1) in six loops with PD controllers kp (1 + td (1 - q^-1)/h), at two levels of white output
+noise: ``runs`` records of each of the twelve, by ``LoopOutputError``: how many end CONVERGED with errors, how many of
+their intervals hold the truth, and how many others have an error. Then two modes in the loop of section 6.2 of A.
+González et al., *Identification of additive continuous-time systems in open and closed loop*, Automatica (2025),
+arXiv:2401.01263, with a delay of .12 s that is searched in 0 to .5 s: errors of the delay and of the modes'
+frequencies, beside CLSRIVC that is told the delay. Last the same loop with noise e/(1 - .9 q^-1) of the same variance,
+by what is known of the loop: reference and controller, the reference alone, or nothing (the direct method).
 """
 
 import argparse
+import sys
+from collections import Counter
 
 from _timing import cpu
 
 import numpy as np
+from _table import print_errors
 
 from ctid_cli import (
     AdditiveModel,
@@ -26,19 +36,29 @@ from ctid_cli import (
     Loop,
     LoopOutputError,
     Record,
+    Rivc,
     Srivc,
     Status,
     Submodel,
     TransferFunction,
     simulate_loop,
 )
+from ctid_cli.estimation.additive_problem import following
+from ctid_cli.inference.innovations import SampledNoise, steps_of
+from ctid_cli.inference.sensitivities import sensitivities
 from ctid_cli.models.factoring import unfactored
+from ctid_cli.signals.noise import ArmaNoise, stream
 
 LOOPS = ((0.05, 1, 0.5, 1), (0.1, 1, 0.3, 1), (0.05, 1, 0.5, 10), (0.01, 2, 0.3, 10), (0.05, 0.5, 0.6, 1))
 LOOPS += ((0.02, 1, 0.5, 10),)
 UNSTABLE = TransferFunction([4.0], [1.0, 0.0, -1.0])
 MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])], 0.12)
 PID, INTERVAL = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0]), 0.05
+#: The loop of campaigns: plant, its parameters, controller and sampling interval; C and D of the coloured noise.
+LATE, DELAYS = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.537), (0.0, 2.0)
+TRUE = np.array([2.8, 4.0, 4.0, 0.537])
+PI, STEP, HELD = DiscreteController([0.5, -0.47], [1.0, -1.0]), 0.1, 5
+COLOURED = (1.0, 0.5), (1.0, -1.5, 0.7)
 
 
 def looped(plant, law, r, v, interval):
@@ -131,11 +151,93 @@ def paper_loop(runs, seed, coloured):
         print(f"{way:25} {counts}: {text}  {times[way] / runs:.2f} CPU s")
 
 
+def theory_with_controller(record, variance, v):
+    """Covariance of ``y - T r`` as the criterion: the noise goes through the loop, ``S v``."""
+    problem = LoopOutputError(2, 0, DELAYS).prepare(record).laid_out.problem
+    psi = problem.response.rows(TRUE, TRUE.size, problem.cell_of(TRUE[-1])).slopes * problem.data.use[:, None]
+    # The transposed loop runs backwards.
+    still = np.zeros(len(psi))
+    back = [(simulate_loop(LATE, PI, still, column, STEP).x + column)[::-1] for column in psi[::-1].T]
+    inverse = np.linalg.inv(psi.T @ psi)
+    return variance * inverse @ np.inner(back, back) @ inverse
+
+
+def theory_with_reference(record, variance, v):
+    """Covariance of instrumental variables made of what of the input follows the reference."""
+    followed = following(record.loop.reference, record.input.values)
+    psi, instruments = (
+        sensitivities(LATE, HeldSignal(record.t, u), record.t)[record.t >= LATE.delay]
+        for u in (record.input.values, followed)
+    )
+    inverse = np.linalg.inv(instruments.T @ psi)
+    return variance * inverse @ (instruments.T @ instruments) @ inverse.T
+
+
+def theory_of_the_direct_method(record, variance, v):
+    """Cramér-Rao bound of the plant beside unknown coefficients of the noise: in a loop they are not independent."""
+    used, free = record.t >= DELAYS[1], np.array([*COLOURED[0][1:], *COLOURED[1][1:]])
+    split, steps = len(COLOURED[0]) - 1, steps_of(used)
+
+    def whitened(coefficients, columns):
+        c, d = ((1.0, *part) for part in np.split(coefficients, [split]))
+        return SampledNoise(ArmaNoise(c, d, innovation_variance=1.0), steps).whitened(columns)
+
+    of_plant = whitened(free, sensitivities(LATE, record.input, record.t, estimate_delay=True)[used])
+    units = 1e-5 * np.eye(free.size)
+    of_noise = [(whitened(free - unit, v[used]) - whitened(free + unit, v[used])) / 2e-5 for unit in units]
+    J = np.column_stack((of_plant, *of_noise))
+    return variance * np.linalg.inv(J.T @ J)[: TRUE.size, : TRUE.size]
+
+
+def campaign(given):
+    """Print the table of one kind of knowledge."""
+    coloured, names = given.known == "nothing", ("a1", "a2", "b0", "delay")[: 3 if given.known == "reference" else 4]
+    truth = dict(zip(names, TRUE, strict=False))
+    estimator, theory = {
+        "controller": (LoopOutputError(2, 0, DELAYS), theory_with_controller),
+        "reference": (Srivc(2, 0, LATE.delay, instruments="reference"), theory_with_reference),
+        "nothing": (Rivc(2, 0, DELAYS, noise_model=given.noise_model), theory_of_the_direct_method),
+    }[given.known]
+    law = ArmaNoise(*(COLOURED if coloured else ((1.0,), (1.0,))), snr_db=given.snr_db)
+    errors, hits, ends, orders, spent = [], [], Counter(), Counter(), 0.0
+    for k in range(given.records):
+        r = np.repeat(stream(given.seed, "input", k).choice([-1.0, 1.0], given.length // HELD + 1), HELD)[
+            : given.length
+        ]
+        quiet = simulate_loop(LATE, PI, r, 0.0, STEP).x
+        v = law.generate(quiet, stream(given.seed, "noise", k))
+        record = looped(LATE, PI, r, v, STEP)
+        if given.known == "reference":
+            record = Record(record.t, record.y, record.input, loop=Loop(r, None))
+        elif coloured:
+            record = Record(record.t, record.y, record.input, feedback=True)
+        taken, fit = cpu(estimator.fit, record)
+        deviations = np.sqrt(np.diag(theory(record, law.innovation_variance_of(quiet), v)))
+        found = np.array([fit.parameters[name] - value for name, value in truth.items()])
+        errors.append(found / deviations[: found.size])
+        hits.append(np.array(covered(fit, truth)))
+        ends[fit.status.name] += 1
+        orders[getattr(getattr(fit, "noise", None), "orders", None)] += 1
+        spent += taken
+        print(k, f"{taken:.2f}", *errors[-1], *hits[-1].astype(int), file=sys.stderr, flush=True)
+    print(" ".join(f"{name}={value}" for name, value in vars(given).items()))
+    print_errors(names, errors, hits)
+    print(f"ends {dict(ends)}, noise {dict(orders.most_common(4))}, {spent / given.records:.2f} CPU s a record")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
+    parser.add_argument("--known", choices=("controller", "reference", "nothing"))
+    parser.add_argument("--snr-db", type=float, default=15.0)
+    parser.add_argument("--noise-model", default="arma:2,1")
+    for name, value in (("records", 300), ("length", 600)):
+        parser.add_argument(f"--{name}", type=int, default=value)
     for name, value in (("runs", 17), ("seed", 1), ("samples", 4000), ("paper", 60), ("unknown", 60)):
         parser.add_argument(f"--{name}", type=int, default=value)
     given = parser.parse_args()
+    if given.known:
+        campaign(given)
+        raise SystemExit
     six_loops(given.runs, given.samples, given.seed)
     paper_loop(given.paper, given.seed, False)
     paper_loop(given.unknown, given.seed, True)

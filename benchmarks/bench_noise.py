@@ -12,14 +12,18 @@ scatter        standard deviation of the errors
 rmse           root mean square error, that of the output-error fit beside it
 coverage       of 95 % intervals [%]
 hausman        rejections at 1 % [%]; orders: how often each pair was estimated
+
+Each record is printed to stderr when it is done.
 """
 
 import argparse
+import sys
 from collections import Counter
 
 from _timing import cpu
 
 import numpy as np
+from _table import print_errors
 
 from ctid_cli import HeldSignal, Record, Rivc, TransferFunction, simulate
 from ctid_cli.inference.innovations import SampledNoise, steps_of
@@ -69,17 +73,11 @@ def main():
         covered.append(np.abs(fit.theta - TRUE) <= fit.law.quantiles() * np.sqrt(np.diag(fit.covariance)))
         rejected += fit.noise.differs
         orders[fit.noise.orders] += 1
-    errors, beside = np.array(errors), np.array(beside)
+        print(replicate, f"{spent:.2f}", *errors[-1], file=sys.stderr, flush=True)
     print(" ".join(f"{name}={value}" for name, value in vars(asked).items()))
-    print("parameter      bias  (+-)  scatter  rmse  output error  coverage")
-    rows = zip(fit.parameter_names, errors.T, beside.T, np.mean(covered, axis=0), strict=True)
-    for name, own, other, share in rows:
-        spread, rmse, output_error = own.std(ddof=1), np.sqrt(np.mean(own**2)), np.sqrt(np.mean(other**2))
-        monte_carlo = spread / np.sqrt(own.size)
-        print(
-            f"{name:10} {own.mean():8.3f} {monte_carlo:5.3f} {spread:8.3f}",
-            f"{rmse:5.2f} {output_error:13.2f} {100 * share:9.1f}",
-        )
+    squares = {"rmse": errors, "output error": beside}
+    more = {title: np.sqrt(np.mean(np.square(own), axis=0)) for title, own in squares.items()}
+    print_errors(fit.parameter_names, errors, covered, **more)
     print(f"hausman {100 * rejected / asked.records:.1f} %, orders {dict(orders.most_common(5))}")
     print(f"{seconds / asked.records:.2f} s of a processor each")
 

@@ -15,6 +15,7 @@ from collections import Counter
 from _timing import cpu
 
 import numpy as np
+from _table import print_errors
 
 from ctid_cli import AdditiveModel, HeldSignal, Record
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
@@ -72,12 +73,7 @@ def main():
     if asked.chosen:
         print(f"numbers of modes {dict(sorted(numbers.items()))}")
     else:
-        print("parameter      bias  (+-)  scatter  coverage")
-        names = (*PLANT.names, "delay")
-        for name, own_errors, share in zip(names, np.array(errors).T, np.mean(covered, axis=0), strict=True):
-            spread = own_errors.std(ddof=1)
-            monte_carlo = spread / np.sqrt(own_errors.size)
-            print(f"{name:10} {own_errors.mean():8.3f} {monte_carlo:5.3f} {spread:8.3f} {100 * share:9.1f}")
+        print_errors((*PLANT.names, "delay"), errors, covered)
         print(f"ends {dict(statuses.most_common())}")
     print(f"{seconds / asked.records:.2f} s of a processor each")
 

@@ -237,12 +237,27 @@ def pt326() -> list[Row]:
     return rows
 
 
+def _variance_in_discrete_time(u: np.ndarray, y: np.ndarray) -> float:
+    """Return the variance of the innovations of the published discrete structure of the gas furnace."""
+    from scipy.optimize import least_squares
+    from scipy.signal import lfilter
+
+    def innovations(values: np.ndarray) -> np.ndarray:
+        b, (pole, first, second, level) = values[:3], values[3:]
+        noise = y - level - lfilter([0.0, 0.0, 0.0, *b], [1.0, -pole], u - u.mean())
+        return lfilter([1.0, -first, -second], [1.0], noise)[7:]
+
+    found = least_squares(innovations, [-0.5, -0.4, -0.5, 0.5, 1.5, -0.6, y.mean()])
+    return float(np.mean(found.fun**2))
+
+
 def gas_furnace() -> list[Row]:
     """Structure of Box and Jenkins' series J."""
     record = record_of("gas_furnace.csv")
     found = identify([record], Given(poles=1, noise_model="arma:2,0"))
     noise = found.fit.noise.noise
     gain = found.fit.parameters["b0"] / found.fit.parameters["a1"]
+    two = identify([record], Given(poles=2, zeros=0, noise_model="arma:2,0")).fit.noise.noise
     return [
         Row(
             "Gas furnace, delay",
@@ -257,6 +272,13 @@ def gas_furnace() -> list[Row]:
             f"D = 1 {noise.denominator[1]:+.2f} q^-1 {noise.denominator[2]:+.2f} q^-2; gain {gain:.2f}",
             "AR(2)",
             "the same",
+        ),
+        Row(
+            "Gas furnace, variance of the innovations",
+            "the same fit; beside it 2 poles and no zero",
+            f"{noise.innovation_variance:.4f}; {two.innovation_variance:.4f}",
+            f"{_variance_in_discrete_time(record.input.values, record.y):.4f}: delay 3 samples, 1 pole, AR(2)",
+            "three numerator coefficients, conditional least squares with `scipy.optimize`, by this script",
         ),
     ]
 

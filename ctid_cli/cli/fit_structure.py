@@ -32,7 +32,8 @@ LoopUse = Literal["none", "reference", "controller"]
 UNKNOWN = "unknown"
 DIRECT = (
     "The model is fitted to the input as it was measured in the loop (direct method): that is right only if the noise "
-    "model is (white noise of the output, or that of --noise) and if there is a delay of a sample in the loop."
+    "model is (white noise of the output, or that of --noise), if there is a delay of a sample in the loop, and if the "
+    "plant is stable."
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]

@@ -61,12 +61,10 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
         wanted = "an input that is held from sample to sample of a regular clock"
         raise DataError(f"{named(record)}instruments in a loop need {wanted}")
     if by_reference:
-        return LoopData(following(record.loop.reference, record.input.values), np.ones(1), np.ones(1), True, True)
+        return LoopData(following(record.loop.reference, record.input.values))
     assert record.loop.controller is not None
     controller = DiscreteController(record.loop.controller.numerator, record.loop.controller.denominator)
-    numerator = np.pad(controller.numerator, (controller.denominator.size - controller.numerator.size, 0))
-    reference, denominator = plain_array(record.loop.reference), plain_array(controller.denominator)
-    return LoopData(reference, numerator, denominator, record.loop.enters == "controller")
+    return LoopData(plain_array(record.loop.reference), controller, record.loop.enters == "controller")
 
 
 def following(reference: Array, u: Array) -> Array:
@@ -224,10 +222,8 @@ class AdditiveProblem:
 
     def loop_radius(self, model: AdditiveModel) -> float:
         """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
-        loop, interval = self.loop, self.data.interval
-        if not loop.closed or loop.direct or interval == 0.0:
-            return math.nan
-        return loop_radius(model, DiscreteController(loop.numerator, loop.denominator), interval)
+        controller, interval = self.loop.controller, self.data.interval
+        return math.nan if controller is None or interval == 0.0 else loop_radius(model, controller, interval)
 
     def _without_fixed(self, found: Equations) -> Equations:
         """Equations in which a known parameter has a row and a column of its own, and nothing moves it."""
@@ -322,7 +318,7 @@ def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> 
     loop, if that does not help, goes on with guarded steps.
     """
     whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
-    radius = problem.loop_radius(problem.model(whole)) if problem.loop.closed and not problem.loop.direct else 0.0
+    radius = 0.0 if problem.loop.controller is None else problem.loop_radius(problem.model(whole))
     if radius > 1.0 and problem.data.y.size * np.log(radius) > np.log(LARGEST_GROWTH):
         raise DataError(
             "the start makes an unstable loop with the controller: its poles reach the magnitude "

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctid_cli.errors import DataError
 from ctid_cli.filtering.simulate import simulate
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
@@ -41,7 +41,8 @@ def compile_kernels(estimators: Iterable[Any], *, regular: bool = True, closed: 
         t[1:] += rng.uniform(-0.1, 0.1, t.size - 1)
     held = HeldSignal(t, rng.choice([-1.0, 1.0], t.size))
     output = simulate(TransferFunction([2.0], [1.0, 2.0, 2.0], 0.4), held, t) + 0.1 * rng.standard_normal(t.size)
-    record = Record(t, output, held, loop=Loop(held.values, DiscreteController([0.1], [1.0])) if closed else None)
+    gain = (DiscreteController if regular else ContinuousController)([0.1], [1.0])
+    record = Record(t, output, held, loop=Loop(held.values, gain) if closed else None)
     for estimator in estimators:
         names = {item.name for item in fields(estimator)}
         # Not every structure can be estimated from this record: what was called before that is found is compiled.

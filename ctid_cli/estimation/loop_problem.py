@@ -219,7 +219,7 @@ class LoopProblem:
         """
         response, loop = self.response, OPEN_LOOP
         if self.data.interval and not response.continuous:
-            loop = LoopData(following(response.data.u, self.data.u), np.ones(1), np.ones(1), True, direct=True)
+            loop = LoopData(following(response.data.u, self.data.u))
         problem = AdditiveProblem(self.data, (Term(response.poles, response.zeros, response.integrators),), delay, loop)
         with suppress(DataError):
             model = automatic_start(record, problem).model

@@ -29,7 +29,7 @@ from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.signals.record import Record, beginning, named
 
-#: Of longer records these first samples are used, unless they are one period: poles need not be exact.
+#: Of longer records these first samples are used: poles need not be exact.
 LONGEST = 20_000
 #: Frequencies of an added pole or pair, and the dampings of a pair, that are tried.
 FREQUENCIES = 20
@@ -71,9 +71,7 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
     It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
     """
     data = filter_data(beginning(record, LONGEST), problem.delay)
-    # One period cannot be cut.
-    own = problem.data if problem.initial_state == "periodic" else data
-    problem = replace(problem, data=own, loop=OPEN_LOOP, fixed={})
+    problem = replace(problem, data=data, loop=OPEN_LOOP, fixed={})
     sets = _pole_sets(problem, data)
     best = _best(problem, sets)
     white = None if best is None else _whitened(data, best.error)

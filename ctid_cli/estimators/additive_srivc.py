@@ -31,7 +31,7 @@ from ctid_cli.inference.intervals import UncertainValue, normal_quantile
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, names_of
 from ctid_cli.models.factoring import unfactored
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
 #: Orders of the submodels that are tried to find the one that known parameters belong to.
@@ -102,8 +102,8 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         ``closed_loop`` simulates the instruments in the noise-free loop of the model with the record's controller and
         reference: needed for unbiased estimates where feedback brings coloured noise into the input. ``reference``
         takes in their place what of the input follows the reference, where the controller is not known.
-    initial_state : {"rest", "periodic", "estimated"}, default "rest"
-        State at the first sample: at rest, that of one period of a steady state, or free responses to be estimated.
+    initial_state : {"rest", "estimated"}, default "rest"
+        State at the first sample: at rest, or free responses to be estimated.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
         residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
@@ -184,10 +184,6 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         check_terms(self.terms)
         places_of(self.fixed, names_of(self.terms))
         check_closed_loop(self.instruments, self.variant)
-        if self.initial_state == "periodic":
-            text = "initial_state periodic needs open-loop instruments, and terms without integrators"
-            if self.instruments != "open_loop" or any(term.integrators for term in self.terms):
-                raise OptionError("initial_state", f"{text}; use rest or estimated")
 
     def check_start(self, start: Start) -> None:
         """Refuse a model with other submodels."""
@@ -196,12 +192,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
 
     def _lay_out(self, record: Record) -> Submodels:
         loop = loop_data(record, self.instruments)
-        # A record of one period has an input before its first sample: the same one.
-        periodic = self.initial_state == "periodic"
-        data = filter_data(record, 0.0 if periodic else self.delay, self.hold_output, periodic=periodic)
-        if self.initial_state == "periodic" and (data.interval == 0.0 or not record.valid.all()):
-            wanted = "one period of a steady state needs one regular clock without missing samples"
-            raise DataError(f"{named(record)}{wanted}; use initial_state 'estimated'")
+        data = filter_data(record, self.delay, self.hold_output)
         fixed = places_of(self.fixed, names_of(self.terms))
         problem = AdditiveProblem(data, self.terms, self.delay, loop, self.initial_state, fixed)
         check_record(record, data, problem.free)

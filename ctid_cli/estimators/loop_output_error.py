@@ -24,6 +24,7 @@ from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit, Starts
 from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import filter_data
+from ctid_cli.filtering.loop import NO_DELAY
 from ctid_cli.filtering.loop_response import LoopResponse
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.sensitivities import Structure
@@ -183,8 +184,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], [0.0], 0.0)
         assert record.loop is not None
         if loop.continuous and self.delay_bounds[1] > 0:
-            why = "a loop in continuous time with a delay in it has no finite state"
-            raise DataError(f"{where}{why}; the delay must be 0, or the controller discrete")
+            raise DataError(f"{where}{NO_DELAY}")
         if self.delay_bounds[1] > 0:
             check_greatest_delay(record, self.delay_bounds[1])
         data = filter_data(record)

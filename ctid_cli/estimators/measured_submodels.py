@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
-from ctid_cli.estimation.additive_problem import Instruments
+from ctid_cli.estimation.additive_problem import Instruments, following
 from ctid_cli.estimation.common import Estimator, Fixed, Start, quality
 from ctid_cli.estimation.measured_records import AppliedModel, without_means
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc, Submodels
 from ctid_cli.estimators.delay_profile import FittedSamples, MeasuredFit
-from ctid_cli.estimators.two_stage import without_feedback
 from ctid_cli.filtering.filter_data import used_samples
 from ctid_cli.filtering.submodels import OPEN_LOOP
 from ctid_cli.inference.sensitivities import Structure
@@ -25,7 +24,7 @@ from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, named
-from ctid_cli.signals.treatment import InitialState, LossKind, Offset
+from ctid_cli.signals.treatment import LossKind, Offset
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +125,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where its controller is not
         known.
-    initial_state : {"rest", "estimate", "periodic"}, default "rest"
+    initial_state : {"rest", "estimate"}, default "rest"
         State before the record.
     offset : {"none", "remove"}, default "none"
         Whether the means of input and output are subtracted first.
@@ -151,7 +150,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     terms: tuple[Term, ...]
     delay: float = 0.0
     instruments: Instruments = "open_loop"
-    initial_state: InitialState = "rest"
+    initial_state: Literal["rest", "estimate"] = "rest"
     offset: Offset = "none"
     factored: bool = True
     fixed: tuple[Fixed, ...] | None = None
@@ -248,7 +247,12 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return replace(fit, two_stage=self._two_stage_difference(fit, laid_out.record))
 
     def _two_stage_difference(self, fit: SubmodelsFit, record: Record) -> float:
-        """Largest difference of a parameter to the two-stage method, in standard errors; NaN where there is none."""
+        """Largest difference of a parameter to the two-stage method, in standard errors; NaN where there is none.
+
+        That estimates the plant as in open loop from what of the input follows the reference (P. M. J. Van den Hof and
+        R. J. P. Schrama, *An indirect method for transfer function estimation from closed loop data*, Automatica 29(6),
+        1993, https://doi.org/10.1016/0005-1098(93)90015-L).
+        """
         if self.instruments != "reference" or not fit.status.succeeded:
             return float("nan")
         other = replace(self, instruments="open_loop", offset="none").fit(without_feedback(record))
@@ -301,6 +305,13 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         used = used_samples(laid_out.problem.data, laid_out.record)
         sensitivities = np.column_stack((psi, free))
         return AppliedModel((error - free @ state,), (used,), (state,), (laid_out.offset,), (sensitivities,))
+
+
+def without_feedback(record: Record) -> Record:
+    """Return a record in a loop with the part of its input that follows the reference, as a record in open loop."""
+    assert record.loop is not None
+    u = record.input.mean + following(record.loop.reference, record.input.values)
+    return Record(record.t, record.y, HeldSignal(record.t, u, record.input.hold), name=record.name)
 
 
 def sampling_margin(model: AdditiveModel, interval: float) -> float:

@@ -1,8 +1,8 @@
-r"""A continuous-time model in a loop with a discrete-time controller or a relay.
+r"""A continuous-time model in a loop with a controller in discrete or continuous time, or a relay.
 
-The reference r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``. The measured
-output is ``y = x + v``, and x is the response of the model to the held input u. A relay switches at the sampling
-instants only. All signals are exact at these instants.
+The reference r enters before the controller, ``u = C (r - y)``, or behind it, ``u = r - C y``. The measured output is
+``y = x + v``, and x is the response of the model to the input u, which a discrete controller holds. A relay switches
+at the sampling instants only. All signals are exact at these instants.
 """
 
 from typing import NamedTuple, get_args
@@ -14,15 +14,21 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError
 from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import plain_array
-from ctid_cli.filtering.simulate import SampledModel, sampled_model
+from ctid_cli.filtering.simulate import SampledModel, sampled_model, simulate
 from ctid_cli.models.additive import AdditiveModel
-from ctid_cli.models.controller import DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
+from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
-from ctid_cli.signals.checks import require_choice
+from ctid_cli.signals.checks import require_choice, require_positive
+from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Controller, Enters
 
 #: Below this fraction of its terms, 1 + (direct loop gain) is rounding.
 NO_GAIN = 1e-12
+#: Why a loop in continuous time is not simulated with a delay.
+NO_DELAY = (
+    "a loop in continuous time with a delay in it has no finite state; the delay must be 0, or the controller discrete"
+)
 #: Zero controller for a loop with a relay, and zero relay for a loop with a controller.
 NOTHING, NO_RELAY = DiscreteController([0.0], [1.0]), (0.0, 0.0, 0.0)
 
@@ -55,7 +61,8 @@ def simulate_loop(
     model : AdditiveModel or TransferFunction
         The plant; any proper model, any delay.
     controller : Controller or Relay
-        The controller, which computes the input from reference and output.
+        The controller, which computes the input from reference and output; in continuous time with reference and
+        noise held (zoh).
     reference : array_like, shape (N,)
         r at the sampling instants [output unit; input unit if it enters behind the controller].
     noise : array_like, shape (N,) or ()
@@ -93,6 +100,10 @@ def simulate_loop(
         raise DataError(
             f"reference and noise of a loop must be lists of equal length; got shapes {r.shape} and {v.shape}"
         )
+    if isinstance(controller, ContinuousController):
+        require_positive("the sampling interval", interval, "s")
+        held = HeldSignal(np.asarray(interval * np.arange(r.size), dtype=float), r)
+        return simulate_continuous_loop(model, controller, held, v, enters)
     plant = sampled_model(model, interval)
     if isinstance(controller, Relay):
         if plant.shift == 0 and plant.direct != 0.0:
@@ -101,7 +112,7 @@ def simulate_loop(
         law, relay = law_of(NOTHING), (controller.amplitude, controller.hysteresis, controller.bias)
     else:
         discrete = _realised(controller)
-        _require_solvable(plant, discrete)
+        _require_sampled_solution(plant, discrete)
         law, relay = law_of(discrete), NO_RELAY
     u, x, _ = loop_pass(plant, law, r, v, enters == "controller", relay=relay)
     if not (np.isfinite(u).all() and np.isfinite(x).all()):
@@ -112,6 +123,49 @@ def simulate_loop(
             f"the magnitude {loop_radius(model, controller, interval):.6g}"
         )
     return LoopSignals(u, x)
+
+
+def simulate_continuous_loop(
+    model: AdditiveModel | TransferFunction,
+    controller: ContinuousController,
+    reference: HeldSignal,
+    noise: Array,
+    enters: Enters = "controller",
+) -> LoopSignals:
+    """Input and noise-free output of a loop in continuous time, at the breaks of its reference and at rest before.
+
+    The noise is held from one break to the next. Where r enters before a controller D/C of a plant B/A, the loop is
+    ``x = B D/(A C + B D) (r - v)`` and ``u = A D/(A C + B D) (r - v)``; behind the controller ``C r - D v`` is in the
+    place of ``D (r - v)``.
+    """
+    if reference.hold == "band-limited":
+        raise DataError("a loop in continuous time needs a reference that is held between its samples: zoh or foh")
+    closed, plant = _closed(model, controller)
+    t, from_reference = reference.t, controller.numerator if enters == "controller" else controller.denominator
+    driven = ((reference, from_reference), (HeldSignal(t, -noise), controller.numerator))
+
+    def seen_at(side: Array) -> Array:
+        parts = [simulate(TransferFunction(np.polymul(side, over), closed), signal, t) for signal, over in driven]
+        return np.asarray(np.sum(parts, axis=0))
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        u, x = seen_at(plant.denominator), seen_at(plant.numerator)
+    if not (np.isfinite(u).all() and np.isfinite(x).all()):
+        raise DataError("the signals of the closed loop are not finite; check reference, noise and stability")
+    return LoopSignals(u, x)
+
+
+def _closed(
+    model: AdditiveModel | TransferFunction, controller: ContinuousController
+) -> tuple[Array, TransferFunction]:
+    """Return the characteristic polynomial of a loop in continuous time, and its plant as one fraction."""
+    plant = unfactored(model) if isinstance(model, AdditiveModel) else model
+    if plant.delay:
+        raise DataError(NO_DELAY)
+    once = (side.numerator[0] if side.numerator.size == side.denominator.size else 0.0 for side in (plant, controller))
+    _require_solution(float(np.prod(list(once))))
+    around = np.polymul(plant.numerator, controller.numerator)
+    return np.polyadd(np.polymul(plant.denominator, controller.denominator), around), plant
 
 
 def loop_pass(
@@ -142,13 +196,15 @@ def law_of(controller: DiscreteController) -> Law:
 
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
-    """Return the largest magnitude of the poles of the sampled loop, which is stable below 1."""
+    """Return the largest magnitude of the poles of the loop over a sampling interval, which is stable below 1."""
+    if isinstance(controller, ContinuousController):
+        return float(np.exp(np.roots(_closed(model, controller)[0]).real.max(initial=-np.inf) * interval))
     return sampled_radius(sampled_model(model, interval), _realised(controller))
 
 
 def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float:
     """Return the largest magnitude of the poles of the loop of a sampled model."""
-    _require_solvable(sampled, discrete)
+    _require_sampled_solution(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()
     # Without reference and noise u = Cc s - Dc x and x = C z + D u.
@@ -168,9 +224,12 @@ def _realised(controller: Controller) -> DiscreteController:
     return DiscreteController(controller.numerator, controller.denominator)
 
 
-def _require_solvable(plant: SampledModel, controller: DiscreteController) -> None:
-    """Raise an error if an algebraic loop has no unique solution."""
-    gain = 0.0 if plant.shift else controller.direct * plant.direct
+def _require_sampled_solution(plant: SampledModel, controller: DiscreteController) -> None:
+    _require_solution(0.0 if plant.shift else controller.direct * plant.direct)
+
+
+def _require_solution(gain: float) -> None:
+    """Raise an error if an algebraic loop of some direct gain has no unique solution."""
     if abs(1.0 + gain) <= NO_GAIN * max(1.0, abs(gain)):
         raise DataError(
             "the loop has no solution: the product of the direct gains of model and controller is -1; change the gain "

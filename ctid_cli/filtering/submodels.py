@@ -18,8 +18,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ctid_cli.arrays import Array, ComplexArray
-from ctid_cli.filtering import kernels
+from ctid_cli.arrays import Array
 from ctid_cli.filtering.bank import (
     MODAL_CONDITION_LIMIT,
     MOST_MODAL_INTEGRATORS,
@@ -33,29 +32,26 @@ from ctid_cli.filtering.bank import (
     chain_pass,
     modal_form,
     modal_pass,
-    to_steady_state,
 )
-from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
+from ctid_cli.filtering.filter_data import FilterData, plain_array
 from ctid_cli.filtering.loop import law_of, loop_pass
 from ctid_cli.filtering.simulate import sampled_chains
 from ctid_cli.models.additive import Term
 from ctid_cli.models.controller import DiscreteController
 
 #: State of the filters at the first sample.
-InitialState = Literal["rest", "periodic", "estimated"]
+InitialState = Literal["rest", "estimated"]
 
 
 class LoopData(NamedTuple):
     """Feedback loop of a record."""
 
-    #: Reference at the sampling instants; empty in open loop, shape (N,).
+    #: Reference at the sampling instants, or where the controller is not known what of the input follows it; empty in
+    #: open loop, shape (N,).
     reference: Array
-    #: Controller in descending powers of q, monic, both of one length, shape (nc + 1,).
-    numerator: Array
-    denominator: Array
-    at_controller: bool
-    #: Whether the reference is the input of the instruments, for an unknown controller.
-    direct: bool = False
+    controller: DiscreteController | None = None
+    #: Whether the reference enters before the controller.
+    at_controller: bool = True
 
     @property
     def closed(self) -> bool:
@@ -64,7 +60,7 @@ class LoopData(NamedTuple):
 
 
 #: No feedback.
-OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
+OPEN_LOOP = LoopData(np.zeros(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +140,8 @@ class SubmodelFilter:
         self.terms = tuple(terms)
         self.delay = float(delay)
         self.loop = loop
-        self.periodic = initial_state == "periodic"
         self.free = free_response_size(terms) if initial_state == "estimated" else 0
         self.size = sum(term.size for term in terms)
-        self._controller = DiscreteController(loop.numerator, loop.denominator)
-        if self.periodic and data.interval == 0.0:
-            raise ValueError("initial_state periodic needs input and output on one regular clock")
 
     def moments(self, theta: Array) -> Equations | None:
         """Return the second moments at one parameter vector; None if they are not finite."""
@@ -211,61 +203,33 @@ class SubmodelFilter:
         modal = [each for each in forms if each is not None]
         if len(modal) == len(parts):
             return pooled_forms(parts, modal, pooled_modes(modal, direct), self.loop.closed)
-        if self.periodic:
-            return None
         chains = Chains(tuple(part.chain() for part in parts), direct)
         return pooled_forms(parts, chains.forms, chains, self.loop.closed)
 
     def _pass(self, data: FilterData, pooled: "Pooled", *, rows: bool, leading: int | None) -> Array:
         """Return the rows of the pass, or their moments."""
         model, delay = pooled.model, self.delay
-        instruments = self._loop_input(model) if self.loop.closed else None
+        instruments = self._loop_input(pooled.parts) if self.loop.closed else None
         if isinstance(model, Chains):
             found = chain_pass(data, model, delay, instruments)
             return found if rows else found[:, :leading].T @ found
-        states = None
-        if self.periodic:
-            data, delay, states = self._in_steady_state(data, model)
-        return modal_pass(data, model, delay, rows=rows, leading=leading, states=states, instruments=instruments)
+        return modal_pass(data, model, delay, rows=rows, leading=leading, instruments=instruments)
 
     def instrument_input(self, theta: Array) -> Array | None:
         """Return the input of the instruments: the measured one, or that of the noise-free loop."""
         if not self.loop.closed:
             return self.data.u
-        pooled = self._pooled(theta)
-        return None if pooled is None else self._loop_input(pooled.model)
+        parts = _parts(theta[: self.size], self.terms)
+        return None if parts is None else self._loop_input(parts)
 
-    def _loop_input(self, model: Modes | Chains) -> Array:
-        """Return the input of the noise-free loop of a model."""
-        interval, reference = self.data.interval, self.loop.reference
-        if self.loop.direct:
+    def _loop_input(self, parts: Sequence[Part]) -> Array:
+        """Return the input of the noise-free loop of submodels."""
+        reference, controller, at_controller = self.loop
+        if controller is None:
             return reference
-        if isinstance(model, Modes):
-            clock = (interval, *split_delay(self.delay, interval))
-            direct = float(model.direct.sum())
-            return np.asarray(kernels.loop_input(model.poles, model.residues, direct, clock, *self.loop[:4]))
-        plant, law = sampled_chains(model, interval, self.delay), law_of(self._controller)
-        return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
-
-    def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
-        """Return the record with its input shifted by whole intervals, the remaining delay, and the periodic states."""
-        count, interval = data.y.size, data.interval
-        period = interval * count
-        shift, fraction = split_delay(self.delay, interval)
-        rolled = np.roll(data.u, shift)
-        # Two more samples: the last interval ends at the first sample, where the next slope begins.
-        data, delay = data._replace(u=np.concatenate((rolled, rolled[:2]))), -fraction * interval
-        nothing = data._replace(use=np.zeros(count, dtype=bool))
-        initial = np.zeros((modes.poles.size, 5), np.complex128)
-        modal_pass(nothing, modes, delay, states=initial)
-        initial[:, 2:] = 0.0
-        to_steady_state(modes.poles, period, initial)
-        # The filters of y_i need the periodic output of the model, hence a second pass over one whole period.
-        states, once_round = initial.copy(), np.append(data.y, data.y[0])
-        whole = nothing._replace(y=once_round, use=np.zeros(count + 1, dtype=bool))
-        modal_pass(whole, modes, delay, states=states)
-        initial[:, 2] = states[:, 2] / -np.expm1(modes.poles * period)
-        return data, delay, initial
+        chains = Chains(tuple(part.chain() for part in parts), np.array([part.direct for part in parts]))
+        plant = sampled_chains(chains, self.data.interval, self.delay)
+        return loop_pass(plant, law_of(controller), reference, np.zeros(reference.size), at_controller)[0]
 
 
 def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
@@ -284,6 +248,7 @@ def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
 class Pooled(NamedTuple):
     """All submodels in one pass, with the maps from its rows to psi, phi and the model output driven by z."""
 
+    parts: Sequence[Part]
     model: Modes | Chains
     #: Number of rows of z.
     width: int
@@ -331,7 +296,7 @@ def pooled_forms(
         )
         output += part.output(driven[:, :order], driven[:, order])
         first += own
-    return Pooled(model, n, np.hstack(psi), np.hstack(phi), output)
+    return Pooled(parts, model, n, np.hstack(psi), np.hstack(phi), output)
 
 
 # --- free responses -------------------------------------------------------------------------------------------------

@@ -83,6 +83,8 @@ class EstimatedForm:
     instruments: Instruments
     #: Whether the noise is modelled too, so that the errors are prewhitened.
     weighed: bool = False
+    #: Whether the criterion is the output error of the simulated loop, which the noise reaches through the loop.
+    simulated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +152,8 @@ def accuracy_of_records(
         start = "the Cramér-Rao bound (psi' R^-1 psi)^-1, R the covariance matrix of the noise"
     elif noise.coloured:
         start = "(psi' psi)^-1 psi' R psi (psi' psi)^-1, R the covariance matrix of the noise"
+    if form.simulated:
+        start = "(psi' psi)^-1 psi' S R S' psi (psi' psi)^-1, S from the noise to the output, R the noise's covariance"
     sets = len(records)
     where = "in the first data set" if sets == 1 else f"averaged over the first {sets} data sets"
     formula = f"{start}, psi {_psi_in_words(form, records[0].loop)}, {where}, as {why_no_limit}"
@@ -166,6 +170,12 @@ def _record_covariance(
         u = simulate_loop(system, law, loop.reference, 0.0, interval, loop.enters).u
         signal = HeldSignal(record.t, u)
     psi = sensitivities(form.model, signal, record.t, form.zeros, estimate_delay=form.delay_from is not None)
+    lags = np.arange(psi.shape[0] if noise.coloured else 1)
+    autocovariances = noise.autocovariance(lags, record.noise_free)
+    if form.simulated:
+        # The parameters move the output as noise does, through the loop; its transpose runs backwards.
+        moved = _through_loop(system, record, psi)
+        return finite_record_covariance(moved, autocovariances, _through_loop(system, record, moved[::-1])[::-1])
     if form.delay_from is not None:
         psi = psi[record.t >= record.input.t[0] + form.delay_from]
     if form.weighed and noise.coloured:
@@ -174,8 +184,18 @@ def _record_covariance(
         # psi' R^-1 psi is the product of the whitened sensitivities.
         white = SampledNoise(law, steps_of(np.ones(len(psi), dtype=bool))).whitened(psi)
         return finite_record_covariance(white, variance)
-    lags = np.arange(psi.shape[0] if noise.coloured else 1)
-    return finite_record_covariance(psi, noise.autocovariance(lags, record.noise_free))
+    return finite_record_covariance(psi, autocovariances[: psi.shape[0]])
+
+
+def _through_loop(system: AdditiveModel | TransferFunction, record: Record, columns: Array) -> Array:
+    """Return what is measured of signals that are added to the output of a loop without a reference."""
+    loop, interval = record.loop, record.interval
+    assert loop is not None
+    assert loop.controller is not None
+    assert interval is not None
+    still = np.zeros(len(columns))
+    moved = [simulate_loop(system, loop.controller, still, one, interval, loop.enters).x for one in columns.T]
+    return columns + np.column_stack(moved)
 
 
 def _psi_in_words(form: EstimatedForm, loop: object | None) -> str:
@@ -183,12 +203,13 @@ def _psi_in_words(form: EstimatedForm, loop: object | None) -> str:
     return "the sensitivities of the output to the parameters" + ("" if loop is None else f" in the {where}")
 
 
-def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
+def finite_record_covariance(psi: Array, autocovariances: ArrayLike, weights: Array | None = None) -> Array:
     r"""Return the covariance of an unweighted output-error estimate with noise of known autocovariances.
 
     With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
     noise: ``sigma^2 M^-1`` for white noise. Unlike the limit for long records it includes the start from rest, which
-    matters unless the memory of the system or of its loop is short compared with the record.
+    matters unless the memory of the system or of its loop is short compared with the record. Where noise reaches the
+    errors as ``F v``, ``weights`` are ``F' psi``.
     """
     from scipy.linalg import matmul_toeplitz
 
@@ -198,7 +219,7 @@ def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
     if found is None:
         return np.full((size, size), np.nan)
     inverse, scale = found
-    scaled = psi * scale
+    scaled = (psi if weights is None else weights) * scale
     first_column = np.zeros(count)
     first_column[: lags.size] = lags[:count]
     coloured = lags[0] * scaled if lags.size == 1 else matmul_toeplitz(first_column, scaled)

@@ -39,7 +39,7 @@ FRESH = 2**31
 class LoopOptions:
     """Feedback around a system."""
 
-    #: A `DiscreteController`, a `ContinuousPid` (by its gains) or a `Relay`.
+    #: A `DiscreteController`, a `ContinuousPid` (by its gains), a `ContinuousController` or a `Relay`.
     controller: Any
     reference: Excitation | None = None
     enters: Enters = "controller"
@@ -193,8 +193,8 @@ class SimulatedSource:
         true_model = self.system if isinstance(self.system, TransferFunction | AdditiveModel) else None
         if self.loop is not None:
             assert true_model is not None
-            record = self._record_in(self.loop, true_model, times, applied.at(times), replicate)
-            return DataSet(record, true_model=true_model)
+            held = HeldSignal(times, applied.at(times), applied.hold)
+            return DataSet(self._record_in(self.loop, true_model, held, replicate), true_model=true_model)
         with at("system"):
             if true_model is None:
                 output = samples_of(self.system, "simulate", applied, times, size=times.size)
@@ -219,21 +219,26 @@ class SimulatedSource:
         return found
 
     def _record_in(
-        self, loop: LoopOptions, system: TransferFunction | AdditiveModel, times: Array, r: Array, replicate: int
+        self, loop: LoopOptions, system: TransferFunction | AdditiveModel, reference: HeldSignal, replicate: int
     ) -> Record:
-        from ctid_cli.filtering.loop import simulate_loop
+        from ctid_cli.filtering.loop import simulate_continuous_loop, simulate_loop
 
-        interval = regular_interval(times)
-        if interval is None:
-            raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
+        times, r, controller, hold = reference.t, reference.values, loop.controller, reference.hold
         # The noise comes before the output, because the output depends on it.
         noise = self._drawn(times, np.zeros(times.size), replicate)
-        controller = loop.at(interval).controller
-        with at("loop.controller"):
-            u, x = simulate_loop(system, controller, r, noise, interval, loop.enters)
+        if isinstance(controller, ContinuousController):
+            with at("loop.controller"):
+                u, x = simulate_continuous_loop(system, controller, reference, noise, loop.enters)
+        else:
+            interval = regular_interval(times)
+            if interval is None:
+                raise DataError("a closed loop needs a regular clock, since its controller acts at every sample")
+            controller, hold = loop.at(interval).controller, "zoh"
+            with at("loop.controller"):
+                u, x = simulate_loop(system, controller, r, noise, interval, loop.enters)
         # Estimators know the loops of linear controllers only.
-        closed = None if isinstance(controller, Relay) else Loop(r, controller, loop.enters)
-        return Record(times, x + noise, HeldSignal(times, u), noise_free=x, loop=closed, feedback=True)
+        closed = None if isinstance(controller, Relay) else Loop(r, controller, loop.enters, hold)
+        return Record(times, x + noise, HeldSignal(times, u, hold), noise_free=x, loop=closed, feedback=True)
 
     def _drawn(self, times: Array, output: Array, replicate: int) -> Array:
         if self.noise is None:

@@ -16,7 +16,7 @@ from ctid_cli.inference.bounds import (
     require_uncorrelated_input,
 )
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.models.controller import DiscreteController, Relay
+from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Gaussian
@@ -44,6 +44,8 @@ def expected_accuracy(
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
         raise DataError("the relay feeds noise back into the input; the theory here covers linear controllers only")
+    if source.loop is not None and isinstance(source.loop.controller, ContinuousController):
+        raise DataError("the controller acts in continuous time; the theory here covers discrete controllers only")
     if (estimated.model.poles.real > 0.0).any():
         raise DataError("the system is unstable; the theory here covers stable systems only")
     why_not = _why_no_limit(source, estimated)
@@ -108,7 +110,8 @@ def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> Esti
     if estimator.poles > fraction.order:
         raise DataError(f"the model has {has}: no data determine the additional poles")
     weighed = getattr(estimator, "noise_model", "white") != "white"
-    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed)
+    simulated = estimator.kind == "loop_output_error"
+    return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed, simulated)
 
 
 def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
@@ -156,6 +159,8 @@ def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
         return "the clock is irregular"
     if estimated.weighed:
         return "the noise is estimated too"
+    if estimated.simulated:
+        return "the output error of a simulated loop is least"
     if not isinstance(signal, Gaussian) or signal.clock_period not in (None, sampling.interval):
         return f"the {name} is not white Gaussian noise held from sample to sample"
     if sampling.samples < LONG:

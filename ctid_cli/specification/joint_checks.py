@@ -14,7 +14,7 @@ from ctid_cli.estimation.common import Start
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
-from ctid_cli.models.controller import ContinuousController, Relay
+from ctid_cli.models.controller import Relay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
@@ -191,7 +191,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     if spec.data is None and not _is_regular(spec):
         if spec.signal is not None:
             yield ("sampling", "kind"), "must be regular: estimators of frequencies compare samples at fixed delays"
-        elif spec.loop is not None:
+        elif spec.loop is not None and not hasattr(spec.loop.controller, "continuous"):
             yield ("sampling", "kind"), "must be regular in a loop: the controller is discrete and acts at every sample"
 
 
@@ -256,11 +256,6 @@ def _of_ratio(loop: Any, noise: Any) -> Iterator[Complaint]:
 def _of_relay(loop: Any, data: Any) -> Iterator[Complaint]:
     if isinstance(loop.controller, Relay):
         yield ("loop",), "a relay is for simulated data; leave the loop out, the record of its input says enough"
-
-
-def _of_continuous(loop: Any, system: Any) -> Iterator[Complaint]:
-    if isinstance(loop.controller, ContinuousController):
-        yield ("loop", "controller"), "a controller in continuous time is for measured records; give continuous_pid"
 
 
 def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
@@ -411,7 +406,6 @@ CHECKS = (
         _of_clock_periods,
         _of_ratio,
         _of_relay,
-        _of_continuous,
         _of_unstable_system,
         _of_custom_system,
     ),

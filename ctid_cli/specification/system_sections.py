@@ -223,7 +223,7 @@ class ContinuousPidControllerSection(ControllerSection):
 
 
 class ContinuousControllerSection(ControllerSection):
-    """A controller that acts in continuous time, for measured records.
+    """A controller that acts in continuous time.
 
     Parameters
     ----------
@@ -307,10 +307,10 @@ class LoopSection(Section):
             yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"
 
 
-def _does_nothing(controller: DiscreteController | ContinuousPid | Relay) -> bool:
+def _does_nothing(controller: DiscreteController | ContinuousController | ContinuousPid | Relay) -> bool:
     if isinstance(controller, ContinuousPid):
         return controller.does_nothing
-    return isinstance(controller, DiscreteController) and not controller.numerator.any()
+    return isinstance(controller, DiscreteController | ContinuousController) and not controller.numerator.any()
 
 
 # --------------------------------------------------------------------------------------------------------------------

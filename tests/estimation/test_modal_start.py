@@ -7,9 +7,7 @@ from ctid_cli.errors import DataError
 from ctid_cli.estimation.common import Start
 from ctid_cli.estimation.modal_start import _pole_sets
 from ctid_cli.estimators.additive_srivc import AdditiveSrivc
-from ctid_cli.filtering.simulate import simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
-from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.additive_records import (
     FOUR_MODES,
@@ -60,14 +58,6 @@ def test_beam_from_rest():
 def test_beam_that_still_rings():
     record, system, _ = beam_record(1, periods=3)
     assert_in_basin(record, system, initial_state="estimated")
-
-
-def test_one_period_of_a_steady_state():
-    once = open_record(TWO_MODES, 1000, 0.0, 14)
-    t, u = 0.05 * np.arange(3000), np.tile(once.input.values, 3)
-    y = simulate_additive(TWO_MODES, HeldSignal(t, u), t)[-1000:]
-    record = Record(once.t, y + 0.1 * np.random.default_rng(15).standard_normal(1000), once.input)
-    assert_in_basin(record, TWO_MODES, initial_state="periodic")
 
 
 def test_noise_free_record_gives_the_system():

@@ -208,33 +208,6 @@ def test_integrators(system, instruments):
     assert fit.additive.submodels[0].integrators == system.submodels[0].integrators
 
 
-def multisine(n, seed):
-    rng = np.random.default_rng(seed)
-    spectrum = np.zeros(n // 2 + 1, complex)
-    spectrum[1 : n // 4] = np.exp(2j * np.pi * rng.random(n // 4 - 1))
-    return np.fft.irfft(spectrum, n) * np.sqrt(n)
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.12, 0.15])
-@pytest.mark.parametrize("hold", ["zoh", "foh"])
-def test_one_period_of_a_steady_state_is_fitted_exactly(hold, delay):
-    # The modes take some 60 s to die out and the period is 25 s: the start of the period matters a great deal.
-    system = AdditiveModel([*TWO_MODES.submodels, Submodel([0.2, 0.5], [0.7, 1.0])], delay)
-    n, periods = 500, 20
-    t = INTERVAL * np.arange(n)
-    u = multisine(n, 1)
-    long = INTERVAL * np.arange(n * periods)
-    x = simulate_additive(system, HeldSignal(long, np.tile(u, periods), hold), long)[-2 * n : -n]
-    record = Record(t, x, HeldSignal(t, u, hold))
-    start = disturbed(system, 1, 0.02)
-    fit = fitted(record, start, initial_state="periodic", tolerance=1e-10)
-    assert fit.status is Status.CONVERGED
-    assert fit.count == n
-    assert_parameters(fit, system, 1e-6)
-    at_rest = fitted(record, start, tolerance=1e-10)
-    assert np.abs(at_rest.additive.theta[0] / system.sorted().theta[0] - 1) > 0.01
-
-
 @pytest.mark.parametrize(
     ("whole", "system", "instruments"),
     [(open_record(system, 1100, 0.0, 2, hold="foh"), system, "open_loop") for system in (MIXED, DRIVE, RIGID)]
@@ -350,8 +323,6 @@ def test_start_that_loses_a_pole_ends_in_words():
         ({"max_iterations": 0}, "max_iterations must be .*1.*0"),
         ({"tolerance": 0.0}, "tolerance must lie between 0 and 1, not 0.0"),
         ({"instruments": "closed_loop", "variant": "guarded"}, "guarded is for open-loop .* use relaxed or plain"),
-        ({"instruments": "closed_loop", "initial_state": "periodic"}, "periodic needs open-loop .* rest or estimated"),
-        ({"terms": (Term(1, 0, 1),), "initial_state": "periodic"}, "periodic needs .* terms without integrators"),
     ],
 )
 def test_impossible_options_are_refused(options, message):
@@ -380,8 +351,6 @@ def test_terms_that_share_a_pole_are_no_start():
 
 
 RECORD = replace(open_record(TWO_MODES, 100, 0.1, 1), name="beam.csv")
-IRREGULAR = np.cumsum(np.random.default_rng(1).uniform(0.02, 0.08, 100))
-NOT_PERIODIC = r"beam.csv: one period .* regular clock .* use initial_state 'estimated'"
 
 
 @pytest.mark.parametrize(
@@ -394,12 +363,6 @@ NOT_PERIODIC = r"beam.csv: one period .* regular clock .* use initial_state 'est
             "10 usable samples are too few for 10",
         ),
         (RECORD, {"instruments": "closed_loop"}, "beam.csv: .*instruments 'open_loop'"),
-        (
-            replace(RECORD, y=np.where(RECORD.t == RECORD.t[5], np.nan, RECORD.y)),
-            {"initial_state": "periodic"},
-            NOT_PERIODIC,
-        ),
-        (open_record(TWO_MODES, 100, 0.1, 1, times=IRREGULAR), {"initial_state": "periodic"}, NOT_PERIODIC),
         (replace(RECORD, inputs=HeldSignal(RECORD.t, np.ones(100))), {}, "beam.csv: the input is constant"),
         (replace(RECORD, y=np.zeros(100)), {}, "beam.csv: the output is constant"),
     ],

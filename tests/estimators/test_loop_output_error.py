@@ -9,10 +9,9 @@ from scipy.signal import cont2discrete
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.estimators.loop_output_error import LoopOutputError
-from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
+from ctid_cli.estimators.measured_submodels import MeasuredSubmodels, without_feedback
 from ctid_cli.estimators.srivc import Srivc
-from ctid_cli.estimators.two_stage import without_feedback
-from ctid_cli.filtering.loop import loop_radius, simulate_loop
+from ctid_cli.filtering.loop import loop_radius, simulate_continuous_loop, simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.fit import Status
 from ctid_cli.models.additive import Term
@@ -89,6 +88,8 @@ def test_output_of_a_loop_in_continuous_time_is_that_of_short_steps(hold):
     r = rng.standard_normal(40)
     one = Record(t, r, HeldSignal(t, r), loop=Loop(r, LEAD, hold=hold))
     found = rows_of(LoopOutputError(2, 0), one, [0.0, -1.0, 4.0, 0.0], 0).output
+    simulated = simulate_continuous_loop(UNSTABLE, LEAD, HeldSignal(t, r, hold), 0.0 * r).x
+    np.testing.assert_allclose(found, simulated, atol=1e-10)
     np.testing.assert_allclose(found, continuous_loop(UNSTABLE, LEAD, r, t, 40, hold == "foh"), atol=2e-5)
 
 

@@ -6,10 +6,10 @@ import pytest
 from scipy.signal import lfilter
 
 from ctid_cli.errors import DataError
-from ctid_cli.filtering.loop import loop_radius, simulate_loop
+from ctid_cli.filtering.loop import loop_radius, simulate_continuous_loop, simulate_loop
 from ctid_cli.filtering.simulate import simulate, simulate_additive
 from ctid_cli.models.additive import AdditiveModel, Submodel
-from ctid_cli.models.controller import DiscreteController
+from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from tests.filtering.plants import parts, with_delay
@@ -130,3 +130,34 @@ def test_an_algebraic_loop_without_solution_is_refused(gain):
         with pytest.raises(DataError, match="the loop has no solution"):
             function(BIPROPER)
         function(late)
+
+
+@pytest.mark.parametrize("enters", ["controller", "input"])
+def test_a_gain_in_continuous_time_makes_its_input_of_reference_output_and_noise(enters):
+    t, (r, v) = np.cumsum(np.random.default_rng(1).uniform(0.05, 0.2, 300)), signals(300)
+    u, x = simulate_continuous_loop(TWO_MODES, ContinuousController([0.1], [1.0]), HeldSignal(t, r), v, enters)
+    made = 0.1 * (r - x - v) if enters == "controller" else r - 0.1 * (x + v)
+    np.testing.assert_allclose(u, made, atol=1e-10)
+
+
+def test_a_fast_discrete_controller_nears_one_in_continuous_time():
+    slow = ContinuousController([0.04, 0.02], [1.0, 0.0])
+    radius = loop_radius(TWO_MODES, slow, INTERVAL)
+    differences = []
+    for finer in (50, 100):
+        h = INTERVAL / finer
+        r, v = (np.repeat(signal, finer) for signal in signals(100))
+        exact = simulate_loop(TWO_MODES, slow, r, v, h).x
+        sampled = DiscreteController([0.04, 0.02 * h - 0.04], [1.0, -1.0])
+        differences.append(np.abs(simulate_loop(TWO_MODES, sampled, r, v, h).x - exact).max() / np.abs(exact).max())
+        assert loop_radius(TWO_MODES, sampled, h) ** finer == pytest.approx(radius, rel=1e-3)
+    assert differences[1] < 0.6 * differences[0] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [(TransferFunction([1.0], [1.0, 1.0], 0.1), "no finite state"), (TransferFunction([1.0], [1.0]), "no solution")],
+)
+def test_a_loop_in_continuous_time_that_is_refused(model, message):
+    with pytest.raises(DataError, match=message):
+        simulate_loop(model, ContinuousController([-1.0], [1.0]), [1.0, 1.0], 0.0, 0.1)

@@ -57,10 +57,7 @@ def record(seed=1, n=300, hold="zoh", interval=INTERVAL, masked=()):
 
 def feedback(controller, n, enters="controller", seed=7):
     """A loop laid out for the pass."""
-    padded = np.zeros(controller.denominator.size)
-    padded[padded.size - controller.numerator.size :] = controller.numerator
-    reference = np.random.default_rng(seed).standard_normal(n)
-    return LoopData(reference, padded, np.array(controller.denominator), enters == "controller")
+    return LoopData(np.random.default_rng(seed).standard_normal(n), controller, enters == "controller")
 
 
 def assert_rows(rows, expected, tolerance):
@@ -202,24 +199,6 @@ def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
         assert isinstance(submodels._pooled(theta).model, Chains)
 
 
-PERIODIC = {name: SUMS[name] for name in ("real pole", "mode", "biproper", "gain", "two modes", "mixed")}
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.3, 0.5371, 31.0371])
-@pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "foh"), ("foh", "zoh")])
-@pytest.mark.parametrize(("terms", "theta"), PERIODIC.values(), ids=PERIODIC.keys())
-def test_periodic_rows_are_those_of_a_long_repetition(terms, theta, hold, hold_output, delay):
-    # A delay may exceed the period: what arrives is some earlier period's input, which is the same.
-    n, repeats = 250, 20
-    one = record(n=n, hold=hold)
-    t = 3.0 + INTERVAL * np.arange(repeats * n)
-    long = Record(t, np.tile(one.y, repeats), HeldSignal(t, np.tile(one.input.values, repeats), hold))
-    periodic = SubmodelFilter(filter_data(one, 0.0, hold_output), terms, delay, initial_state="periodic")
-    rest = SubmodelFilter(filter_data(long, 0.0, hold_output), terms, delay)
-    inner = slice((repeats - 2) * n, (repeats - 1) * n)
-    assert_rows(periodic.rows(np.array(theta)), [part[inner] for part in rest.rows(np.array(theta))], 1e-9)
-
-
 @pytest.mark.parametrize(("closed", "hold", "delay"), [(False, "zoh", 0.37), (False, "foh", 0.0), (True, "zoh", 0.37)])
 @ALL_SUMS
 def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed):
@@ -259,7 +238,7 @@ def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize(
     ("initial_state", "closed"),
-    [("rest", False), ("periodic", False), ("estimated", False), ("rest", True), ("estimated", True)],
+    [("rest", False), ("estimated", False), ("rest", True), ("estimated", True)],
 )
 def test_parameters_without_a_finite_response_give_nothing(theta, initial_state, closed):
     data = filter_data(record(n=2000))

@@ -5,10 +5,14 @@ import pytest
 from scipy.signal import cont2discrete, tf2ss
 
 from ctid_cli.errors import DataError
+from ctid_cli.estimators.loop_output_error import LoopOutputError
+from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.filtering.simulate import simulate
 from ctid_cli.inference.bounds import (
     WHITE,
+    EstimatedForm,
     ParameterAccuracy,
+    accuracy_of_records,
     cramer_rao_bound,
     limiting_accuracy,
     output_variance,
@@ -20,8 +24,9 @@ from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Prbs
-from ctid_cli.signals.noise import stream
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.held import HeldSignal
+from ctid_cli.signals.noise import ArmaNoise, stream
+from ctid_cli.signals.record import Loop, Record
 
 INTERVAL = 0.05
 
@@ -283,3 +288,20 @@ def test_known_bounds_of_the_second_order_benchmark(clock, expected):
     r = record(CASE_1, clock * 0.05)
     noise = np.sqrt(np.mean(r.y**2) / 10**1.5)
     np.testing.assert_allclose(np.sqrt(np.diag(cramer_rao_bound(CASE_1, r, noise, 15.0))), expected, rtol=0.1)
+
+
+def test_errors_of_a_simulated_loop_are_those_of_its_derivatives_and_of_noise_that_passes_it():
+    plant, law, count = TransferFunction([4.0], [1.0, 2.8, 4.0], 0.137), DiscreteController([0.5, -0.47], [1, -1]), 300
+    t, r = INTERVAL * np.arange(count), np.random.default_rng(3).standard_normal(count)
+    u, x = simulate_loop(plant, law, r, 0.0, INTERVAL)
+    record, noise = Record(t, x, HeldSignal(t, u), loop=Loop(r, law)), ArmaNoise(*COLOURED, innovation_variance=0.02)
+    form = EstimatedForm(plant, 0, 0.3, "closed_loop", simulated=True)
+    found = accuracy_of_records(form, plant, [record], noise, "").parameters.covariance
+    problem = LoopOutputError(2, 0, (0.0, 0.3)).prepare(record).laid_out.problem
+    theta = np.array([2.8, 4.0, 4.0, 0.137])
+    psi = problem.response.rows(theta, 4, problem.cell_of(0.137)).slopes
+    S = np.array([v + simulate_loop(plant, law, 0.0 * v, v, INTERVAL).x for v in np.eye(count)]).T
+    lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    reached = np.linalg.inv(psi.T @ psi) @ psi.T @ S
+    expected = reached @ noise.autocovariance(np.arange(count), x)[lags] @ reached.T
+    assert largest_relative_error(found, expected) < 1e-7

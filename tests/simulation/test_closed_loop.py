@@ -146,9 +146,15 @@ monte_carlo: {runs: 1, seed: 1}
     assert build_plan(load_spec(tmp_path / "spec.yaml")).data_cells[0].hash != cells[0].hash
 
 
-def test_an_unstable_plant_in_a_stable_loop_is_simulated_and_found(tmp_path):
+CONTINUOUS = UNSTABLE.replace(
+    "{numerator: [11, -10], denominator: [1, 0]}", "{continuous: {numerator: [1.5, 3], denominator: [0.05, 1]}}"
+).replace("kind: regular, interval: 0.05", "kind: uniform_intervals, low: 0.02, high: 0.08")
+
+
+@pytest.mark.parametrize("text", [UNSTABLE, CONTINUOUS], ids=["discrete", "continuous, irregular clock"])
+def test_an_unstable_plant_in_a_stable_loop_is_simulated_and_found(tmp_path, text):
     file = tmp_path / "unstable.yaml"
-    file.write_text(UNSTABLE, encoding="utf-8")
+    file.write_text(text, encoding="utf-8")
     (cell,) = build_plan(load_spec(file)).data_cells
     fit = LoopOutputError(2, 0).fit(cell.dataset(0).record)
     error = (fit.theta - [0.0, -1.0, 4.0]) / np.sqrt(np.diag(fit.covariance))
