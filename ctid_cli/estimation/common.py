@@ -129,6 +129,8 @@ class Estimator(Generic[LaidOut, AnyFit]):
         A DataError says why nothing can be estimated.
         """
         records = [record] if isinstance(record, Record) else list(record)
+        for one in records if not hasattr(self, "inputs") else ():
+            one.input  # noqa: B018 - refuses several
         in_loop = any(one.in_loop for one in records) and getattr(self, "instruments", "open_loop") == "open_loop"
         return Prepared(self, self._lay_out(record), in_loop)
 

@@ -1,5 +1,6 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -218,6 +219,14 @@ class MultiInputFit(MeasuredFit):
     """
 
     model: MultiInputModel  # type: ignore[assignment]  # what asks for one transfer function asks for that of an input
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients and delays by name, delays that are known too."""
+        known = {f"{name}_delay": part.delay for name, part in self.model.parts.items()}
+        return {n: v for n, v in self.parameters.items() if re.fullmatch(r"(.+_)?[ab]\d+", n)} | {
+            n: self.parameters.get(n, v) for n, v in known.items()
+        }
 
     def of_input(self, name: str) -> InputFit:
         """Return the transfer function of an input, with its responses.
@@ -483,14 +492,28 @@ class DelayProfile(RecordsEstimator):
 
     def _each(self, names: Sequence[str]) -> list["DelayProfile"]:
         """Return the estimator of each input by itself."""
-        own = {one.name: one for one in self.inputs or ()}
-        unknown = [name for name in own if name not in names]
+        unknown = [one.name for one in self.inputs or () if one.name not in names]
         if unknown:
             raise OptionError(
                 "inputs",
                 f"there is no input {unknown[0]!r}; the record has {', '.join(names) if any(names) else 'one'}",
             )
-        return [self._alone(own[name]) if name in own else replace(self, inputs=None, fixed=None) for name in names]
+        return [self.of_input(name) for name in names]
+
+    def of_input(self, name: str) -> "DelayProfile":
+        """Return the estimator of one of several inputs by itself.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        DelayProfile
+            Its options, without parameters that are fixed.
+        """
+        return self._alone(next((one for one in self.inputs or () if one.name == name), InputModel(name)))
 
     def _known(self, names: tuple[str, ...]) -> dict[int, float]:
         """Return the values of the fixed parameters by their places, for inputs of some names."""
