@@ -33,7 +33,7 @@ class Status(Enum):
     )
     AT_BOUND = (
         "The least cost is at the border of the admissible models: a pole is as fast, as slow or as "
-        "little damped as may be."
+        "little damped as may be, or a parameter at a bound that was given."
     )
     RIDGE = (
         "The cost is least and hardly changes along a line as far as models are admissible: the data do "
