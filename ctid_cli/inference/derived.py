@@ -14,7 +14,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
-HELD = "A pole is held at a bound of the admissible models, where the record does not determine it."
+HELD = "It is held at a bound: one that was given, or of the admissible models, where the record does not determine it."
 #: A quantity that changes by less than this fraction where a free pole changes by its own size is held [-].
 UNMOVED = 1e-6
 #: Standard errors to each side of a quantity with a given gradient by the leading parameters.
