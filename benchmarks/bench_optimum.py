@@ -350,7 +350,7 @@ def two_inputs(rng):
 
 
 def two_inputs_compared(number, rng, count):
-    """One system with two inputs: CPU time of its fit, and the least squared error of the descents over ctid's, less 1."""
+    """CPU time of a fit with two inputs, and how far the least descent and that from the truth are from it."""
     record, models = two_inputs(rng)
     own = tuple(InputModel(name, poles=m.order) for name, m in zip(record.held, models, strict=True))
     prepared = DelayProfile(max(m.order for m in models), 0, (0.0, 2.0), inputs=own).prepare(record)

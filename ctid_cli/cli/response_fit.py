@@ -58,10 +58,10 @@ def frequency_fit(
             "column standard_error"
         )
     data = replace(data, weight=weight or "none")
-    model = with_delays(model, ())
+    delays = with_delays(model, ())
     with as_usage_errors():
-        given: Any = {"integrators": model.integrators or 0, "fixed": model.fixed, "bounds": model.parameter_bounds}
-        options = FrequencyDomain(model.poles, model.zeros or 0, model.bounds or (0.0, 0.0), **given)
+        given: Any = {"integrators": model.integrators or 0, "fixed": model.fixed, "bounds": delays.parameter_bounds}
+        options = FrequencyDomain(model.poles, model.zeros or 0, delays.bounds or (0.0, 0.0), **given)
         return FrequencyFitResult.of(identify_frequency_response(data, options))
 
 

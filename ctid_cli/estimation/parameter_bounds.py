@@ -15,7 +15,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 from ctid_cli.estimation.common import Bound
 from ctid_cli.estimation.measured_records import MeasuredRecords
-from ctid_cli.estimation.optimum.best_model import Optimum
+from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.known import KnownCoefficients, null_space
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.text import listed
@@ -200,7 +200,7 @@ class BoundedSearch:
         other.known = KnownCoefficients.of(degrees.poles, degrees.numerators - 1, places, parts)
         return other
 
-    def _begin(self, measured: MeasuredRecords, start: Optimum) -> tuple[Array, tuple[float, ...]]:
+    def _begin(self, measured: MeasuredRecords, start: Optimum) -> Begin:
         """Return where a search with known coefficients begins."""
         known = measured.known
         if not known.all_poles:

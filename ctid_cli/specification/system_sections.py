@@ -141,17 +141,7 @@ _OF_SEVERAL = "is for a system with one input; of several inputs give each its n
 
 
 class PartSection(SystemSection):
-    """The transfer function from one of several inputs to the output, strictly proper and stable.
-
-    Parameters
-    ----------
-    numerator : list of float
-        coefficients of B in descending powers of s
-    denominator : list of float
-        coefficients of A in descending powers of s
-    delay : float, default 0.0
-        Pure delay [s]
-    """
+    """The transfer function from one of several inputs to the output, strictly proper and stable."""
 
     elsewhere = {"additive": _OF_SEVERAL, "kind": _OF_SEVERAL}  # noqa: RUF012 - of the base class
 
