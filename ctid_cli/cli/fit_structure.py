@@ -334,9 +334,7 @@ def as_usage_errors() -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        options = {"fixed": "--fix", "noise_model": "--noise", "bounds": "--bound"}
-        text = re.sub(r"^(fixed|noise_model|bounds)\b", lambda found: options[found[1]], str(error))
-        raise UsageError(text) from None
+        raise UsageError(re.sub(r"^fixed\b", "--fix", re.sub(r"^noise_model\b", "--noise", str(error)))) from None
 
 
 def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOutputError | Given:

@@ -89,7 +89,7 @@ def quantities_of(bounds: Sequence[Bound], degrees: Degrees) -> list[Quantity]:
         if not inputs:
             shown = [own + kind for own in degrees.prefixes for kind in DERIVED]
             known = listed(coefficients + shown)
-            raise OptionError("bounds", f"bounds of {bound.name!r} are not possible; there are {known}")
+            raise OptionError("bounds", f"there is no {bound.name!r} to bound; there are {known}")
         found.append(_derived(bound, degrees, inputs[0]))
     if len({one.bound.name for one in found}) < len(found):
         raise OptionError("bounds", "a parameter is bounded twice; give each one bound")
