@@ -69,11 +69,11 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
     The covariance of a fraction's coefficients goes with the Jacobian of its partial fractions. A fraction has none in
     the given terms if its poles are repeated, different in number, or more of them complex than the terms can take.
     """
-    if isinstance(fit.model, MultiInputModel):
-        return InSubmodels(fit.coefficients)
     additive = getattr(fit, "additive", None)
     if additive is not None:
         return InSubmodels(additive.parameters)
+    if isinstance(fit.model, MultiInputModel):
+        return InSubmodels(fit.coefficients)
     if terms is None or fit.model is None:
         return InSubmodels()
     try:

@@ -251,11 +251,12 @@ def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | M
     if inputs := content.get("inputs"):
         return MultiInputModel.of({name: TransferFunction(**one["system"]) for name, one in inputs.items()})
     system = content.get("system") or {}
-    delay = float(system.get("delay") or 0.0)
+    # An option of a custom system may be called delay.
     if "additive" in system:
-        return AdditiveModel([Submodel(**item) for item in system["additive"]], delay)
+        parts = [Submodel(**item) for item in system["additive"]]
+        return AdditiveModel(parts, float(system.get("delay") or 0.0))
     if "denominator" in system:
-        return TransferFunction(system["numerator"], system["denominator"], delay)
+        return TransferFunction(system["numerator"], system["denominator"], float(system.get("delay") or 0.0))
     return None
 
 
