@@ -508,9 +508,7 @@ class DelayProfile(RecordsEstimator):
         if self.fixed and not self.inputs and not any("_" in one.name for one in self.fixed):
             self._known(("",))
         if self.bounds and (self.loss != "squares" or self.noise_model != "white"):
-            raise OptionError(
-                "bounds", "parameters are bounded with loss squares and white noise only; drop one"
-            )
+            raise OptionError("bounds", "parameters are bounded with loss squares and white noise only; drop one")
         if self.bounds and not self.inputs and not any("_" in one.name.removeprefix("time_") for one in self.bounds):
             self._quantities(("",))
 
