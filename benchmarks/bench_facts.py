@@ -15,7 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from ctid_cli import HeldSignal, Record, TransferFunction, simulate
-from ctid_cli.inference.record_facts import beside_response, record_facts
+from ctid_cli.inference.record_facts import decompose, record_facts
 from ctid_cli.inference.record_tests import LEVEL
 from ctid_cli.inference.signal_features import saturated
 from ctid_cli.signals.held import regular_interval
@@ -174,7 +174,7 @@ def main(records, seed, every):
         pole = 0.0 if rng.random() < 0.5 else rng.uniform(0.5, 0.95)
         record = record_of(case, noise_deviation(case) * draw_noise(rng, case.t.size, pole))
         begin = time.process_time()
-        beside = beside_response(record)
+        beside = decompose(record)
         seconds += time.process_time() - begin
         stated = alarms(record, beside)
         false.update(stated | ({"any"} if stated else set()))
@@ -188,7 +188,7 @@ def main(records, seed, every):
             noise = noise_deviation(case) * draw_noise(rng, case.t.size, of)
             for fault, spoilt in faulty(case, noise, rng).items():
                 if spoilt is not None:
-                    stated = alarms(spoilt, beside_response(spoilt))
+                    stated = alarms(spoilt, decompose(spoilt))
                     tried[fault, name] += 1
                     found[fault, name] += fault in stated
                     found[fault, name, "others"] += bool(stated - {fault})

@@ -23,6 +23,7 @@ INSTEAD = {
     r"\bhonest(?:y|ly)?\b": "correct, coverage",
     r"\bwhose failure\b": "failure classification",
     r"\bsecond looks?\b": "re-check",
+    r"\bholes?\b": "gap",
     r"\bThe same, (?:for|with|in|as)\b": "the name of the thing again",
 }
 #: Technical terms that contain such words.

@@ -30,7 +30,7 @@ from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate
 from ctid_cli.inference.of_input import InputFit
 from ctid_cli.inference.residual_tests import FEWEST_TESTED, ResidualTests, residual_tests
-from ctid_cli.inference.response_test import AnswerTest, response_test
+from ctid_cli.inference.response_test import ResponseTest, response_test
 from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
@@ -81,7 +81,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         What was asked for.
     fit : MeasuredFit, MultiInputFit, SubmodelsFit, LoopFit or FrequencyDomainFit
         The estimate.
-    answer : AnswerTest
+    answer : ResponseTest
         Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
     estimates : tuple of UncertainValue
         The parameters with their uncertainty.
@@ -109,7 +109,7 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     options: Options
     fit: MeasuredFit | MultiInputFit | SubmodelsFit | LoopFit | FrequencyDomainFit
-    answer: AnswerTest
+    answer: ResponseTest
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
     derived: tuple[UncertainValue, ...]
@@ -338,7 +338,7 @@ def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> t
     return tuple(found)
 
 
-def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolArray]) -> AnswerTest:
+def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolArray]) -> ResponseTest:
     """Test the response of the output to its input; of several to any of them, by the least of their p-values."""
     names = list(records[0].held)
     if len(names) == 1:

@@ -1,1 +1,1 @@
-"""Exact filtering and simulation on any clock, with any delay; sets of low-pass filters and what they do to a cost."""
+"""Exact filtering and simulation on any clock, with any delay; sets of low-pass filters and their effect on a cost."""

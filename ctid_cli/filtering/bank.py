@@ -26,20 +26,21 @@ from ctid_cli.filtering import kernels
 from ctid_cli.filtering.filter_data import FilterData, plain_array, split_delay
 from ctid_cli.filtering.realisation import chain, held_step, scaled_roots, transitions
 
-#: Partial fractions are used while they amplify rounding by less than this; beyond, poles count as repeated.
+#: Partial fractions are used if they amplify rounding by less than this; otherwise poles count as repeated.
 MODAL_CONDITION_LIMIT = 1e4
-#: Integrators that the modal form has.
+#: Largest number of integrators in modal form.
 MOST_MODAL_INTEGRATORS = 2
 
 Form = Literal["auto", "modal", "chain"]
-#: A delay [s]; on a regular clock also the breaks by which the read-out lags, and the fraction of an interval beyond.
+#: A delay [s]; on a regular clock alternatively the number of breaks by which the read-out lags, and the fraction of an
+#: interval from that break to the read-out.
 Place = float | tuple[int, float]
-#: No input besides the first, nothing that is not wanted.
+#: Empty arrays: no second input, and outputs that are not requested.
 NOTHING, NO_ROWS = np.zeros(0), np.zeros((0, 0))
 
 
 class Equations(NamedTuple):
-    """Second moments at one parameter vector, of sensitivities or instruments psi, regressors phi and output error."""
+    """Second moments of sensitivities or instruments psi, regressors phi and output error at one parameter vector."""
 
     #: ``sum psi phi'``, shape (p, p).
     instrument_regressor: Array
@@ -47,14 +48,14 @@ class Equations(NamedTuple):
     instrument_error: Array
     #: ``sum psi psi'``, shape (p, p).
     hessian: Array
-    #: Infinite where the parameters are inadmissible or the response is not finite.
+    #: Sum of squared output errors; infinite for inadmissible parameters or a response that is not finite.
     squared_error: float
     #: Sum of squares of the model output [output unit^2].
     output_power: float
 
 
 class Modes(NamedTuple):
-    """Partial fractions of one model, or of several submodels with their modes pooled."""
+    """Partial fractions of one model, or of several submodels (modes concatenated)."""
 
     #: One pole of each pair [rad/s], shape (m,).
     poles: ComplexArray
@@ -62,7 +63,7 @@ class Modes(NamedTuple):
     owner: IntArray
     #: Weights of z and w of each mode in the output, shape (m, 2).
     residues: ComplexArray
-    #: Direct feed-through of each submodel.
+    #: Direct feedthrough of each submodel.
     direct: Array
 
     @property
@@ -74,11 +75,11 @@ class Modes(NamedTuple):
 class ModalForm(NamedTuple):
     """Partial fractions of the standard rows."""
 
-    #: Amplification of rounding [-], infinite where poles coincide.
+    #: Amplification of rounding [-]; infinite if poles coincide.
     condition: float
     poles: ComplexArray
     residues: ComplexArray
-    #: The standard rows of the rows ``z, w, v, y - x, e`` of a pass.
+    #: Map from the rows ``z, w, v, y - x, e`` of a pass to the standard rows.
     mapping: Array
 
     @property
@@ -88,12 +89,12 @@ class ModalForm(NamedTuple):
 
     @property
     def modes(self) -> Modes:
-        """The modes of a model by itself."""
+        """Modes of the single model."""
         return Modes(self.poles, np.zeros(self.poles.size, np.int64), self.residues, np.zeros(1))
 
 
 def modal_form(a: Array, b: Array, integrators: int = 0) -> ModalForm:
-    """Return the partial fractions of ``B/(p^l A)``; their condition says whether they can be used."""
+    """Return the partial fractions of ``B/(p^l A)``; check their condition before use."""
     w0, roots = scaled_roots(a)
     return ModalForm(*kernels.modal_form(a, b, integrators, roots * w0))
 
@@ -112,10 +113,10 @@ def modal_pass(
 ) -> Array:
     """Return the moments of the rows of a pass, or the rows themselves, shape (count, q).
 
-    The rows are z of all modes; w, if ``double``; v; ``y - sum x``; and, if ``filter_output``, e. Where ``instruments``
-    are given they are v, held between the samples of a regular clock, and the rows go on with z, w and u of the input
-    itself. ``leading`` rows are multiplied with all (default: all); ``states`` are those at the first sample, and
-    become those after the last one, shape (m, 5).
+    The rows are z of all modes; w, if ``double``; v; ``y - sum x``; and, if ``filter_output``, e. ``instruments``, if
+    given, replace the input as v, held between the samples of a regular clock, and are followed by the rows z, w and u
+    of the input. The first ``leading`` rows are multiplied with all rows (default: all); ``states``, shape (m, 5), are
+    those at the first sample, and are overwritten by those after the last one.
     """
     n = modes.width
     layout = (n if double else 0, 2 * n if double else n, (2 * n + 2 if double else n + 2) if filter_output else 0)
@@ -132,8 +133,8 @@ def modal_pass(
 
 
 def to_steady_state(poles: ComplexArray, period: float, states: ComplexArray) -> None:
-    """Turn what one period adds to z and w from rest into the states at both ends of a periodic input, in place."""
-    # z(T) = decay z(0) + what the period adds, the same at both ends; and w(T) = decay (w(0) + T z(0)) + …
+    """Convert z and w after one period from rest into the periodic states, in place."""
+    # z(T) = decay z(0) + z after a period from rest, with z(T) = z(0); and w(T) = decay (w(0) + T z(0)) + …
     missing = -np.expm1(poles * period)
     states[:, 0] /= missing
     states[:, 1] = (states[:, 1] + period * (1.0 - missing) * states[:, 0]) / missing
@@ -157,7 +158,7 @@ def _run(
     rows: Array,
     simulated: Array,
 ) -> None:
-    """Run the pass for the clock of a record."""
+    """Run the compiled pass on the clock of a record."""
     if states is None:
         states = np.zeros((modes.poles.size, 5), np.complex128)
     grid, clock = None, None
@@ -172,7 +173,7 @@ def _run(
 
 
 def _place(delay: Place, interval: float) -> tuple[int, float]:
-    """Return the breaks by which the read-out lags, and the fraction of an interval that is read beyond."""
+    """Return the number of breaks by which the read-out lags, and the fraction of an interval after that break."""
     return delay if isinstance(delay, tuple) else split_delay(delay, interval)
 
 
@@ -200,7 +201,7 @@ def chain_states(
     step = held_step(dynamics, gain, data.interval * w0)
     states = kernels.regular_states(*step, values, changes, initial)
     if fraction > 0.0:
-        # The states stand at the break before the instant that arrives now: this reads them out there.
+        # The states are those at a break; move them to the read-out instant, a fraction of an interval later.
         part = held_step(dynamics, gain, fraction * data.interval * w0)
         states = states @ part.transition.T + np.outer(values, part.from_value)
         states += np.outer(fraction * changes, part.from_change)
@@ -208,14 +209,14 @@ def chain_states(
 
 
 class ChainForm(NamedTuple):
-    """A chain ``z' = w0 (F z + g u)``, and its part in the standard rows with a second chain that x drives."""
+    """A chain ``z' = w0 (F z + g u)``, and its map to the standard rows with a second chain driven by x."""
 
     w0: float
     dynamics: Array
     gain: Array
     #: Map from the states to ``x = B/(p^l A) u``.
     output: Array
-    #: The standard rows of the rows ``z, w, v, y - x, e`` of a pass, as those of partial fractions.
+    #: Map from the rows ``z, w, v, y - x, e`` of a pass to the standard rows.
     mapping: Array
 
     @property
@@ -225,7 +226,7 @@ class ChainForm(NamedTuple):
 
     @property
     def double(self) -> tuple[Array, Array]:
-        """Dynamics and gain of both chains in a row."""
+        """Dynamics and gain of both chains in series."""
         n = self.width
         dynamics = np.asarray(np.kron(np.eye(2), self.dynamics), dtype=np.float64)
         dynamics[n:, :n] = np.outer(self.gain, self.output)
@@ -258,14 +259,14 @@ def chain_form(a: Array, b: Array, integrators: int = 0) -> ChainForm:
 
 
 class Chains(NamedTuple):
-    """The chains of one model, or of several submodels, and what each of these passes on at once."""
+    """Chains of one model or of several submodels, with the direct feedthrough of each."""
 
     forms: tuple[ChainForm, ...]
     direct: Array
 
 
 def chain_pass(data: FilterData, chains: Chains, delay: float, instruments: Array | None = None) -> Array:
-    """Return the rows of a pass over chains, shape (count, q), those of the chains next to each other."""
+    """Return the rows of a pass over chains, shape (count, q), with the rows of all chains concatenated."""
     inputs = [data] if instruments is None else [data._replace(u=instruments, input_foh=False), data]
     columns: list[list[Array]] = []
     for driving in inputs:
@@ -273,7 +274,7 @@ def chain_pass(data: FilterData, chains: Chains, delay: float, instruments: Arra
         singles = [state[:, : form.width] for form, state in zip(chains.forms, states, strict=True)]
         doubles = [state[:, form.width : -1] for form, state in zip(chains.forms, states, strict=True)]
         columns.append([*singles, *doubles, states[0][:, -1:]])
-    # The last are driven by the measured input.
+    # The states of the last pass are driven by the measured input.
     u = states[0][:, -1]
     outputs = [
         single @ form.output + direct * u

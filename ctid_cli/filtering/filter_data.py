@@ -1,4 +1,4 @@
-"""A record as the passes take it: one named tuple of plain arrays."""
+"""Layout of a record for filtering: a named tuple of plain arrays."""
 
 from math import ceil
 from typing import NamedTuple
@@ -12,19 +12,19 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
-#: A delay closer to a whole number of intervals than this fraction of one is that whole number.
+#: A delay within this fraction of an interval of a whole number of intervals is rounded to it.
 WHOLE_INTERVAL = 1e-10
-#: Instants closer than this fraction of the shortest interval are one instant, written with different rounding.
+#: Instants closer than this fraction of the shortest interval differ by rounding only.
 ROUNDING_GAP = 1e-9
 
 
 class FilterData(NamedTuple):
-    """A record laid out for the passes.
+    """A record laid out for filtering.
 
-    Arrays are contiguous and writeable: for any other layout a pass would be compiled again.
+    Arrays are contiguous and writeable: any other layout would trigger another compilation.
     """
 
-    #: Sampling instants [s] and outputs, masked samples bridged by straight lines, shape (N,).
+    #: Sampling instants [s] and outputs, shape (N,); masked samples are interpolated linearly.
     t: Array
     y: Array
     #: Samples that enter sums: present, and not before the start-up time, shape (N,).
@@ -38,18 +38,18 @@ class FilterData(NamedTuple):
     interval: float
     #: Whether input and output have the same instants.
     common_clock: bool
-    #: Time [s] by which a break may be late and still count as reached: what rounding makes of one instant.
+    #: Time [s] by which a break may be late, due to rounding, and still count as reached.
     slack: float = 0.0
-    #: The same samples with each of the further inputs.
+    #: Layouts with each of the further inputs.
     further: tuple["FilterData", ...] = ()
 
     @property
     def inputs(self) -> tuple["FilterData", ...]:
-        """The samples with each of the inputs."""
+        """Layouts with each of the inputs."""
         return (self, *self.further)
 
     @property
-    def count(self) -> int:  # type: ignore[override]  # what a tuple counts is of no use here
+    def count(self) -> int:  # type: ignore[override]  # tuple.count is not needed
         """Number of samples that enter sums."""
         return int(self.use.sum())
 
@@ -65,17 +65,17 @@ class FilterData(NamedTuple):
 
 
 def plain_array(values: ArrayLike) -> Array:
-    """A fresh, writeable, contiguous array."""
+    """Return a new, writeable, contiguous array."""
     return np.array(values, dtype=np.float64, order="C")
 
 
 def filter_data(
     record: Record, start: float = 0.0, hold_output: OutputHold = "foh", *, periodic: bool = False
 ) -> FilterData:
-    """Lay a record out for filtering; a periodic one repeats itself one interval after its end.
+    """Lay a record out for filtering; a periodic record repeats one interval after its end.
 
-    The samples of a record whose input is band-limited are every k-th point of its finer clock: regular passes are
-    many times faster than those over any clock. All inputs share these points.
+    The samples of a record with a band-limited input are every k-th point of a finer regular clock, on which filtering
+    is many times faster than on an irregular one. All inputs share these points.
     """
     signals = [one.periodic_lines if periodic else one.lines for one in record.held.values()]
     slack = 1e-9 * (record.interval or 0.0)
@@ -108,23 +108,23 @@ def filter_data(
 
 
 def _on_points(signal: HeldSignal, t: Array) -> HeldSignal:
-    """A held signal, or lines, with a value at every point of a finer clock."""
+    """Return a held or piecewise linear signal with a value at every point of a finer clock."""
     return signal if signal.t.size == t.size else HeldSignal(t, signal.at(t), signal.hold)
 
 
 def clock_slack(*clocks: Array) -> float:
-    """Return a small fraction of the shortest interval of some clocks [s]."""
+    """Return the rounding tolerance of clocks, a small fraction of their shortest interval [s]."""
     shortest = min((float(np.diff(clock).min()) for clock in clocks if clock.size > 1), default=0.0)
     return ROUNDING_GAP * shortest
 
 
 def used_samples(data: FilterData, record: Record) -> BoolArray:
-    """Samples of a record that enter sums, shape (N,)."""
+    """Return which samples of a record enter sums, shape (N,)."""
     return data.use if data.use.size == record.n_samples else data.use[::FINER]
 
 
 def split_delay(delay: float, interval: float) -> tuple[int, float]:
-    """Return whole intervals by which the read-out lags, and the fraction of an interval read beyond that break."""
+    """Return the whole intervals by which the read-out lags, and the fraction of an interval after that break."""
     ratio = delay / interval
     shift = ceil(ratio)
     fraction = shift - ratio

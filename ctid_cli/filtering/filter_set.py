@@ -1,17 +1,18 @@
-r"""Sets of low-pass filters that lead a delay estimate out of local minima.
+r"""Sets of low-pass filters with which a delay estimate escapes local minima.
 
-With the rational part known, an input of spectral density ``Psi(w)`` and white output noise of intensity ``lambda``,
-the cost of a delay error d after a low-pass filter L is, by Parseval,
+For a known rational part, an input of spectral density ``Psi(w)`` and white output noise of intensity ``lambda``, the
+cost of a delay error d after a low-pass filter L is, by Parseval,
 
 .. math:: J(d) = \frac1\pi \int_{-\infty}^{\infty} (1 - \cos w d) |L G_0(jw)|^2 \Psi(w)\,dw
                  + \frac{\lambda}{2\pi} \int_{-\infty}^{\infty} |L(jw)|^2\,dw,
 
-twice the drop of the autocorrelation of the filtered output from its peak, above the noise floor. Every such cost is
-even in d and least at d = 0. The longer the period of the filter, the wider the valley around zero.
+twice the decrease of the autocorrelation of the filtered output from its peak, plus the noise floor. Every such cost
+is even in d and least at d = 0. The region of convergence around zero grows with the period of the filter.
 
-A descent of one filtered cost may stop at a local minimum. If for every delay error some filter of a set has a descent
-that ends strictly closer to zero, switching between them ends at zero: minima are finite in number, and each lies below
-the one before. That is the necessary condition (40) for useful redundancy, which :func:`check_filters` verifies.
+A descent of one filtered cost may stop at a local minimum. If for every delay error the descent of some filter of a
+set ends strictly closer to zero, switching between filters ends at zero, since there are finitely many minima and each
+is closer than the one before. That is the necessary condition (40) for useful redundancy, which :func:`check_filters`
+verifies.
 
 Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time delay estimation for
 continuous-time models" (arXiv:1703.09344).
@@ -30,7 +31,7 @@ from ctid_cli.signals.checks import require_integer, require_positive
 
 
 def ideal_cost(delay_error: ArrayLike, cutoff: float) -> Array:
-    r"""Cost of a delay error where the low-pass filter and the system together are an ideal low-pass filter.
+    r"""Return the cost of a delay error if low-pass filter and system in series are an ideal low-pass filter.
 
     The input is white noise of unit intensity, and there is no output noise.
 
@@ -42,7 +43,7 @@ def ideal_cost(delay_error: ArrayLike, cutoff: float) -> Array:
 
 
 def extrema(cutoff: float, count: int, exact: bool = False) -> Array:
-    r"""Positive delay errors at which the ideal cost has its extrema.
+    r"""Return the positive delay errors at which the ideal cost has extrema.
 
     The extrema are those of ``sin(x)/x``, ``x = wc d``: the roots of ``tan x = x`` (51), one just below each
     ``q = (i + 1/2) pi``. Equation (36) is ``x ~ q - 1/q``; it lies above the root, by 0.15 % for i = 1, 0.018 % for
@@ -53,7 +54,7 @@ def extrema(cutoff: float, count: int, exact: bool = False) -> Array:
     q = (np.arange(1, count + 1) + 0.5) * np.pi
     x = q - 1 / q
     if exact:
-        # With y = q - x the equation reads y = arctan(1/(q - y)): each round gains the factor x² + 1 > 21.
+        # With y = q - x the equation is y = arctan(1/(q - y)): each iteration reduces the error by x² + 1 > 21.
         y = 1 / q
         for _ in range(14):
             y = np.arctan(1 / (q - y))
@@ -62,16 +63,16 @@ def extrema(cutoff: float, count: int, exact: bool = False) -> Array:
 
 
 def convergence_region(cutoff: float, exact: bool = False) -> float:
-    r"""Delay error up to which a descent of the ideal cost ends at zero."""
+    r"""Return the delay error up to which a descent of the ideal cost ends at zero."""
     return float(extrema(cutoff, 1, exact)[0])
 
 
 #: Least ratio of the longest to the shortest period for which a sufficient number of filters exists, (41): the second
-#: extremum over the first, both by (36). Those of the true cost ask for 1.7192; between the two a narrow gap remains.
+#: extremum over the first, both by (36). The true extrema require 1.7192; between the two values a narrow gap remains.
 LEAST_BETA = (5 / 4 - 1 / (5 * math.pi**2)) / (3 / 4 - 1 / (3 * math.pi**2))
-#: Beyond this ratio the longest period is too slow for the system that it must show.
+#: Beyond this ratio the longest period is too slow for the system.
 GREATEST_BETA = 10.0
-#: Filters times extrema that a check looks at, at most.
+#: Largest number of filters times extrema in a check.
 _WORK_LIMIT = 20_000_000
 
 
@@ -97,7 +98,7 @@ class FilterSet:
 
     Notes
     -----
-    ``T_k = beta T_bw + (k - 1) (1 - beta) T_bw/(nf - 1)``, k = 1 ... nf: (38), of which (39) is another spelling.
+    ``T_k = beta T_bw + (k - 1) (1 - beta) T_bw/(nf - 1)``, k = 1 ... nf: (38), equivalent to (39).
     The minima of a filter's cost are proportional to its period, hence the linear spacing.
 
     Examples
@@ -139,22 +140,22 @@ def _check_beta(beta: float) -> None:
         raise OptionError(
             "beta",
             f"beta, the ratio of the longest to the shortest period, must be between {LEAST_BETA:.4f} (bound (41): the "
-            f"least for which some number of filters suffices) and {GREATEST_BETA:g}, not {beta}.",
+            f"least for which a finite number of filters suffices) and {GREATEST_BETA:g}, not {beta}.",
         )
 
 
 def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: float) -> int:
-    r"""A number of filters that satisfies the necessary condition (40) for sure; often many fewer do.
+    r"""Return a number of filters sufficient for the necessary condition (40); often far fewer satisfy it.
 
     Equations (55)-(57): with i0 the first maximum of the longest period, by (36), that is not below the largest error,
-    ``nf >= (1/M + beta - 2)/(1/M - 1)``, ``M = (z - 4/(z pi^2))/(z + 2 - 4/((z + 2) pi^2))``, ``z = 4 i0 - 3``. All of
-    that rests on (36). With the true extrema the number suffices from beta = 1.7192 on; below, errors just beyond the
-    first maximum of the longest period lie under every positive minimum, and no number of filters helps.
+    ``nf >= (1/M + beta - 2)/(1/M - 1)``, ``M = (z - 4/(z pi^2))/(z + 2 - 4/((z + 2) pi^2))``, ``z = 4 i0 - 3``. This
+    uses the approximation (36). With the true extrema the number suffices for beta >= 1.7192; below, errors just beyond
+    the first maximum of the longest period are smaller than every positive minimum, and no number of filters suffices.
     """
     _check_beta(beta)
     require_positive("bandwidth", bandwidth, "rad/s")
     require_positive("largest_error", largest_error, "s")
-    # Maximum i lies at (z/4 - 1/(z pi^2)) periods, z = 4 i - 1; solved for z it says in which valley an error lies.
+    # Maximum i lies at (z/4 - 1/(z pi^2)) periods, z = 4 i - 1; solving for z gives the two maxima around an error.
     ratio = largest_error * bandwidth / (2 * math.pi * beta)
     i0 = max(1, math.ceil((2 * (ratio + math.hypot(ratio, 1 / math.pi)) + 1) / 4))
     if i0 == 1:
@@ -166,7 +167,7 @@ def sufficient_number_of_filters(beta: float, bandwidth: float, largest_error: f
 
 @dataclass(frozen=True)
 class ServedInterval:
-    """Delay errors from which the same filters lead closer to zero, to the same minima."""
+    """Interval of delay errors from which the same filters descend closer to zero, to the same minima."""
 
     #: Ends of the open interval of absolute delay errors [s].
     low: float
@@ -178,14 +179,14 @@ class ServedInterval:
 
 @dataclass(frozen=True)
 class FilterCheck:
-    """Whether a set of ideal low-pass filters leads from every delay error closer to zero."""
+    """Result of the check that from every delay error some ideal low-pass filter descends closer to zero."""
 
     #: Cut-off frequencies [rad/s].
     cutoffs: tuple[float, ...]
-    #: Largest absolute delay error looked at [s].
+    #: Largest absolute delay error checked [s].
     largest_error: float
     intervals: tuple[ServedInterval, ...]
-    #: Open intervals of absolute delay errors [s] from which no filter leads closer to zero.
+    #: Open intervals of absolute delay errors [s] from which no filter descends closer to zero.
     gaps: tuple[tuple[float, float], ...]
     exact: bool
 
@@ -195,7 +196,7 @@ class FilterCheck:
         return not self.gaps
 
     def path(self, initial_error: float) -> list[tuple[int, float]]:
-        """Descents that lead from a delay error towards zero."""
+        """Return the descents, as filter and end, from a delay error towards zero."""
         if not abs(initial_error) <= self.largest_error:
             raise ValueError(
                 f"the check covers delay errors up to {self.largest_error:g} s, not {abs(initial_error):g} s; "
@@ -230,22 +231,22 @@ def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) 
     Returns
     -------
     FilterCheck
-        Whether every error up to the largest one is served, by which filters, and where not.
+        Intervals of errors with the filters that reduce them, and the gaps.
 
     Raises
     ------
     ValueError
-        If a cut-off frequency or the largest error is not positive, or the range holds too many extrema.
+        If a cut-off frequency or the largest error is not positive, or the range contains too many extrema.
 
     Notes
     -----
-    No grid is involved. A descent leads from anywhere between two neighbouring maxima of a filter's cost to the minimum
-    between them, so the filter serves exactly the errors between that minimum and the maximum beyond it. The ends of
-    all these intervals split the range into pieces in which nothing changes. The ends themselves, where a descent may
-    go either way, are left out.
+    No grid is involved. A descent from any point between two neighbouring maxima of a filter's cost ends at the minimum
+    between them, so the filter reduces exactly the errors between that minimum and the next maximum. The ends of all
+    these intervals split the range into pieces with constant results. The ends, where the direction of a descent is
+    undetermined, are excluded.
 
-    The condition is necessary, not sufficient: an estimator also has to prefer the nearer minimum to the one it is in,
-    and real filters are not ideal.
+    The condition is necessary, not sufficient: an estimator must also prefer the nearer minimum to the current one, and
+    real filters are not ideal.
 
     Examples
     --------
@@ -263,13 +264,13 @@ def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) 
     require_positive("largest_error", largest_error, "s")
     if w.size * (largest_error * w.sum() / np.pi + w.size) > _WORK_LIMIT:
         raise ValueError(
-            f"{w.size} filters have too many extrema up to {largest_error:g} s to be looked at one by one; "
+            f"{w.size} filters have too many extrema up to {largest_error:g} s to be checked one by one; "
             "give a smaller largest error, fewer filters or lower cut-offs."
         )
     landscapes = [_landscape(float(cutoff), largest_error, exact) for cutoff in w]
     breaks = np.unique(np.concatenate([part for landscape in landscapes for part in landscape]))
     breaks = np.array([0.0, *breaks[(breaks > 0) & (breaks < largest_error)], largest_error])
-    wide = np.diff(breaks) > 1e-12 * largest_error  # what is left of two ends that are equal but for rounding
+    wide = np.diff(breaks) > 1e-12 * largest_error  # drop pieces between ends that differ by rounding only
     low, high = breaks[:-1][wide], breaks[1:][wide]
     middle = 0.5 * (low + high)
     ends = np.array([_ends(middle, *landscape) for landscape in landscapes])
@@ -280,9 +281,9 @@ def check_filters(cutoffs: ArrayLike, largest_error: float, exact: bool = True) 
 def _served(
     low: Array, high: Array, ends: Array, middle: Array
 ) -> tuple[list[ServedInterval], list[tuple[float, float]]]:
-    """Pieces that filters serve, joined where these and their minima are the same, and those that none does.
+    """Return the pieces that filters reduce, merged if filters and minima are equal, and the gaps.
 
-    ``ends`` is where the descent of each filter from the middle of each piece ends, shape (filters, pieces).
+    ``ends`` are the ends of the descent of each filter from the middle of each piece, shape (filters, pieces).
     """
     nearest_first = np.argsort(ends, axis=0, kind="stable")
     helps = ends < middle
@@ -303,12 +304,12 @@ def _served(
 
 
 def _landscape(cutoff: float, largest_error: float, exact: bool) -> tuple[Array, Array]:
-    """Maxima up to the first beyond an error, and the minima between them, the one at zero first [s]."""
+    """Return the maxima up to the first beyond an error, and the minima between them, starting with zero [s]."""
     pairs = int(largest_error * cutoff / (2 * np.pi)) + 2
     all_ = extrema(cutoff, 2 * pairs - 1, exact)
     return all_[::2], np.concatenate([[0.0], all_[1::2]])
 
 
 def _ends(errors: Array, maxima: Array, minima: Array) -> Array:
-    """Where descents from positive delay errors end [s]."""
+    """Return the ends of descents from positive delay errors [s]."""
     return np.asarray(minima[np.searchsorted(maxima, errors)])

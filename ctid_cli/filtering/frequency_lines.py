@@ -1,13 +1,13 @@
-r"""A frequency response laid out for the search, and what first-order modes and state spaces answer at its lines.
+r"""Layout of a frequency response for estimation, and responses of modes and state spaces at its lines.
 
-The values are ``G(jw)``, or those of samples, ``Y(q)/U(q)`` with ``q = exp(j w h)``, where the input is constant over
-intervals h. Sampled, a delay of ``d - f`` intervals reads the state of a system ``z' = F z + g u`` a fraction f after a
-break, d breaks ago:
+The values are ``G(jw)``, or the sampled response ``Y(q)/U(q)`` with ``q = exp(j w h)`` for an input that is constant
+over intervals h. With a delay of ``d - f`` intervals the output of a sampled system ``z' = F z + g u`` depends on the
+state a fraction f after the break d breaks earlier:
 
 .. math:: z = q^{-d} \left[ e^{F f h} (q I - e^{F h})^{-1} \Gamma(h) + \Gamma(f h) \right] u, \qquad
           \Gamma(x) = \int_0^x e^{F s} ds \, g.
 
-A complex equation is two real ones, but one at frequency zero and at half the sampling frequency.
+A complex equation is two real ones, except at frequency zero and at half the sampling frequency, where it is one.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray
 from ctid_cli.filtering.bank import Place
 from ctid_cli.filtering.realisation import held_step
 
-#: Below this magnitude of ``p x`` integrals over a step x are series, of this number of terms.
+#: Below this magnitude of ``p x`` integrals over a step x are computed as series with this number of terms.
 SERIES_BELOW, TERMS = 0.5, 16
-#: A line this close to half the sampling frequency, as a fraction of it, is at it.
+#: Relative tolerance within which a line counts as half the sampling frequency.
 AT_NYQUIST = 1e-9
 
 
@@ -34,7 +34,7 @@ class FrequencyLines:
     response: ComplexArray
     #: Factors of the errors in the sum of squares, shape (K,).
     weights: Array
-    #: Interval [s] of the samples that the values are of; 0 of ``G(jw)``.
+    #: Sampling interval [s] of a sampled response; 0 for ``G(jw)``.
     interval: float = 0.0
 
     #: Input and output have no instants.
@@ -42,7 +42,7 @@ class FrequencyLines:
 
     @cached_property
     def use(self) -> BoolArray:
-        """Which real and imaginary parts are equations, shape (2 K,)."""
+        """Mask of the real and imaginary parts that are equations, shape (2 K,)."""
         real = self.frequencies == 0.0
         if self.interval:
             real |= np.abs(self.frequencies * self.interval / np.pi - 1.0) <= AT_NYQUIST
@@ -70,13 +70,13 @@ class FrequencyLines:
 
     @property
     def length(self) -> float:
-        """Length of a record that resolves as much [s]."""
+        """Length of a record with the same frequency resolution [s]."""
         gaps = np.diff(np.unique(self.frequencies))
         return 2.0 * np.pi / min(self.lowest, float(np.median(gaps)) if gaps.size else self.lowest)
 
     @property
     def shift(self) -> ComplexArray:
-        """The derivative in time ``j w``, or ``q``, at each line."""
+        """Operator ``j w``, or ``q`` for a sampled response, at each line."""
         return np.asarray(np.exp(1j * self.frequencies * self.interval) if self.interval else 1j * self.frequencies)
 
     def parts(self, columns: ComplexArray) -> Array:
@@ -85,13 +85,13 @@ class FrequencyLines:
         return np.ascontiguousarray(np.vstack((weighted.real, weighted.imag))[self.use].T)
 
     def delayed(self, delay: Place) -> ComplexArray:
-        """Return the response of the delay to the input as it is at the samples."""
+        """Return the frequency response of the delay, of its whole intervals for a sampled response."""
         if isinstance(delay, tuple):
             return np.asarray(self.shift ** -delay[0])
         return np.asarray(np.exp(-self.shift * delay))
 
     def of_modes(self, poles: ComplexArray, delay: Place) -> tuple[ComplexArray, ComplexArray]:
-        """Return ``1/(s - p)`` behind the delay and its derivative by each pole, shapes (K, n)."""
+        """Return ``1/(s - p)`` with the delay and its derivative by each pole, shapes (K, n)."""
         late = self.delayed(delay)[:, None]
         if not isinstance(delay, tuple):
             first = 1.0 / (self.shift[:, None] - poles)
@@ -107,7 +107,7 @@ class FrequencyLines:
         return late * value, late * slope
 
     def of_states(self, dynamics: Array, gain: Array, delay: Place) -> ComplexArray:
-        """Return the states of ``z' = F z + g u`` behind the delay, shape (K, n)."""
+        """Return the responses of the states of ``z' = F z + g u`` with the delay, shape (K, n)."""
         late, unit = self.delayed(delay)[:, None], np.eye(gain.size)
         if not isinstance(delay, tuple):
             return np.asarray(late * _resolved(self.shift, dynamics, gain))
@@ -124,7 +124,7 @@ def _resolved(points: ComplexArray, matrix: Array, gain: Array) -> ComplexArray:
 
 
 def held_integral(poles: ComplexArray, x: float) -> tuple[ComplexArray, ComplexArray]:
-    """Return ``(exp(p x) - 1)/p`` and its derivative by p, for p = 0 too."""
+    """Return ``(exp(p x) - 1)/p`` and its derivative by p, also for p = 0."""
     z = np.asarray(poles * x, dtype=complex)
     small = np.abs(z) < SERIES_BELOW
     power = 1.0 / np.cumprod(np.arange(1.0, TERMS + 1.0))

@@ -1,16 +1,16 @@
-r"""All compiled loops over the samples of linear systems.
+r"""Compiled loops over the samples of linear systems.
 
-A kernel calls only kernels of this file and reads no constant and no type of another: Numba's cache on disk looks only
-at the file of a function, and is then never stale. What makes the arguments, and what is made of the results, is NumPy
-(:mod:`~ctid_cli.filtering.bank`, :mod:`~ctid_cli.filtering.submodels`, :mod:`~ctid_cli.filtering.simulate`).
+Kernels use only functions, constants and types of this file: Numba's disk cache checks only the file of a function, so
+that it is never stale. Preparation and evaluation are in NumPy (:mod:`~ctid_cli.filtering.bank`,
+:mod:`~ctid_cli.filtering.submodels`, :mod:`~ctid_cli.filtering.simulate`).
 
 A filter has two forms. The *modal* form, for simple poles, is a sum of partial fractions: for one pole p of each
 conjugate pair a pass advances ``z = 1/(s - p) u``, ``w = 1/(s - p)^2 u`` and ``e = 1/(s - p) y``, real and imaginary
 part as two rows, block by block and mode by mode, with the state in registers. The *chain* form, for repeated poles,
 advances a state space by exact transitions.
 
-Helpers that are only called from kernels are inlined (``inline="always"``): compiled by themselves and again in each
-caller, they would cost most of the time to the first estimate.
+Helpers that are only called from kernels are inlined (``inline="always"``): compiling them separately and again in
+each caller would take most of the time to the first estimate.
 """
 
 import math
@@ -20,16 +20,15 @@ from numba import njit
 
 from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 
-#: Rows are made in blocks of this many samples, which stay in the first cache of a processor.
+#: Rows are computed in blocks of this number of samples, which fit into the L1 cache.
 BLOCK = 128
-#: Length of the rows of a block: there is a state behind the last one, and each row begins on a line of the cache.
+#: Length of the rows of a block: one more state than samples, padded so that rows are aligned to cache lines.
 WIDTH = BLOCK + 8
-#: 1/(k + 4)!, k = 0 … 14, of the series for |x| <= 1: what is left out is below rounding.
+#: 1/(k + 4)!, k = 0 … 14, of the series for |x| <= 1: the remainder is below rounding.
 SERIES = tuple(1.0 / math.factorial(k + 4) for k in range(15))
-#: Up to |x| = 2^this a block of weights is summed as series of halved steps, and doubled; beyond, exponentials are
-#: faster.
+#: Up to |x| = 2^MOST_DOUBLINGS weights are series at halved steps, then doubled; beyond, exponentials are faster.
 MOST_DOUBLINGS = 5
-#: Places of the parts of a block of steps, see `_weigh`.
+#: Indices of the parts of a block of steps, see `_weigh`.
 GAP, VALUE, CHANGE, DECAY_RE, DECAY_IM, SINGLE_RE, SINGLE_IM, DOUBLE_RE, DOUBLE_IM, PARTS = range(10)
 #: Digits per level, and Taylor degree, of the transitions of a chain over any step.
 BASE = 16
@@ -41,10 +40,10 @@ TAYLOR_DEGREE = 6
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def polish_roots(coefficients: Array, roots: ComplexArray) -> None:
-    """Improve the roots of a monic real polynomial by Newton steps, in place; a pair stands side by side."""
-    # Against rounding, which is relative to the *largest* root. Only where the step is small against the distance to
-    # the next root: the members of a cluster are wrong each by itself and right together, and must not be moved one by
-    # one.
+    """Improve the roots of a monic real polynomial by Newton steps, in place; the roots of a pair are adjacent."""
+    # Removes rounding errors, which are relative to the *largest* root. Only if the step is small compared with the
+    # distance to the next root: errors of the roots of a cluster cancel in their product, and moving single roots would
+    # destroy that.
     for i in range(roots.size):
         gap = np.inf
         for j in range(roots.size):
@@ -76,10 +75,10 @@ def _add_mode(mapping: Array, row: int, column: int, paired: bool, weight: compl
 def modal_form(
     a: Array, b: Array, integrators: int, roots: ComplexArray
 ) -> tuple[float, ComplexArray, ComplexArray, Array]:
-    r"""Partial fractions of the standard rows of ``B/(p^l A)``, with A monic of degree n and l up to 2.
+    r"""Return partial fractions of the standard rows of ``B/(p^l A)``, with A monic of degree n and l up to 2.
 
-    Returns how much they amplify rounding, infinite where poles coincide; the poles, one of each pair, and 0 last if
-    there are integrators; the weights of z and w in the output x, shape (modes, 2); and the map to the standard rows of
+    Returns the amplification of rounding, infinite if poles coincide; the poles, one of each pair, and 0 last if there
+    are integrators; the weights of z and w in the output x, shape (modes, 2); and the map to the standard rows of
     :mod:`~ctid_cli.filtering.bank` from the rows of a pass: z and w of each mode, v, ``y - x``, and e of each mode.
     """
     n, origin = a.size - 1, integrators
@@ -92,17 +91,17 @@ def modal_form(
     mapping = np.zeros((3 * n + origin + 3, 3 * width + 2))
     slopes, curvatures = np.ones(n, np.complex128), np.zeros(n, np.complex128)
     for i in range(n):
-        # A'(pole), as a product: exact where the polynomial form would cancel; and A''/A' = 2 sum 1/(pole - other).
+        # A'(pole) as a product, which avoids cancellation; and A''/A' = 2 sum 1/(pole - other).
         for j in range(n):
             if roots[j] != roots[i]:
                 slopes[i] *= roots[i] - roots[j]
                 curvatures[i] += 2.0 / (roots[i] - roots[j])
             elif j != i:
                 return np.inf, poles, residues, mapping
-        # A pole at the origin has no bandwidth; a slope that underflows when squared belongs to a double one.
+        # Poles at the origin are in `integrators`; a slope that underflows when squared belongs to a double pole.
         if slopes[i] * slopes[i] == 0.0 or roots[i] == 0.0:
             return np.inf, poles, residues, mapping
-    # Rounding matters against the largest gain of p^k/A^2, which lies near the frequency of some pole, or at zero.
+    # Rounding is compared with the largest gain of p^k/A^2, which lies near the frequency of some pole, or at zero.
     condition = 1.0
     peaks, spreads = np.zeros(n), np.zeros(n)
     for at in range(n + 1 if n > 1 else 0):
@@ -155,7 +154,7 @@ def modal_form(
         row += 2 if paired else 1
         mode += 1
     if origin > 0:
-        # The power series at the origin of 1/A, B/A and B/A^2: their terms are the weights of 1/p and of 1/p^2.
+        # Power series at the origin of 1/A, B/A and B/A^2: their terms are the weights of 1/p and of 1/p^2.
         a0, a1 = a[n], a[n - 1] if n > 0 else 0.0
         b0, b1 = b[b.size - 1], b[b.size - 2] if b.size > 1 else 0.0
         own = (1.0 / a0, -a1 / a0**2)
@@ -180,16 +179,16 @@ def modal_form(
     return condition, poles, residues, mapping
 
 
-# --- what a held input makes of a mode over a step ------------------------------------------------------------------
+# --- response of a mode to a held input over a step -----------------------------------------------------------------
 # All weights follow from f(x) = (exp(x) - 1 - x)/x^2 and its derivative at x = pole * step: with
 # g = (exp(x) - 1)/x = 1 + x f and g' = f + x f', the decay is exp(x) = 1 + x g.
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, inline="always")
 def _series(re: float, im: float) -> tuple[float, float, float, float]:
-    """Real and imaginary part of f and of f' at |x| <= 1, without cancellation however slow the pole is."""
-    # Of a real polynomial at x only the remainder by t^2 - 2 re t + |x|^2, which is zero at x, is complex: two products
-    # for each coefficient where complex ones take four. last is the quotient's constant term at the end.
+    """Return real and imaginary part of f and of f' at |x| <= 1, without cancellation for slow poles."""
+    # Division of a real polynomial by t^2 - 2 re t + |x|^2, which is zero at x, leaves a linear remainder: two products
+    # for each coefficient instead of four. last is the quotient's constant term at the end.
     twice, square = re + re, re * re + im * im
     before, last = 0.0, SERIES[14]
     for k in range(13, 0, -1):
@@ -208,7 +207,7 @@ def _series(re: float, im: float) -> tuple[float, float, float, float]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex, complex, complex, complex]:
-    """What ``z = 1/(s - p) v`` and ``w = 1/(s - p)^2 v`` become over a step with v linear: d, m, b, c, f, g.
+    """Return the weights d, m, b, c, f, g of ``z = 1/(s - p) v``, ``w = 1/(s - p)^2 v`` over a step with v linear.
 
     ``z+ = d z + b v + c (change of v)`` and ``w+ = d w + m z + f v + g (change of v)``.
     """
@@ -219,7 +218,7 @@ def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex,
         g, g_slope = 1.0 + x * f, f + x * slope
         decay = 1.0 + x * g
     else:
-        # Divided by x throughout: 1 + x f would cancel where the step is long.
+        # Divided by x throughout: 1 + x f would cancel for long steps.
         over = 1.0 / x
         decay = np.exp(x)
         g = (decay - 1.0) * over
@@ -229,24 +228,24 @@ def step_weights(pole: complex, step: float) -> tuple[complex, complex, complex,
     return decay, step * decay, step * g, step * f, square * g_slope, square * slope
 
 
-#: A regular clock: the interval, and shift and fraction of the delay ``(shift - fraction) interval``. Else None.
+#: A regular clock: the interval, and shift and fraction of the delay ``(shift - fraction) interval``; else None.
 Grid = tuple[float, int, float] | None
 #: Any other clock: instants of the samples and of the breaks of the input, the delay, and the time by which a break may
-#: be late and still count as reached. Else None.
+#: be late and still count as reached; else None.
 Instants = tuple[Array, Array, float, float] | None
 
 
-# --- passes: steps over which inputs are held, and the modes that they drive ------------------------------------------
+# --- passes of modes over steps with held inputs ----------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _weigh(
     pole: complex, double: bool, grid: Grid, instants: Instants, longest: float, count: int, steps: Array
 ) -> None:
-    """Write the decay of a mode over each step of a block, and what the held input adds to it, and to its square too.
+    """Write the decay of a mode over each step of a block, and the terms that the held input adds to z and w.
 
-    The parts of ``steps``, shape (PARTS, BLOCK): the gaps, the input and its change over them, and what is written. On
-    a grid all gaps are the same; at any instants none is longer than ``longest``.
+    The parts of ``steps``, shape (PARTS, BLOCK): the gaps, the input and its change over them, and the results. On a
+    grid all gaps are equal; on any other clock none is longer than ``longest``.
     """
     if grid is not None:
         decay, _, at_b, at_c, at_f, at_g = step_weights(pole, steps[GAP, 0])
@@ -263,7 +262,7 @@ def _weigh(
         size = abs(pole) * longest
         doublings = max(0, math.ceil(math.log2(size))) if 0.0 < size < np.inf else 0
         if doublings > MOST_DOUBLINGS:
-            # A step far longer than the mode remembers.
+            # Steps far longer than the memory of the mode.
             for k in range(count):
                 decay, _, at_b, at_c, at_f, at_g = step_weights(pole, steps[GAP, k])
                 single, double = (
@@ -276,13 +275,13 @@ def _weigh(
             return
         scale = 0.5**doublings
         re, im = scale * pole.real, scale * pole.imag
-        # f and f' stand where the weights made of them will.
+        # f and f' are stored in the places of the weights computed from them.
         for k in range(count):
             steps[SINGLE_RE, k], steps[SINGLE_IM, k], steps[DOUBLE_RE, k], steps[DOUBLE_IM, k] = _series(
                 re * steps[GAP, k], im * steps[GAP, k]
             )
         for _ in range(doublings):
-            # f(2 x) = (g^2 + 2 f)/4, hence f'(2 x) = (g g' + f')/4. All double equally often: the loop has no branch.
+            # f(2 x) = (g^2 + 2 f)/4, hence f'(2 x) = (g g' + f')/4. All steps double equally often: no branches.
             for k in range(count):
                 x_re, x_im = re * steps[GAP, k], im * steps[GAP, k]
                 f_re, f_im, slope_re, slope_im = (
@@ -322,20 +321,20 @@ def _weigh(
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _advance(steps: Array, count: int, state: ComplexArray, rows: Array, w: int, paired: bool, begin: int) -> None:
-    """Advance a mode, and its square, over steps; the state after step k is written to column ``begin + k``.
+    """Advance z and w of a mode over steps; the state after step k is written to column ``begin + k``.
 
-    The rows begin with the real and imaginary part of z, those of w stand ``w`` rows below (0: none). In real
-    arithmetic, so that the state stays in registers. Where ``begin`` is 1, column 0 is the state before all steps.
+    The rows begin with the real and imaginary part of z; those of w are ``w`` rows below (0: none). In real arithmetic,
+    so that the state stays in registers. If ``begin`` is 1, column 0 is the state before all steps.
     """
-    # The imaginary part of a real mode is zero, and written to the last row, where nothing is read.
+    # The imaginary part of a real mode is zero, and written to the last row, which is never read.
     z_row, w_row = (1, w + 1) if paired else (rows.shape[0] - 1, rows.shape[0] - 1)
     z_re, z_im, w_re, w_im = state[0].real, state[0].imag, state[1].real, state[1].imag
     rows[0, 0], rows[z_row, 0] = z_re, z_im
     if w > 0:
         rows[w, 0], rows[w_row, 0] = w_re, w_im
         for k in range(count):
-            # w+ = d (w + gap z) + …, from z before its step. Summed so that only two of the products wait for the step
-            # before.
+            # w+ = d (w + gap z) + …, from z before its step. Summed so that only two of the products depend on the
+            # previous step.
             d_re, d_im, gap = steps[DECAY_RE, k], steps[DECAY_IM, k], steps[GAP, k]
             moved_re, moved_im = gap * z_re, gap * z_im
             driven_re = d_re * moved_re - d_im * moved_im + steps[DOUBLE_RE, k]
@@ -363,9 +362,9 @@ def _advance(steps: Array, count: int, state: ComplexArray, rows: Array, w: int,
 def _read_out(
     steps: Array, count: int, path: Array, instants: Instants, passed: IntArray, rows: Array, w: int, paired: bool
 ) -> None:
-    """Write the states at the samples of a block, each a step behind a state of the path: sample k behind state k.
+    """Write the states at the samples of a block: sample k is one step after state k of the path.
 
-    Or, at any instants, behind state ``passed[k]``.
+    On an irregular clock it is one step after state ``passed[k]``.
     """
     z_row, w_row = (1, w + 1) if paired else (rows.shape[0] - 1, rows.shape[0] - 1)
     for k in range(count):
@@ -387,7 +386,7 @@ def _read_out(
 
 @njit(cache=True, nogil=True, inline="always")
 def _held(tu: Array, u: Array, foh: bool, at: int) -> tuple[float, float, float]:
-    """Length of the step from a break, the input at its start, and the change over it."""
+    """Return the length of the step from a break, the input at its start, and its change over the step."""
     if at + 1 == tu.size:
         return 0.0, u[at], 0.0
     return tu[at + 1] - tu[at], u[at], u[at + 1] - u[at] if foh else 0.0
@@ -399,10 +398,10 @@ def _irregular_steps(
 ) -> tuple[int, int, int, float]:
     """Fill in the steps of a block on any clock: from break to break, up to delayed samples, from sample to sample.
 
-    Returns how many samples there are and how many breaks are reached, the last of these, and the longest step.
-    ``passed`` are the breaks of the block before each sample. A block ends when either fills it: where the input has
-    far more breaks than the output samples, some blocks hold no sample. Before the first break the states are zero, and
-    stay so: a step of length zero that nothing drives.
+    Returns the number of samples, the number of breaks reached, the last of these, and the longest step. ``passed`` is
+    the number of breaks of the block before each sample. A block ends when samples or breaks fill it: if the input has
+    far more breaks than the output has samples, some blocks contain no sample. Before the first break the states remain
+    zero, by steps of length zero without input.
     """
     assert instants is not None
     t, tu, delay, slack = instants
@@ -421,7 +420,7 @@ def _irregular_steps(
             longest_gap = max(longest_gap, gap)
             reached, last = reached + 1, last + 1
             gap, value, change = _held(tu, u, foh, last)
-        # Read out on the way to the next break; the states stay at this one.
+        # Read out between this break and the next; the states stay at this one.
         step = max(0.0, instant - tu[last]) if last >= 0 else 0.0
         passed[k] = reached
         late[GAP, k], late[VALUE, k], late[CHANGE, k] = step, value, change * (step / gap) if change != 0.0 else 0.0
@@ -432,11 +431,10 @@ def _irregular_steps(
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, rows: Array, written: int) -> int:
-    """Add the used columns of a block to the upper part of the moments, or to the rows; returns how many there are.
+    """Add the used columns of a block to the upper part of the moments, or to the rows; return the number of rows.
 
-    Moments are the products of some leading rows with all that follow them, two rows with four others at a time: each
-    number that is loaded enters several products, and eight sums do not wait for each other. Block and moments have
-    empty rows and columns behind the others, for whole tiles.
+    Moments are the products of leading rows with all following rows, in tiles of two by four rows: each number that is
+    loaded enters several products, and the eight sums are independent. Block and moments are padded to whole tiles.
     """
     kept = 0
     for k in range(count):
@@ -450,7 +448,7 @@ def _emit(block: Array, count: int, use: BoolArray, start: int, gram: Array, row
             rows[written + k, i] = block[i, k]
     for i in range(0, gram.shape[0] - 1, 2):
         one, two = block[i], block[i + 1]
-        # Below the diagonal of a tile products too many are formed; they are overwritten at the end.
+        # Superfluous products below the diagonal of a tile are overwritten at the end.
         for j in range(i, gram.shape[1] - 3, 4):
             a, b, c, d = block[j], block[j + 1], block[j + 2], block[j + 3]
             one_a, one_b, one_c, one_d, two_a, two_b, two_c, two_d = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -492,19 +490,19 @@ def filter_pass(
     rows: Array,
     simulated: Array,
 ) -> None:
-    """Pass over a record for the pooled modes of one model or of several submodels.
+    """Filter a record by the modes of one model or of several submodels.
 
     On a regular clock ``grid`` is the interval, and shift and fraction of the delay ``(shift - fraction) interval``; on
     any other it is None, and ``instants`` are those of the samples and of the breaks of the input, the delay, and the
-    time by which a break may be late and still count as reached. What only the other clock needs is not compiled.
-    ``instruments`` are the values of v at the breaks and whether straight lines join them; ``measured`` those of u
-    where this is another signal, else empty; ``output`` the samples of y and whether straight lines join them. Mode i
+    time by which a break may be late and still count as reached. Code for the other kind of clock is not compiled.
+    ``instruments`` are the values of v at the breaks and whether they are interpolated linearly; ``measured`` those of
+    u if it differs from v, else empty; ``output`` the samples of y and whether they are interpolated linearly. Mode i
     belongs to submodel ``owner[i]``, whose output is ``x = sum Re(residues z) + direct u``. The rows of a pass are z;
-    w; v; ``y - sum x``; e, driven by what the other submodels leave of the output; and where u is another signal z, w
-    of u, and u. ``layout`` has the places of w, of v and of e among them (0: not wanted). ``states`` are z, w, e and z,
-    w of u at the first sample, and are left as they are after the last one. ``gram`` receives the products of its
-    leading rows with all, ``rows`` the rows of the used samples, and ``simulated`` the output x at every sample; an
-    empty array is not wanted.
+    w; v; ``y - sum x``; e, driven by y less the outputs of the other submodels; and z and w of u, and u, if u differs
+    from v. ``layout`` has the row numbers of w, v and e (0: not requested). ``states`` are z, w, e, and z and w of u at
+    the first sample, and are overwritten by those after the last one. ``gram`` receives the products of its leading
+    rows with all rows, ``rows`` the rows of the used samples, and ``simulated`` the output x at every sample; empty
+    arrays are not filled.
     """
     v, foh = instruments
     y, y_foh = output
@@ -532,7 +530,7 @@ def filter_pass(
             u = v if source == 0 else measured
             base, square, place = (0, w_row, v_row) if source == 0 else (u_row, u_square, u_place)
             if grid is not None:
-                # Sample k sees the input from break start + k - shift on: none where that is negative.
+                # Sample k depends on the input from break start + k - shift on; zero if that is negative.
                 for k in range(count):
                     at = start + k - grid[1]
                     breaks[VALUE, k] = late[VALUE, k] = u[at] if at >= 0 else 0.0
@@ -576,7 +574,7 @@ def filter_pass(
             for k in range(count):
                 simulated[start + k] = y[start + k] - error[k]
         if e_row > 0:
-            # What the other submodels leave of the output drives e.
+            # y less the outputs of the other submodels drives e.
             for i in range(submodels):
                 for k in range(count):
                     outputs[i, k] += error[k]
@@ -587,7 +585,7 @@ def filter_pass(
                     samples[VALUE, k], samples[CHANGE, k] = earlier, left[k] - earlier if y_foh else 0.0
                 _weigh(poles[i], False, grid, instants, longest, count, samples)
                 if start == 0 and count > 0:
-                    # No step leads to the very first sample.
+                    # The first sample has no step before it.
                     samples[DECAY_RE, 0], samples[DECAY_IM, 0] = 1.0, 0.0
                     samples[SINGLE_RE, 0], samples[SINGLE_IM, 0] = 0.0, 0.0
                 _advance(samples, count, states[i, 2:], own, 0, paired, 0)
@@ -610,7 +608,7 @@ def filter_pass(
 def regular_states(
     transition: Array, from_value: Array, from_change: Array, values: Array, changes: Array, initial: Array
 ) -> Array:
-    """States ``z+ = F z + g value + h change`` of a chain before each of its steps, shape (N, n).
+    """Return the states ``z+ = F z + g value + h change`` of a chain before each of its steps, shape (N, n).
 
     F is zero above its first superdiagonal.
     """
@@ -641,7 +639,7 @@ def _chain_step(
 ) -> None:
     """Advance ``state = [z, v, v']`` of a chain by ``step``, in place, see `irregular_states`."""
     # Digits from the lowest up; the transitions commute. The table ends at the longest step, so that only rounding can
-    # ask its last level for more than one digit.
+    # give its last level more than one digit.
     size = state.size
     n = size - 2
     whole = math.floor(step / quantum)
@@ -654,7 +652,7 @@ def _chain_step(
             digit = min(int(whole), BASE - 1)
         if digit > 0:
             power = powers[level, digit]
-            # Zero above the first superdiagonal, but for the two columns of the signal.
+            # Zero above the first superdiagonal, except for the two columns of the signal.
             for i in range(n):
                 total = power[i, n] * state[n] + power[i, n + 1] * state[n + 1]
                 for m in range(min(i + 2, n)):
@@ -665,7 +663,7 @@ def _chain_step(
                 state[i] = work[0, i]
         whole = shifted
         level += 1
-    # What is left of a quantum: sum of (M rest)^d/d! applied to the state, term from term; M is nearly empty.
+    # The remaining fraction of a quantum: sum of (M rest)^d/d! applied to the state, term by term; M is sparse.
     if rest > 0.0:
         term, following = work[0], work[1]
         for i in range(size):
@@ -695,10 +693,11 @@ def irregular_states(
     slack: float,
     initial: Array,
 ) -> Array:
-    """States ``[z, v, v']`` of a chain at rising instants, shape (N, n + 2), from the state at the first break.
+    """Return the states ``[z, v, v']`` of a chain at rising instants, shape (N, n + 2).
 
     ``powers[level, digit]`` are the transitions over ``digit BASE^level`` quanta; ``starts``, ``columns`` and
-    ``values`` the entries of the dynamics that are not zero, row by row. Before the first break everything is zero.
+    ``values`` the nonzero entries of the dynamics, row by row; ``initial`` the state at the first break, before which
+    everything is zero.
     """
     size = initial.size + 2
     states = np.zeros((instants.size, size))
@@ -707,7 +706,7 @@ def irregular_states(
         base[i] = initial[i]
     j = -1  # the last break that has been reached
     for k in range(instants.size):
-        # One that is later by rounding only is taken with those before it.
+        # A break that is late by rounding only counts as reached.
         while j + 1 < tu.size and tu[j + 1] <= instants[k] + slack:
             if j >= 0:
                 _chain_step(powers, quantum, starts, columns, values, tu[j + 1] - tu[j], base, work)
@@ -738,17 +737,18 @@ def loop_signals(
     push: Array,
     start: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
-    """Input, noise-free output and states of a sampled plant ``F, g, c, direct, shift`` in a loop with ``A, B, C, D``.
+    """Simulate a sampled plant ``F, g, c, direct, shift`` in a loop with a controller ``A, B, C, D``.
 
-    The output of a relay of some amplitude, hysteresis and bias is added to that of the law; its amplitude is 0 where
-    there is none. ``before`` is the share of r that the controller sees, 1 or 0. ``push``, shape (N, n) or (0, n), is
-    added to the plant's next states. The start is its state, the controller's, and the inputs before the first sample.
+    Returns input, noise-free output and plant states. The output of a relay (amplitude, hysteresis, bias) is added to
+    that of the controller; without a relay its amplitude is 0. ``before`` is 1 if r enters before the controller, else
+    0. ``push``, shape (N, n) or (0, n), is added to the plant's next states. ``start`` has the states of plant and
+    controller, and the inputs before the first sample.
     """
     F, g, c, direct, shift = plant
     A, B, C, D = law
     amplitude, hysteresis, bias = relay
     n, m, pushed = g.size, B.size, push.shape[0] > 0
-    # Where plant and law both act at once the input acts on the output that it is made from: solve for it.
+    # If plant and controller both have direct feedthrough, the loop is algebraic: solve it for the input.
     own = direct if shift == 0 else 0.0
     closing = 1.0 / (1.0 + D * own)
     u, x, states = np.empty(r.size), np.empty(r.size), np.empty((r.size, n))
@@ -760,13 +760,13 @@ def loop_signals(
     for i in range(m):
         held += C[i] * s[i]
     for k in range(r.size):
-        # x as far as earlier inputs make it.
+        # x from earlier inputs.
         arriving = 0.0
         if shift > 0:
             arriving = u[k - shift] if shift <= k else late[k]
         output = free + direct * arriving
         error = before * r[k] - v[k] - output
-        # Within the hysteresis the relay stays as it is.
+        # Within the hysteresis the relay keeps its value.
         if error > hysteresis:
             side = 1.0
         elif error < -hysteresis:
@@ -775,7 +775,7 @@ def loop_signals(
         if shift == 0:
             arriving = value
         u[k], x[k] = value, output + own * value
-        # Both step on with what they have seen at this sample, to what they put out at the next one.
+        # Advance both states to the next sample.
         error -= own * value
         free, held = 0.0, 0.0
         for i in range(n):
@@ -809,7 +809,7 @@ def loop_input(
     denominator: Array,
     at_controller: bool,
 ) -> Array:
-    """Input of the noise-free loop of a model in modal form with a discrete controller, from rest, shape (N,).
+    """Return the input of the noise-free loop of a modal model with a discrete controller, from rest, shape (N,).
 
     The model and its clock are those of `filter_pass`. The controller has polynomials of one length in descending
     powers of q; the reference enters before or behind it.
@@ -817,8 +817,8 @@ def loop_input(
     interval, shift, fraction = clock
     modes, order = poles.size, numerator.size - 1
     v = np.zeros(reference.size)
-    # Real and imaginary parts: over a whole interval z+ = d z + b v and w+ = d w + m z + f v; x at the instant that is
-    # read, a fraction of an interval behind the break, is that of the states there and of the input that arrived.
+    # Over a whole interval z+ = d z + b v and w+ = d w + m z + f v; x at the read-out instant, a fraction of an
+    # interval after the break, follows from the states at the break and from the delayed input.
     weights = np.zeros((modes, 4), np.complex128)
     read = np.zeros((modes, 2), np.complex128)
     gain = direct
@@ -830,25 +830,25 @@ def loop_input(
         read[i, 1] = residues[i, 1] * decay
         gain += (residues[i, 0] * at_b + residues[i, 1] * at_f).real
     z, w = np.zeros(modes, np.complex128), np.zeros(modes, np.complex128)
-    # The controller in its transposed direct form II, with a zero behind its states. Its direct part and, if the model
-    # has one without delay, the model's close an algebraic loop.
+    # The controller in transposed direct form II, with a zero after its states. Its direct feedthrough and that of a
+    # model without delay form an algebraic loop.
     memory = np.zeros(order + 1)
     own = gain if shift == 0 else 0.0
     first = numerator[0]
     closing = 1.0 / (1.0 + first * own)
     x = 0.0
     for k in range(v.size):
-        # x_k as far as the inputs before sample k make it.
+        # x_k from the inputs before sample k.
         arrived = v[k - shift] if 0 < shift <= k else 0.0
         x += gain * arrived
-        # v_k = C (r - x), or r - C x: solved for v_k where it acts on x_k itself.
+        # v_k = C (r - x), or r - C x, solved for v_k if x_k depends on v_k.
         error = reference[k] - x if at_controller else -x
         value = memory[0] + first * error
         if not at_controller:
             value += reference[k]
         value *= closing
         v[k] = value
-        # The model over a whole interval, driven by the input that arrives; and what its states make of the next x.
+        # The model over a whole interval, driven by the delayed input; and its contribution to the next x.
         last = value if shift == 0 else arrived
         x = 0.0
         for i in range(modes):
@@ -857,7 +857,7 @@ def loop_input(
                 x += (read[i, 1] * w[i]).real
             z[i] = weights[i, 0] * z[i] + weights[i, 2] * last
             x += (read[i, 0] * z[i]).real
-        # The controller's state sees the whole error, with what v_k itself has added to x_k.
+        # The controller's state depends on the whole error, including the direct effect of v_k on x_k.
         error -= own * value
         response = memory[0] + first * error
         for m in range(order):

@@ -1,8 +1,8 @@
 r"""A continuous-time model in a loop with a discrete-time controller or a relay.
 
 The reference r enters before the controller, ``u = C(q) (r - y)``, or behind it, ``u = r - C(q) y``. The measured
-output is ``y = x + v``, and x is the response of the model to the held input u. A relay looks and switches at the
-sampling instants. Everything is exact there.
+output is ``y = x + v``, and x is the response of the model to the held input u. A relay switches at the sampling
+instants only. All signals are exact at these instants.
 """
 
 from typing import NamedTuple, get_args
@@ -21,13 +21,13 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_choice
 from ctid_cli.signals.record import Controller, Enters
 
-#: Below this fraction of its terms, 1 + (direct gain round the loop) is rounding.
+#: Below this fraction of its terms, 1 + (direct loop gain) is rounding.
 NO_GAIN = 1e-12
-#: No controller beside a relay, and no relay beside a controller.
+#: Zero controller for a loop with a relay, and zero relay for a loop with a controller.
 NOTHING, NO_RELAY = DiscreteController([0.0], [1.0]), (0.0, 0.0, 0.0)
 
 
-#: A controller as the kernel takes it.
+#: State space of a controller for the kernel.
 Law = tuple[Array, Array, Array, float]
 
 
@@ -48,18 +48,18 @@ def simulate_loop(
     interval: float,
     enters: Enters = "controller",
 ) -> LoopSignals:
-    """Input and noise-free output of a loop that is at rest before the first sample.
+    """Return input and noise-free output of a loop that is at rest before the first sample.
 
     Parameters
     ----------
     model : AdditiveModel or TransferFunction
         The plant; any proper model, any delay.
     controller : Controller or Relay
-        What makes the input from reference and output.
+        The controller, which computes the input from reference and output.
     reference : array_like, shape (N,)
         r at the sampling instants [output unit; input unit if it enters behind the controller].
     noise : array_like, shape (N,) or ()
-        v, what is added to the output before the controller sees it [output unit]; 0 for none.
+        v, added to the output before the controller [output unit]; 0 for none.
     interval : float
         Sampling interval [s].
     enters : {"controller", "input"}, default "controller"
@@ -73,10 +73,10 @@ def simulate_loop(
     Raises
     ------
     DataError
-        If the loop has no solution (direct gains of -1 round the loop), a relay meets a model that acts at once, the
-        signals outgrow the range of numbers, or reference and noise do not match.
+        If the loop has no solution (a direct loop gain of -1), a relay is combined with a model that has direct
+        feedthrough, the signals overflow, or the lengths of reference and noise differ.
     ValueError
-        If the interval is not positive or it is not said where the reference enters.
+        If the interval is not positive or `enters` is not one of its values.
 
     Examples
     --------
@@ -96,7 +96,7 @@ def simulate_loop(
     plant = sampled_model(model, interval)
     if isinstance(controller, Relay):
         if plant.shift == 0 and plant.direct != 0.0:
-            text = "a relay needs a model that does not act at once: give it a delay, or fewer zeros than poles"
+            text = "a relay needs a model without direct feedthrough: give it a delay, or fewer zeros than poles"
             raise DataError(text)
         law, relay = law_of(NOTHING), (controller.amplitude, controller.hysteresis, controller.bias)
     else:
@@ -125,7 +125,7 @@ def loop_pass(
     start: tuple[Array, Array, Array] | None = None,
     relay: tuple[float, float, float] = NO_RELAY,
 ) -> tuple[Array, Array, Array]:
-    """Return input, noise-free output and plant states of a sampled loop; the kernel says what the arguments are."""
+    """Return input, noise-free output and plant states of a sampled loop; arguments are those of the kernel."""
     size = plant.from_input.size
     push = np.zeros((0, size)) if push is None else push
     start = (np.zeros(size), np.zeros(law[1].size), np.zeros(plant.shift)) if start is None else start
@@ -136,18 +136,18 @@ def loop_pass(
 
 
 def law_of(controller: DiscreteController) -> Law:
-    """Return a controller as the kernel takes it."""
+    """Return the state space of a controller for the kernel."""
     A, B, C, D = controller.state_space()
     return plain_array(A), plain_array(B[:, 0]), plain_array(C[0]), float(D[0, 0])
 
 
 def loop_radius(model: AdditiveModel | TransferFunction, controller: Controller, interval: float) -> float:
-    """Largest magnitude of the poles of the sampled loop: it is stable below 1."""
+    """Return the largest magnitude of the poles of the sampled loop, which is stable below 1."""
     return sampled_radius(sampled_model(model, interval), _realised(controller))
 
 
 def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float:
-    """Largest magnitude of the poles of the loop of a sampled model."""
+    """Return the largest magnitude of the poles of the loop of a sampled model."""
     _require_solvable(sampled, discrete)
     A, B, C, D = sampled.state_space()
     Ac, Bc, Cc, Dc = discrete.state_space()
@@ -162,17 +162,17 @@ def sampled_radius(sampled: SampledModel, discrete: DiscreteController) -> float
 
 
 def _realised(controller: Controller) -> DiscreteController:
-    """The controller with a state space."""
+    """Return the controller as a `DiscreteController`."""
     if isinstance(controller, DiscreteController):
         return controller
     return DiscreteController(controller.numerator, controller.denominator)
 
 
 def _require_solvable(plant: SampledModel, controller: DiscreteController) -> None:
-    """Refuse a loop without delay in which the present input is not determined by the present signals."""
+    """Raise an error if an algebraic loop has no unique solution."""
     gain = 0.0 if plant.shift else controller.direct * plant.direct
     if abs(1.0 + gain) <= NO_GAIN * max(1.0, abs(gain)):
         raise DataError(
-            "the loop has no solution: model and controller both act at once, with gains whose product is -1; change "
-            "the gain of the controller, or give the model a delay or fewer zeros"
+            "the loop has no solution: the product of the direct gains of model and controller is -1; change the gain "
+            "of the controller, or give the model a delay or fewer zeros"
         )

@@ -1,14 +1,14 @@
-r"""Output of a loop to its reference, and its exact derivatives by the parameters of the plant and by the first state.
+r"""Response of a loop to its reference, and its exact derivatives by the plant parameters and the initial state.
 
 The plant is ``B/(p^l A) exp(-tau p)`` with ``theta = (a_1 … a_n, b_0 … b_m, tau)`` and monic A; it need not be stable,
-if the loop is. A discrete controller acts on what it is fed at the samples, and holds the input between them. A
-controller in continuous time makes one linear system of the loop, which the held reference drives on any clock.
+if the loop is. A discrete controller acts at the samples and holds the input between them. With a controller in
+continuous time the loop is one linear system, driven by the held reference on any clock.
 
 The matrices of the plant, or of the whole loop in continuous time, are analytic in theta: their derivatives are the
 imaginary parts at ``theta + i step``, without cancellation (W. Squire and G. Trapp, *Using complex variables to
 estimate derivatives of real functions*, SIAM Review 40 (1998) 110-112). With ``z`` and ``u`` the plant's states and
-input, the derivatives ``dz`` of the signals are those of the same loop without reference, pushed by ``dF z + dg u`` and
-with ``dc z + dd u`` added to the output.
+input, the derivatives ``dz`` of the signals are those of the loop without reference, with ``dF z + dg u`` added to the
+next states and ``dc z + dd u`` added to the output.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from ctid_cli.filtering.realisation import exponential_minus_identity, time_scal
 from ctid_cli.filtering.simulate import SampledModel
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 
-#: Step along the imaginary axis; its square is nothing beside 1.
+#: Complex step; its square is negligible.
 TINY = 1e-30
 
 
@@ -47,9 +47,9 @@ class _Plant(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoopResponse:
-    """A loop around a plant of some structure, with what drives it."""
+    """A loop around a plant of given structure, with its reference."""
 
-    #: The clock, with the reference in the place of the input.
+    #: The clock, with the reference as the input.
     data: FilterData
     controller: DiscreteController | ContinuousController
     at_controller: bool
@@ -65,17 +65,18 @@ class LoopResponse:
     def rows(self, theta: Array, count: int, cell: int | None = None, state: Array | None = None) -> LoopRows:
         """Return the output from a state, by default of rest, and its derivatives by the first ``count`` parameters.
 
-        ``cell`` says in which sampling interval a delay at a sample counts, where the derivatives have a kink. A state
-        is that of the plant, of the controller, and the inputs on their way at the first sample.
+        ``cell`` is the sampling interval to which a delay of a whole number of intervals belongs, because the
+        derivatives have a kink there. A state has those of plant and controller, and the delayed inputs at the first
+        sample.
         """
         if state is not None:
-            # That of the plant is p^(n-1)/A u … 1/A u in seconds, whatever the time unit of its companion form.
+            # That of the plant is p^(n-1)/A u … 1/A u in seconds, independent of the time unit of its companion form.
             n = self.poles + self.integrators
             state = np.concatenate((state[:n] * self._scale(theta) ** np.arange(1.0, n + 1.0), state[n:]))
         return self._continuous(theta, count, state) if self.continuous else self._discrete(theta, count, cell, state)
 
     def free(self, theta: Array, cell: int | None = None) -> Array:
-        """Return the responses to each part of the state without reference, shape (N, f)."""
+        """Return the free responses to each entry of the initial state, shape (N, f)."""
         still = replace(self, data=self.data._replace(u=np.zeros_like(self.data.u)))
         size = self.poles + self.integrators + self.controller.denominator.size - 1
         if not self.continuous:
@@ -83,7 +84,7 @@ class LoopResponse:
         return np.column_stack([still.rows(theta, 0, cell, unit).output for unit in np.eye(size)])
 
     def radius(self, theta: Array) -> float:
-        """Largest magnitude of the poles of the loop, over one sampling interval; it is stable below 1."""
+        """Return the largest magnitude of the poles of the loop over one sampling interval; it is stable below 1."""
         if isinstance(self.controller, DiscreteController):
             return sampled_radius(self._sampled(theta, None), self.controller)
         interval = self.data.interval or float(np.median(np.diff(self.data.t)))
@@ -186,7 +187,7 @@ class LoopResponse:
 
 
 def _held(plant: _Plant, step: Any) -> tuple[Any, Any]:
-    """Return the transition over a step in the plant's own time unit, and what the held input adds."""
+    """Return the transition over a step in the plant's time unit, and the contribution of the held input."""
     n = plant.gain.size
     augmented = np.zeros((n + 1, n + 1), plant.dynamics.dtype)
     augmented[:n, :n], augmented[:n, n] = plant.dynamics, plant.gain
@@ -201,7 +202,7 @@ def _stepped(theta: Array, place: int) -> Any:
 
 
 def _real(plant: SampledModel) -> SampledModel:
-    """Return a sampled plant as the kernel takes it."""
+    """Return a sampled plant with real arrays for the kernel."""
     F, g, c = (np.ascontiguousarray(np.real(part)) for part in plant[:3])
     return SampledModel(F, g, c, float(np.real(plant.direct)), plant.shift)
 

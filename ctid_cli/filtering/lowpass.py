@@ -1,4 +1,4 @@
-"""Butterworth low-pass filtering of a whole record, input and output alike."""
+"""Butterworth low-pass filtering of input and output of a record."""
 
 from dataclasses import dataclass
 
@@ -66,10 +66,10 @@ class Lowpass:
 
         Notes
         -----
-        On a common regular clock the samples pass through one discrete filter. That commutes with any filter of the
-        held signal, so no error is made; only a linearly held input that begins with a jump keeps a transient. On any
-        other clock the held signals pass through the analogue filter exactly, and the smooth results are taken as
-        linear between the samples.
+        On a common regular clock the samples are filtered by one discrete filter. It commutes with any filter of the
+        held signal, so that the result is exact; only a linearly held input that begins with a jump keeps a transient.
+        On any other clock the held signals are filtered exactly by the analogue filter, and the smooth results are
+        interpolated linearly between the samples.
         """
         from scipy.signal import butter, sosfilt
 
@@ -80,7 +80,7 @@ class Lowpass:
                     f"the low-pass cut-off {self.cutoff:g} rad/s is not below half the sampling frequency, "
                     f"{np.pi / record.interval:g} rad/s"
                 )
-            # The filter by bilinear transform with the cut-off in its place.
+            # Bilinear transform with prewarping, which keeps the cut-off frequency.
             sections = butter(self.order, self.cutoff * record.interval / np.pi, output="sos")
             filtered_u = HeldSignal(record.input.t, sosfilt(sections, record.input.values), record.input.hold)
             filtered_y = sosfilt(sections, y)

@@ -1,9 +1,9 @@
-"""State-space realisations that stay accurate for stiff and for repeated poles, and their exact steps.
+"""State-space realisations that are accurate for stiff and for repeated poles, and their exact steps.
 
 A polynomial A of degree n is realised as a *chain* of first-order (real pole) and second-order (complex pair)
-sections of unit static gain, fastest first. No partial fractions are formed, so repeated poles are no special case,
-and because a slow section only ever integrates what a faster one has settled, no cancellation grows with the spread
-of the poles. Everything runs in the polynomial's own time unit ``1/w0``, ``w0 = |a_n|^(1/n)``.
+sections of unit static gain, fastest first. No partial fractions are formed, so repeated poles are no special case.
+Each section filters the settled output of a faster one, so that cancellation does not grow with the spread of the
+poles. The time unit is ``1/w0``, ``w0 = |a_n|^(1/n)``.
 """
 
 from math import copysign, sqrt
@@ -14,7 +14,7 @@ import numpy as np
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 from ctid_cli.filtering import kernels
 
-#: A matrix is halved until its norm is below this: the remainder of its Taylor polynomial is then below 1e-17.
+#: A matrix is halved until its norm is below this, so that the remainder of its Taylor polynomial is below 1e-17.
 TAYLOR_NORM = 0.25
 TAYLOR_DEGREE = 12
 #: Norm of the dynamics over the smallest digit of a transition: the remainder (2^-7)^7/7! of the Taylor polynomial
@@ -37,7 +37,7 @@ def scaled_roots(denominator: Array) -> tuple[float, ComplexArray]:
 
 
 def polynomial_roots(coefficients: Array) -> ComplexArray:
-    """Return the roots of a monic real polynomial, those of a pair side by side with the upper one first."""
+    """Return the roots of a monic real polynomial; those of a pair are adjacent, the upper one first."""
     n = coefficients.size - 1
     if n == 1:
         return np.array([complex(-coefficients[1])])
@@ -67,7 +67,7 @@ class Chain(NamedTuple):
 
 
 def chain(roots: ComplexArray) -> Chain:
-    """Return the chain of unit-gain sections with given poles, whose pairs stand side by side; the fastest first."""
+    """Return the chain of unit-gain sections with given poles (pairs adjacent), fastest first."""
     roots, n = roots[np.argsort(-np.abs(roots), kind="stable")], roots.size
     dynamics, gain = np.zeros((n, n)), np.zeros(n)
     i, last, static = 0, -1, 1.0
@@ -86,7 +86,7 @@ def chain(roots: ComplexArray) -> Chain:
         else:
             dynamics[entry, last] = rate
         i, last, static = entry + 1, i, static * rate
-    # The last section puts out 1/A v, up to the static gain, and the derivative of p^k/A v is p^(k+1)/A v.
+    # The output of the last section is 1/A v, up to the static gain, and the derivative of p^k/A v is p^(k+1)/A v.
     powers = np.zeros((n, n))
     for k in range(n):
         powers[k] = powers[k - 1] @ dynamics if k > 0 else np.eye(n)[last] / static
@@ -123,7 +123,7 @@ def exponential_minus_identity(matrix: Array) -> Array:
 def held_step(dynamics: Array, gain: Array, step: float) -> HeldStep:
     """Return the exact map of ``z' = F z + g v`` over one step."""
     n = gain.size
-    # v and its change over the step are two further states: the exponential holds the integrals over both.
+    # v and its change over the step are two further states: the exponential contains the integrals over both.
     augmented = np.zeros((n + 2, n + 2))
     augmented[:n, :n], augmented[:n, n] = dynamics * step, gain * step
     augmented[n, n + 1] = 1.0
@@ -132,13 +132,13 @@ def held_step(dynamics: Array, gain: Array, step: float) -> HeldStep:
 
 
 class Transitions(NamedTuple):
-    """Transitions of ``[z, v, v']`` over any step: digits of its whole quanta in a base, then a Taylor polynomial."""
+    """Transitions of ``[z, v, v']`` over any step: by the digits of its whole quanta, then by a Taylor polynomial."""
 
     #: exp(M digit BASE^level quantum), shape (levels, BASE, n + 2, n + 2).
     powers: Array
     quantum: float
-    #: Entries that are not zero of M, the dynamics with the held signal and its slope as states, row by row: where each
-    #: row begins, the columns, and the values.
+    #: Nonzero entries, row by row, of M, the dynamics with the held signal and its slope as states: index of the first
+    #: entry of each row, columns, and values.
     starts: IntArray
     columns: IntArray
     values: Array
@@ -160,7 +160,7 @@ def transitions(dynamics: Array, gain: Array, longest: float) -> Transitions:
         power = np.zeros((n + 2, n + 2))
         for digit in range(kernels.BASE):
             powers[level, digit] = power + np.eye(n + 2)
-            # (I + X)(I + Y) - I = X + Y + X Y, which keeps the digits of slow modes beside a fast one.
+            # (I + X)(I + Y) - I = X + Y + X Y, which keeps the accuracy of slow modes if there is a fast one.
             power = power + first + power @ first
     rows, columns = np.nonzero(augmented)
     starts = np.searchsorted(rows, np.arange(n + 3)).astype(np.int64)

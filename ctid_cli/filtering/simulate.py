@@ -1,4 +1,4 @@
-"""Exact responses of models to a held input, at any instants, and their sampled equivalents behind a constant hold."""
+"""Exact responses of models to a held input at any instants, and their zero-order-hold equivalents."""
 
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from ctid_cli.signals.held import REGULARITY, HeldSignal, regular_interval
 
 
 def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> Array:
-    """Output of a model at rest before the first break of its input.
+    """Return the output of a model at rest before the first break of its input.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
 
     Notes
     -----
-    No step size is involved: between the input's breaks the state moves by a matrix exponential. At the jump of a
+    No step size is involved: between the input's breaks the state advances by a matrix exponential. At the jump of a
     biproper model's input the value from the right is returned.
 
     Examples
@@ -65,7 +65,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
         return t
     if signal.hold == "band-limited":
         signal = signal.lines
-        # Where a sample is wanted at each of the input's own, a regular pass over the finer clock gives it.
+        # At the instants of the input's samples a pass over the finer regular clock suffices.
         if np.array_equal(t, signal.t[::FINER]):
             return simulate(model, signal, signal.t)[::FINER].copy()
     direct, strictly_proper = feedthrough(model)
@@ -94,7 +94,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
 
 
 def feedthrough(model: TransferFunction) -> tuple[float, Array]:
-    """What of its input a model passes on at once, and the numerator of the rest, in n coefficients."""
+    """Return the direct feedthrough of a model, and the n numerator coefficients of its strictly proper part."""
     if model.relative_degree < 0:
         raise DataError("a model with more zeros than poles has no response to a jump")
     numerator = np.concatenate([np.zeros(model.relative_degree), model.numerator])
@@ -112,7 +112,7 @@ def _response(a: Array, b: Array, delay: float, data: FilterData) -> Array:
 
 
 class SampledModel(NamedTuple):
-    r"""``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for an input held between the samples."""
+    r"""Sampled model ``z_(k+1) = F z_k + g u_(k-shift)``, ``x_k = c z_k + d u_(k-shift)`` for a zero-order hold."""
 
     #: F, block diagonal for a sum of submodels, shape (n, n).
     transition: Array
@@ -124,12 +124,12 @@ class SampledModel(NamedTuple):
     shift: int
 
     def state_space(self) -> tuple[Array, Array, Array, Array]:
-        """Realisation with the late inputs as further states."""
+        """Return the realisation with the delayed inputs as further states."""
         n, size = self.from_input.size, self.from_input.size + self.shift
         A, B, C, D = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size)), np.zeros((1, 1))
         A[:n, :n], C[0, :n] = self.transition, self.output
         if self.shift:
-            # The states behind the plant's are u_(k-1) … u_(k-shift).
+            # The states after the plant's are u_(k-1) … u_(k-shift).
             A[:n, -1], C[0, -1], B[n, 0] = self.from_input, self.direct, 1.0
             A[n:, n:] = np.eye(self.shift, k=-1)
         else:
@@ -138,10 +138,10 @@ class SampledModel(NamedTuple):
 
 
 def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> SampledModel:
-    r"""Exact zero-order-hold equivalent of a model at rest.
+    r"""Return the exact zero-order-hold equivalent of a model at rest.
 
     With the delay ``(shift - fraction) h``, ``0 <= fraction < 1``, the output at ``t_k`` is that of the undelayed model
-    ``fraction h`` after ``t_(k-shift)``, while it still holds ``u_(k-shift)``.
+    ``fraction h`` after ``t_(k-shift)``, where its input is still ``u_(k-shift)``.
     """
     require_positive("the sampling interval", interval, "s")
     parts = [s.transfer_function() for s in model.submodels] if isinstance(model, AdditiveModel) else [model]
@@ -154,7 +154,7 @@ def sampled_model(model: AdditiveModel | TransferFunction, interval: float) -> S
 
 
 def sampled_chains(chains: Chains, interval: float, delay: float) -> SampledModel:
-    """Return the equivalent of chains."""
+    """Return the zero-order-hold equivalent of chains."""
     shift, fraction = split_delay(delay, interval)
     size, first, at_once = sum(form.width for form in chains.forms), 0, float(chains.direct.sum())
     transition, from_input, output = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -168,7 +168,7 @@ def sampled_chains(chains: Chains, interval: float, delay: float) -> SampledMode
 
 
 def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike) -> Array:
-    """Output of a sum of submodels at rest before the first break of its input.
+    """Return the output of a sum of submodels at rest before the first break of its input.
 
     Parameters
     ----------
@@ -191,8 +191,8 @@ def simulate_additive(model: AdditiveModel, signal: HeldSignal, times: ArrayLike
 
     Notes
     -----
-    Exact for every clock and delay, as :func:`ctid_cli.filtering.simulate`, and formed submodel by submodel: no
-    polynomial of the order of the whole sum, with the rounding of its roots, is needed.
+    Exact for every clock and delay, as :func:`ctid_cli.filtering.simulate`. Submodels are simulated separately, which
+    avoids a polynomial of the order of the sum and the rounding of its roots.
 
     Examples
     --------

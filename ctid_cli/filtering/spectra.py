@@ -1,11 +1,11 @@
 r"""Finite-record spectra of a record's output and of its delayed input, exactly, for any clock, hold and delay.
 
-Over a window ``[t_0, t_1]`` of length T and at its own frequencies ``w_k = 2 pi k / T`` the spectrum of a signal v is
+Over a window ``[t_0, t_1]`` of length T, at its frequencies ``w_k = 2 pi k / T``, the spectrum of a signal v is
 
 .. math:: V(w_k) = \frac{1}{T} \int_{t_0}^{t_1} v(t) e^{-j w_k (t - t_0)} dt.
 
 There ``exp(-j w_k T) = 1``: a derivative ``p^i v`` has the spectrum ``(jw)^i V`` plus a real polynomial in ``jw`` of
-degree ``i - 1`` made of the end values of v. A differential equation therefore holds exactly between finite spectra,
+degree ``i - 1`` from the end values of v. A differential equation therefore holds exactly between finite spectra,
 up to one real polynomial for the states at both ends of the window.
 
 By Parseval the mean square of v over the window is ``|V(0)|^2 + 2 sum_k |V(w_k)|^2``.
@@ -23,28 +23,28 @@ from ctid_cli.filtering.spectral_kernels import partial_sums, window_spectrum
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
-#: Partial sums are kept for this many stretches of breaks; within a stretch they are formed when a delay asks.
+#: Partial sums are stored for this number of stretches of breaks; within a stretch they are computed when needed.
 STRETCHES = 128
 #: No stretch is shorter than this number of breaks.
 SHORTEST_STRETCH = 8
-#: Sampling intervals are sorted into this many groups of like ones to find what interpolation does to the output.
+#: Number of groups of similar sampling intervals used to compute the damping of the output by interpolation.
 STEP_GROUPS = 64
 
 
 class RecordSpectra(NamedTuple):
     """Spectra of a record's output and of its input at any delay.
 
-    The input is exact. The output is joined by straight lines between its samples, missing ones left out. That keeps
-    the values and slopes at the ends of the window and damps the curvature between them: a wave ``exp(jwt)`` by
-    ``(sin(wh/2)/(wh/2))^2`` in an interval of length h. The mean of that factor over the window is taken out of the
-    spectrum. What remains are images of other frequencies: small, and noise-like on an irregular clock, but a reason
-    to finish an estimate in the time domain.
+    The input is exact. The output is interpolated linearly between its samples, without the missing ones. That keeps
+    the values and slopes at the ends of the window and damps a wave ``exp(jwt)`` by ``(sin(wh/2)/(wh/2))^2`` in an
+    interval of length h. The spectrum is divided by the mean of that factor over the window. Images of other
+    frequencies remain: they are small, and noise-like on an irregular clock, but an estimate should be completed in the
+    time domain.
     """
 
     window: tuple[float, float]
     #: Frequencies [rad/s], shape (K,).
     frequencies: Array
-    #: Mean factor by which straight lines between the samples damp each frequency [-], shape (K,).
+    #: Mean factor by which linear interpolation damps each frequency [-], shape (K,).
     damping: Array
     #: Spectrum of the output [output unit], shape (K,).
     outputs: ComplexArray
@@ -58,7 +58,7 @@ class RecordSpectra(NamedTuple):
         return self.window[1] - self.window[0]
 
     def inputs(self, delay: float, count: int | None = None) -> ComplexArray:
-        """Spectrum of the delayed input over the window, at all frequencies or the first few."""
+        """Return the spectrum of the delayed input over the window, at the first ``count`` frequencies (or all)."""
         if not 0.0 <= delay <= self.greatest_delay:
             raise ValueError(f"the delay must lie between 0 and {self.greatest_delay:g} s, not {delay:g} s")
         first = int(self.frequencies[0] > 0.0)
@@ -84,7 +84,7 @@ def record_spectra(
     count = int(np.floor(highest * (last - first) / (2 * np.pi)))
     if count < 1:
         raise DataError(
-            f"{where}the {last - first:g} s from {first:g} s on hold no full period of {highest:g} rad/s; "
+            f"{where}the {last - first:g} s from {first:g} s on contain no full period of {highest:g} rad/s; "
             "take a longer record, a smaller greatest delay or a higher frequency"
         )
     window, kept = (first, last), slice(0 if keep_mean else 1, None)
@@ -97,20 +97,20 @@ def record_spectra(
 
 
 def lowpass_weight(frequencies: Array, lowpass: Lowpass | None) -> Array:
-    """Squared gain of a Butterworth low-pass filter."""
+    """Return the squared gain of a Butterworth low-pass filter."""
     if lowpass is None:
         return np.ones(frequencies.size)
-    # Far above a sharp filter the power overflows to infinity and the weight is 0, as it should be.
+    # Far above the cut-off the power overflows to infinity, and the weight is correctly 0.
     with np.errstate(over="ignore"):
         weight: Array = 1.0 / (1.0 + (frequencies / lowpass.cutoff) ** (2 * lowpass.order))
     return weight
 
 
 def _damping(record: Record, window: tuple[float, float], frequencies: Array) -> Array:
-    """Mean of ``(sin(wh/2)/(wh/2))^2`` over the sampling intervals in a window, each counted with its length."""
+    """Return the mean of ``(sin(wh/2)/(wh/2))^2`` over the sampling intervals in a window, weighted by their length."""
     present = record.t[record.valid]
     steps = np.sort(np.diff(present[(present >= window[0]) & (present <= window[1])]))
-    # Intervals of about the same length share one: that which has their mean to second order in the frequency.
+    # Each group of similar intervals is replaced by one length with the same mean to second order in the frequency.
     groups = np.array_split(steps, min(steps.size, STEP_GROUPS))
     lengths = np.array([group.sum() for group in groups])
     typical = np.sqrt(np.array([(group**3).sum() for group in groups]) / lengths)
@@ -121,26 +121,26 @@ def _damping(record: Record, window: tuple[float, float], frequencies: Array) ->
 class HeldSpectrum(NamedTuple):
     """A held signal laid out for its spectrum over a window, at any delay.
 
-    Integration by parts leaves sums over the breaks: of the jumps of the value for a constant hold, of the jumps of
-    the slope for a linear one. Their partial sums are kept at every few breaks at both ends of the window.
+    Integration by parts gives sums over the breaks: of the jumps of the value for a constant hold, of the jumps of the
+    slope for a linear one. Their partial sums are stored for every few breaks at both ends of the window.
     """
 
-    #: Breaks that jump, from the start of the window [s]; values, slopes, jumps and integrals there, shape (M,).
+    #: Breaks with a jump, from the start of the window [s]; values, slopes, jumps and integrals there, shape (M,).
     times: Array
     values: Array
     slopes: Array
     jumps: Array
     integral: Array
     foh: bool
-    #: Numbers of breaks up to which partial sums are kept, and these, shape (marks, count).
+    #: Numbers of breaks up to which partial sums are stored, and these sums, shape (marks, count).
     marks: IntArray
     sums: ComplexArray
     duration: float
 
     def at(self, delay: float, gain: Array) -> ComplexArray:
-        """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by a delay [s].
+        """Return the spectrum of the signal delayed by ``delay`` [s] at zero and the next ``gain.size`` frequencies.
 
-        The gain multiplies what happens inside the window, as opposed to its ends.
+        The gain multiplies the contribution of the breaks inside the window, not that of its ends.
         """
         return np.asarray(window_spectrum(*self, delay, gain))
 
@@ -157,7 +157,7 @@ def _held_spectrum(
         slopes[:-1] = np.diff(values) / steps
     jumps = np.diff(slopes if foh else values, prepend=0.0)
     integral = np.concatenate(([0.0], np.cumsum(steps * (values[:-1] + 0.5 * slopes[:-1] * steps))))
-    # Nothing happens at a break without a jump, and nothing after the window matters.
+    # Breaks without a jump contribute nothing, nor do those after the window.
     kept = (jumps != 0.0) & (times < duration)
     kept[0] = True
     times, values, slopes, jumps, integral = (array[kept] for array in (times, values, slopes, jumps, integral))

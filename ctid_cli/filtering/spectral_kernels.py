@@ -1,20 +1,20 @@
-r"""Compiled loops over the frequencies of finite-record spectra: the input at a delay, and fits at held delays.
+r"""Compiled loops over the frequencies of finite-record spectra: the input at a delay, and fits at fixed delays.
 
-A kernel calls only kernels of this file and reads no constant and no type of another: Numba's cache on disk looks only
-at the file of a function, and is then never stale. What makes the arguments is NumPy, in
-:mod:`~ctid_cli.filtering.spectra` and :mod:`~ctid_cli.estimation.filtered_costs`.
+Kernels use only functions, constants and types of this file: Numba's disk cache checks only the file of a function, so
+that it is never stale. Arguments are prepared in NumPy, in :mod:`~ctid_cli.filtering.spectra` and
+:mod:`~ctid_cli.estimation.filtered_costs`.
 
-A search over the delay makes thousands of small fits one after the other, each from the end of the one before. The
-whole fit is therefore compiled: with its steps in NumPy, side by side for all filters, a search took ten times as long.
+A search over the delay consists of thousands of small successive fits, each started from the result of the previous
+one. The whole fit is therefore compiled: vectorised over all filters in NumPy, a search took ten times as long.
 
-At a held delay the model ``x = B/A u(t - tau)`` obeys
+At a fixed delay the model ``x = B/A u(t - tau)`` satisfies
 
 .. math:: X = \frac{B(jw)\,U_\tau + T(jw)}{A(jw)}, \qquad \varepsilon = Y - X,
 
 exactly, with one real polynomial T of degree n - 1 for the states at both ends of the window. Its coefficients are
-estimated with those of A and B, so that a record may start and end in mid-motion. The cost ``sum_k g_k |eps_k|^2``
-counts every frequency on both sides of zero; with the weight ``g = |L(jw)|^2`` it is, by Parseval, the mean square over
-the window of the output error behind the filter L.
+estimated with those of A and B, so that a record need not start or end at rest. The cost ``sum_k g_k |eps_k|^2`` is
+over positive and negative frequencies; with the weight ``g = |L(jw)|^2`` it is, by Parseval, the mean square over the
+window of the output error after the filter L.
 """
 
 import math
@@ -24,11 +24,12 @@ from numba import njit
 
 from ctid_cli.arrays import Array, ComplexArray, IntArray
 
-#: Added to normal equations of unit diagonal, so that those of columns that depend on one another have a solution.
+#: Added to normal equations of unit diagonal, so that those of linearly dependent columns have a solution.
 RIDGE = 1e-14
-#: The delay counts as undetermined where projecting the coefficients out leaves less of the curvature.
+#: The delay counts as undetermined if projecting out the coefficients leaves less than this share of the curvature.
 LEAST_CURVATURE = 1e-12
-#: A step is taken only if the cost falls by this fraction of what its slope promises (Armijo's rule), but for rounding.
+#: A step is accepted only if the cost decreases by this fraction of the linear prediction (Armijo's rule), up to
+#: rounding.
 SUFFICIENT_FALL = 0.1
 ROUNDING = 1e-13
 
@@ -38,12 +39,12 @@ ROUNDING = 1e-13
 
 @njit(cache=True, nogil=True)
 def _phases(angle: float, count: int) -> ComplexArray:
-    """``exp(-j k angle)``, k = 1 … count, by doubling: vector operations throughout."""
+    """Return ``exp(-j k angle)``, k = 1 … count, by doubling."""
     found = np.empty(count, np.complex128)
     found[0] = complex(math.cos(angle), -math.sin(angle))
     done = 1
     while done < count:
-        # Element by element: for an assignment of arrays Numba compiles the text of an error message, for seconds.
+        # Element by element: array assignment would add seconds of compilation, for an error message of Numba.
         for i in range(min(done, count - done)):
             found[done + i] = found[done - 1] * found[i]
         done *= 2
@@ -61,7 +62,7 @@ def _add_jumps(times: Array, jumps: Array, first: int, last: int, base: float, t
 
 @njit(cache=True, nogil=True)
 def partial_sums(times: Array, jumps: Array, marks: IntArray, base: float, count: int) -> ComplexArray:
-    """Sums over the first ``marks[r]`` breaks, shape (marks, count)."""
+    """Return the sums over the first ``marks[r]`` breaks, shape (marks, count)."""
     sums = np.zeros((marks.size, count), np.complex128)
     for r in range(1, marks.size):
         for k in range(count):
@@ -84,9 +85,9 @@ def window_spectrum(
     delay: float,
     gain: Array,
 ) -> ComplexArray:
-    """Spectrum at zero frequency and at as many above it as there are gains, of the signal later by ``delay``.
+    """Return the spectrum of the signal delayed by ``delay`` at zero and the next ``gain.size`` frequencies.
 
-    The gain multiplies what happens inside the window, as opposed to its ends.
+    The gain multiplies the contribution of the breaks inside the window, not that of its ends.
 
     With a and b the ends of the window on the undelayed signal's clock, value v and slope r there, and D the sum of
     ``jump exp(-jw t)`` over the breaks between them,
@@ -111,7 +112,7 @@ def window_spectrum(
     spectrum[0] = (total_right - total_left) / duration
     if count == 0:
         return spectrum
-    # D: kept sums up to the nearest marks, completed break by break.
+    # D: stored sums up to the nearest marks, completed break by break.
     base = 2.0 * np.pi / duration
     row, upper = np.searchsorted(marks, left + 1, "right") - 1, np.searchsorted(marks, right + 1, "right") - 1
     total, early = sums[upper, :count].copy(), sums[row, :count].copy()
@@ -132,12 +133,12 @@ def window_spectrum(
     return spectrum
 
 
-# --- a fit at a held delay ------------------------------------------------------------------------------------------
+# --- a fit at a fixed delay -----------------------------------------------------------------------------------------
 
 
 @njit(inline="always")
 def _at(coefficients: Array, s: complex) -> complex:
-    """Polynomial in descending powers."""
+    """Return the value of a polynomial in descending powers."""
     value = 0.0j
     for c in coefficients:
         value = value * s + c
@@ -154,9 +155,9 @@ def _moments(
     poles: int,
     order: int,
 ) -> tuple[Array, float]:
-    """Products of the columns (dx/da, dx/db, dx/dT, dx/dtau, eps) at ``theta = (a, b, T)``; the power of the output.
+    """Return products of the columns (dx/da, dx/db, dx/dT, dx/dtau, eps) at ``theta = (a, b, T)``, and output power.
 
-    ``order`` counts the integrators too. Where B is zero, dx/da takes the measured output: what least squares need.
+    ``order`` includes the integrators. If B is zero, dx/da uses the measured output, as least squares require.
     """
     size, ahead = theta.size + 2, theta.size - order
     denominator = np.zeros(order + 1)
@@ -171,9 +172,9 @@ def _moments(
     columns = np.empty((2 * frequencies.size, size))
     for k in range(frequencies.size):
         jw = complex(0.0, frequencies[k])
-        # A frequency above zero stands for its negative too.
+        # A positive frequency also represents its negative.
         root = math.sqrt(weights[k] if frequencies[k] == 0.0 else 2.0 * weights[k])
-        # Without a complex division, which Numba checks for zero and raises at.
+        # No complex division, for which Numba would add a check for zero.
         at = _at(denominator, jw)
         inverse = at.conjugate() * (1.0 / (at.real * at.real + at.imag * at.imag))
         forced = _at(numerator, jw) * inputs[k] * inverse
@@ -199,7 +200,7 @@ def _moments(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve(gram: Array, right: int, first: int, last: int) -> tuple[bool, Array]:
-    """Project one column on those from ``first`` to before ``last``; whether all of these have a length."""
+    """Project one column on columns ``first … last - 1``; also return whether the projection succeeded."""
     count, solution = last - first, np.zeros(last)
     scale, matrix = np.empty(count), np.empty((count, count + 1))
     for i in range(count):
@@ -228,7 +229,7 @@ def _solve(gram: Array, right: int, first: int, last: int) -> tuple[bool, Array]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_stable(theta: Array, poles: int) -> bool:
-    """Routh's criterion for the denominator ``(1, a_1 … a_n)``, which is at the head of the parameters."""
+    """Return whether the denominator ``(1, a_1 … a_n)``, the first parameters, is stable, by Routh's criterion."""
     rows = np.zeros((2, poles // 2 + 2))
     rows[0, 0] = 1.0
     for i in range(1, poles + 1):
@@ -256,7 +257,7 @@ def least_squares(
     poles: int,
     order: int,
 ) -> tuple[bool, Array]:
-    """Least-squares estimate of ``(a, b, T)`` with a state-variable filter 1/F, ``start = (f_1 … f_n, 0 … 0)``.
+    """Return the least-squares estimate of ``(a, b, T)`` with filter 1/F, ``start = (f_1 … f_n, 0 … 0)``.
 
     ``A Y = B U + T`` divided by F reads ``Y = -sum (a_i - f_i) (jw)^(n-i)/F Y + B/F U + T/F``.
     """
@@ -278,16 +279,16 @@ def least_cost(
     tolerance: float,
     halvings: int,
 ) -> tuple[Array, float, float]:
-    """Gauss-Newton on the coefficients from a stable denominator, for which B and T are fitted: ``start = (a, 0, 0)``.
+    """Minimise the cost over the coefficients by Gauss-Newton from ``start = (a, 0, 0)``, with a stable.
 
-    A step to an unstable model, or one that does not lower the cost, is halved, so often at most. The iteration ends
-    where a step changes the model's output by less than a fraction of its size. Returns the coefficients, the squared
-    error, infinite where nothing could be computed, and the Gauss-Newton step of the delay [s], NaN where the data do
-    not determine it. With integrators no frequency may be zero.
+    B and T are first fitted to the given a. A step to an unstable model, or one that does not lower the cost, is halved
+    at most ``halvings`` times. The iteration ends when a step changes the model's output by less than the relative
+    tolerance. Returns the coefficients, the squared error, infinite if the computation failed, and the Gauss-Newton
+    step of the delay [s], NaN if the data do not determine it. With integrators no frequency may be zero.
     """
     size, coefficients = start.size, start.size - order
     gram, power = _moments(frequencies, outputs, inputs, weights, start, poles, order)
-    # At zero B and T the output error is what they explain: one step is the minimum.
+    # The output is linear in B and T: one step from zero gives the minimum.
     solved, step = _solve(gram, size + 1, poles, size)
     theta = start + step
     gram, power = _moments(frequencies, outputs, inputs, weights, theta, poles, order)
@@ -297,7 +298,8 @@ def least_cost(
         solved, step = _solve(gram, size + 1, 0, size)
         if not solved:
             break
-        # The step solves the normal equations: this is the gradient's product with it, and the square of what it moves.
+        # Product of gradient and step; it equals the squared change of the output, as the step solves the normal
+        # equations.
         slope = 0.0
         for i in range(size):
             slope += step[i] * gram[i, size + 1]

@@ -1,15 +1,15 @@
-r"""Filtered signals of a sum of submodels and their second moments: rows of additive refined instrumental variables.
+r"""Filtered signals of a sum of submodels and their second moments, for additive refined instrumental variables.
 
 Submodel i is ``G_i = B_i / (p^l A_i)``, ``A_i = 1 + a_1 p + … + a_n p^n``, ``B_i = b_0 + … + b_m p^m``, with
 integrators (l > 0) in at most one of them, and ``theta = (a_1 … a_n, b_0 … b_m)`` of each in turn. At each used sample,
-with z the instrument source, u the input and ``y_i = y - sum of the other x_l`` what the others leave of the output,
+with z the instrument source, u the input and ``y_i = y - sum of the other x_l`` the output less the other submodels',
 
 .. math:: \psi_{a_k} = -\frac{p^k B_i}{p^l A_i^2} z, \quad \psi_{b_k} = \frac{p^k}{p^l A_i} z, \qquad
           \varphi_{a_k} = -\frac{p^k}{A_i} y_i, \quad \varphi_{b_k} = \frac{p^k}{p^l A_i} u .
 
-In open loop ``z = u`` and psi are the sensitivities of the model output. In closed loop z is the input of the model's
-own noise-free loop (González, Classens, Rojas, Welsh and Oomen, *Identification of additive continuous-time systems in
-open and closed loop*, equations (10), (20), (29) and (31)).
+In open loop ``z = u`` and psi are the sensitivities of the model output. In closed loop z is the input of the
+noise-free loop with the model (González, Classens, Rojas, Welsh and Oomen, *Identification of additive continuous-time
+systems in open and closed loop*, equations (10), (20), (29) and (31)).
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ InitialState = Literal["rest", "periodic", "estimated"]
 
 
 class LoopData(NamedTuple):
-    """The feedback around a record."""
+    """Feedback loop of a record."""
 
     #: Reference at the sampling instants; empty in open loop, shape (N,).
     reference: Array
@@ -54,7 +54,7 @@ class LoopData(NamedTuple):
     numerator: Array
     denominator: Array
     at_controller: bool
-    #: Whether the reference is the instruments' input itself, and the controller is not known.
+    #: Whether the reference is the input of the instruments, for an unknown controller.
     direct: bool = False
 
     @property
@@ -69,7 +69,7 @@ OPEN_LOOP = LoopData(np.zeros(0), np.ones(1), np.ones(1), True)
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One submodel with a monic denominator, and what of the input it passes on at once."""
+    """One submodel with a monic denominator, split into direct feedthrough and strictly proper part."""
 
     term: Term
     #: Coefficient of the highest power of A; theta has A with a constant term of 1.
@@ -92,14 +92,14 @@ class Part:
         return cls(term, highest, a, rest if rest.size else np.zeros(1), direct)
 
     def modal(self) -> ModalForm | None:
-        """Return the partial fractions; None where they amplify rounding."""
+        """Return the partial fractions; None if they amplify rounding too much."""
         if self.term.integrators > MOST_MODAL_INTEGRATORS:
             return None
         form = modal_form(plain_array(self.a), plain_array(self.b), self.term.integrators)
         return form if form.condition < MODAL_CONDITION_LIMIT else None
 
     def chain(self) -> ChainForm:
-        """Return the chain, which repeated poles have too."""
+        """Return the chain, which also exists for repeated poles."""
         return chain_form(plain_array(self.a), plain_array(self.b), self.term.integrators)
 
     def output(self, driven: Array, u: Array) -> Array:
@@ -114,13 +114,13 @@ class Part:
         return np.column_stack((-of_output[:, 1:], of_input[:, : self.term.zeros + 1])) / self.highest
 
     def regressors(self, driven: Array, u: Array, filtered: Array, left: Array) -> Array:
-        """Return phi from ``p^k/(p^l A) u`` and u, and from ``p^k/A`` of what the others leave of the output."""
+        """Return phi from ``p^k/(p^l A) u`` and u, and from ``p^k/A y_i`` and ``y_i``."""
         of_output = self._with_highest(filtered, left, 0)
         of_input = self._with_highest(driven, u)
         return np.column_stack((-of_output[:, 1:], of_input[:, : self.term.zeros + 1])) / self.highest
 
     def _with_highest(self, lower: Array, signal: Array, integrators: int | None = None) -> Array:
-        """Return the columns ``p^k/(p^l A) s``, k = 0 … n + l, from those below the last and s itself."""
+        """Return the columns ``p^k/(p^l A) s``, k = 0 … n + l, from the lower ones and s."""
         first = self.term.integrators if integrators is None else integrators
         return np.column_stack((lower, signal - lower[:, first:] @ self.a[:0:-1]))
 
@@ -128,8 +128,8 @@ class Part:
 class SubmodelFilter:
     """The filters of a record for sums of submodels of one structure.
 
-    All submodels are filtered in one compiled pass of their pooled modes. Where one has (nearly) repeated poles all go
-    through chains, several times slower.
+    All submodels are filtered in one compiled pass over all their modes. If one has (nearly) repeated poles, all use
+    chains, which are several times slower.
     """
 
     def __init__(
@@ -152,8 +152,8 @@ class SubmodelFilter:
             raise ValueError("initial_state periodic needs input and output on one regular clock")
 
     def moments(self, theta: Array) -> Equations | None:
-        """Return the second moments at one parameter vector; None where they are not finite."""
-        # What overflows is found by the sums not being finite.
+        """Return the second moments at one parameter vector; None if they are not finite."""
+        # Overflow is detected by sums that are not finite.
         with np.errstate(all="ignore"):
             moments = self._moments(theta)
         if moments is None or not np.isfinite(moments.squared_error):
@@ -172,7 +172,7 @@ class SubmodelFilter:
         if pooled is None:
             return None
         psi, phi, output = pooled.psi, pooled.phi, pooled.output
-        # psi and the model output are made of the rows up to that of the error.
+        # psi and the model output depend on the rows up to that of the error only.
         leading = 2 * pooled.width + 2
         gram = self._pass(self.data, pooled, rows=False, leading=leading)
         products = psi[:leading].T @ gram
@@ -202,7 +202,7 @@ class SubmodelFilter:
         return np.column_stack((psi + by_theta, by_free)), np.column_stack((phi + by_theta, by_free)), error, output + x
 
     def _pooled(self, theta: Array, form: Form = "auto") -> "Pooled | None":
-        """Return all submodels for one pass; None where there is none."""
+        """Return all submodels for one pass; None for inadmissible parameters."""
         parts = _parts(theta, self.terms) if np.isfinite(theta).all() else None
         if parts is None:
             return None
@@ -229,7 +229,7 @@ class SubmodelFilter:
         return modal_pass(data, model, delay, rows=rows, leading=leading, states=states, instruments=instruments)
 
     def instrument_input(self, theta: Array) -> Array | None:
-        """Return what drives the instruments: the input, or that of the noise-free loop."""
+        """Return the input of the instruments: the measured one, or that of the noise-free loop."""
         if not self.loop.closed:
             return self.data.u
         pooled = self._pooled(theta)
@@ -248,20 +248,19 @@ class SubmodelFilter:
         return loop_pass(plant, law, reference, np.zeros(reference.size), self.loop.at_controller)[0]
 
     def _in_steady_state(self, data: FilterData, modes: Modes) -> tuple[FilterData, float, ComplexArray]:
-        """Return the record with its input late by whole intervals, the delay left, and states that come back."""
+        """Return the record with its input shifted by whole intervals, the remaining delay, and the periodic states."""
         count, interval = data.y.size, data.interval
         period = interval * count
         shift, fraction = split_delay(self.delay, interval)
         rolled = np.roll(data.u, shift)
-        # Two samples more: the last interval leads back to the first sample, where the next slope begins.
+        # Two more samples: the last interval ends at the first sample, where the next slope begins.
         data, delay = data._replace(u=np.concatenate((rolled, rolled[:2]))), -fraction * interval
         nothing = data._replace(use=np.zeros(count, dtype=bool))
         initial = np.zeros((modes.poles.size, 5), np.complex128)
         modal_pass(nothing, modes, delay, states=initial)
         initial[:, 2:] = 0.0
         to_steady_state(modes.poles, period, initial)
-        # What filters see of the output depends on the output of the model, so it comes second; and once round, back at
-        # the first sample.
+        # The filters of y_i need the periodic output of the model, hence a second pass over one whole period.
         states, once_round = initial.copy(), np.append(data.y, data.y[0])
         whole = nothing._replace(y=once_round, use=np.zeros(count + 1, dtype=bool))
         modal_pass(whole, modes, delay, states=states)
@@ -270,7 +269,7 @@ class SubmodelFilter:
 
 
 def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
-    """Return the submodels of parameters; None where one has lost a pole."""
+    """Return the submodels of parameters; None if a leading denominator coefficient is zero."""
     parts: list[Part] = []
     first = 0
     for term in terms:
@@ -283,7 +282,7 @@ def _parts(theta: Array, terms: Sequence[Term]) -> list[Part] | None:
 
 
 class Pooled(NamedTuple):
-    """All submodels in one pass, and psi, phi and the model output driven by z as maps of its rows."""
+    """All submodels in one pass, with the maps from its rows to psi, phi and the model output driven by z."""
 
     model: Modes | Chains
     #: Number of rows of z.
@@ -304,7 +303,7 @@ def pooled_modes(forms: Sequence[ModalForm], direct: Array) -> Modes:
 def pooled_forms(
     parts: Sequence[Part], forms: Sequence[ModalForm | ChainForm], model: Modes | Chains, closed: bool
 ) -> Pooled:
-    """Return what is made of the rows of one pass over all submodels."""
+    """Return the maps from the rows of one pass over all submodels."""
     n = sum(form.width for form in forms)
     v, error, u = 2 * n, 2 * n + 1, 5 * n + 2 if closed else 2 * n
     width = u + 1 if closed else 3 * n + 2
@@ -346,7 +345,7 @@ def free_response_size(terms: Sequence[Term]) -> int:
 def free_response(
     theta: Array, free: Array, terms: Sequence[Term], elapsed: Array
 ) -> tuple[Array, Array, Array] | None:
-    r"""Return what initial conditions add to the output, and its derivatives to theta and to the conditions.
+    r"""Return the free response to initial conditions, and its derivatives by theta and by the conditions.
 
     The free response of submodel i after the first sample is that of ``C_i / (p^l A_i)`` to an impulse,
     ``C_i = c_0 + … + c_(n+l-1) p^(n+l-1)``, hence
@@ -354,7 +353,7 @@ def free_response(
     .. math:: \frac{\partial x}{\partial c_k} = \frac{p^k}{p^l A_i}\delta, \qquad
               \frac{\partial x}{\partial a_k} = -\frac{p^k C_i}{p^l A_i^2}\delta .
 
-    None where a submodel has lost a pole.
+    None if a leading denominator coefficient is zero.
     """
     response = np.zeros(elapsed.size)
     by_theta, by_free = np.zeros((elapsed.size, theta.size)), np.zeros((elapsed.size, free.size))
@@ -378,7 +377,7 @@ def free_response(
 
 
 def _impulse_responses(part: Part, elapsed: Array) -> tuple[Array, Array]:
-    """Return ``p^k/(p^l A)`` of an impulse, and ``p^k/A`` of what B/(p^l A) makes of it, columns."""
+    """Return the impulse responses of ``p^k/(p^l A)`` and of ``p^k B/(p^l A^2)`` as columns."""
     n, order = part.term.poles, part.term.order
     form = part.modal() or part.chain()
     if isinstance(form, ChainForm):

@@ -8,7 +8,7 @@ from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.identification.candidates import MOST_POLES, Span
 from ctid_cli.identification.criterion import Ranking, Searched
-from ctid_cli.inference.response_test import AnswerTest
+from ctid_cli.inference.response_test import ResponseTest
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
@@ -142,7 +142,7 @@ class Choice:
         The same, or parts of long ones, to which the candidates were fitted.
     ranking : Ranking
         All structures of the grid, the best first.
-    answer : AnswerTest
+    answer : ResponseTest
         Whether a response of the outputs to the inputs is seen at all.
     sentences : tuple of str
         One for each choice, with its criterion and that of the runner-up.
@@ -152,7 +152,7 @@ class Choice:
     records: tuple[Record, ...] = field(repr=False)
     fitted: tuple[Record, ...] = field(repr=False)
     ranking: Ranking = field(repr=False)
-    answer: AnswerTest
+    answer: ResponseTest
     sentences: tuple[str, ...]
 
     @property

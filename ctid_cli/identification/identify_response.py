@@ -9,7 +9,7 @@ from ctid_cli.estimators.identification import Identification, free_directions, 
 from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_search
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
-from ctid_cli.inference.response_test import LEVEL, AnswerTest
+from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.signals.frequency_data import FrequencyData
 from ctid_cli.text import count
 
@@ -65,7 +65,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
     )
 
 
-def _answer(fit: FrequencyDomainFit) -> AnswerTest:
+def _answer(fit: FrequencyDomainFit) -> ResponseTest:
     """Test the model against no response by the F-distribution, each line being a place where noise may have a peak."""
     from scipy.stats import f as f_distribution
 
@@ -74,10 +74,10 @@ def _answer(fit: FrequencyDomainFit) -> AnswerTest:
     chances = 0.5 * fit.count
     p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
     least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
-    return AnswerTest(fit.r2, least / (1.0 + least), p_value)
+    return ResponseTest(fit.r2, least / (1.0 + least), p_value)
 
 
-def _warnings(fit: FrequencyDomainFit, answer: AnswerTest) -> Iterator[str]:
+def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
     """Yield what to know before the model is used, the costliest first."""
     if not answer.seen:
         yield f"No model: the values are not seen to be anything but noise (p = {answer.p_value:.2g})"

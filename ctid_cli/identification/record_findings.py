@@ -136,11 +136,9 @@ class _Sentences:
             text = f"The output was recorded in steps of {self.y(f.output_quantum)}"
             level: Level = "warning" if share > 0.1 else "note"
             yield Finding(level, "resolution", f"{text}, {100 * share:.2g} % of its standard deviation.")
-        if f.beside.outliers:
-            where = ", ".join(self.t(t) for t in f.beside.outliers[:3]) + (
-                ", ..." if len(f.beside.outliers) > 3 else ""
-            )
-            lies = count(len(f.beside.outliers), "output sample") + (" lies" if len(f.beside.outliers) == 1 else " lie")
+        if f.parts.outliers:
+            where = ", ".join(self.t(t) for t in f.parts.outliers[:3]) + (", ..." if len(f.parts.outliers) > 3 else "")
+            lies = count(len(f.parts.outliers), "output sample") + (" lies" if len(f.parts.outliers) == 1 else " lie")
             yield Finding("warning", "outliers", f"{lies} farther from the others than noise explains (t = {where}).")
 
     def _response(self) -> Finding:
@@ -152,7 +150,7 @@ class _Sentences:
             )
             few = f.n_samples - f.n_masked < FEWEST_SAMPLES
             return Finding("warning" if few else "problem", "response", text)
-        ratio, time, delay = f.beside.signal_to_noise, f.beside.response_time, f.beside.delay
+        ratio, time, delay = f.parts.signal_to_noise, f.parts.response_time, f.parts.delay
         parts = [f"The output responds to the input ({p})"]
         if not math.isnan(ratio.value):
             parts.append(f"signal-to-noise ratio {self._interval(ratio, 'dB')}")
@@ -171,14 +169,14 @@ class _Sentences:
 
     def _tests(self) -> Iterator[Finding]:
         """What stands beside the response, and what of it is not detected."""
-        beside = self.facts.beside
-        if beside.offset is None or beside.drift is None or beside.start is None:
+        parts = self.facts.parts
+        if parts.offset is None or parts.drift is None or parts.start is None:
             return
-        rest = f"an input of {self.u(beside.input_at_rest)}"
+        rest = f"an input of {self.u(parts.input_at_rest)}"
         named = [
-            ("offset", beside.offset, f"At {rest} the output rests at"),
-            ("drift", beside.drift, "Beside the response the output drifts over the record by"),
-            ("start", beside.start, "The record does not begin at rest: at first the output is off by"),
+            ("offset", parts.offset, f"At {rest} the output rests at"),
+            ("drift", parts.drift, "Beside the response the output drifts over the record by"),
+            ("start", parts.start, "The record does not begin at rest: at first the output is off by"),
         ]
         missed = []
         for topic, term, words in named:
@@ -187,12 +185,12 @@ class _Sentences:
                 yield Finding("warning", topic, f"{words} {size}, {probability(term.p_value)}.")
             else:
                 missed.append(f"{topic} {size}")
-        p = probability(beside.feedback_p_value)
-        if beside.feedback_p_value <= LEVEL:
+        p = probability(parts.feedback_p_value)
+        if parts.feedback_p_value <= LEVEL:
             yield Finding("warning", "feedback", f"The input goes with the noise of the output, as in a loop ({p}).")
         else:
             missed.append(f"feedback ({p})")
-        missed += ["outliers"] * (not beside.outliers) + ["saturation"] * (not self.facts.saturated)
+        missed += ["outliers"] * (not parts.outliers) + ["saturation"] * (not self.facts.saturated)
         if missed:
             text = "; ".join(missed)
             yield Finding("ok", "not detected", f"{text}. This rules nothing out: the intervals hold 95 %.")

@@ -1,1 +1,1 @@
-"""Accuracy and quality of an estimate, whichever algorithm found it."""
+"""Accuracy and quality of estimates, independent of the estimation method."""

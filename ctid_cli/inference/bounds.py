@@ -1,4 +1,4 @@
-"""Accuracy that theory gives: Cramér-Rao bounds of a record, and the limit for long records."""
+"""Theoretical accuracy: Cramér-Rao bounds of a record, and the asymptotic limit for long records."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ParameterAccuracy:
     def of(
         cls, model: AdditiveModel | TransferFunction, covariance: Array, zeros: int | None = None, delay: bool = False
     ) -> ParameterAccuracy:
-        """Accuracy of the parameters of a model, or with its delay estimated too, or of a fraction with more zeros."""
+        """Return the accuracy of a model's parameters, optionally with the delay or with more zeros of a fraction."""
         if isinstance(model, AdditiveModel):
             names, values = (*model.names, *("delay",) * delay), np.append(model.theta, [model.delay] * delay)
             return cls(model, names, values, covariance)
@@ -57,7 +57,7 @@ class ParameterAccuracy:
         return errors
 
     def factored(self, terms: Sequence[Term] | None = None) -> ParameterAccuracy:
-        """Accuracy of the submodels into which an estimated transfer function is factored, by the delta method."""
+        """Return the accuracy of the submodels of a factored transfer function, by the delta method."""
         if isinstance(self.model, AdditiveModel):
             return self
         additive = factored(self.model, terms)
@@ -73,24 +73,24 @@ class ParameterAccuracy:
 
 @dataclass(frozen=True, eq=False)
 class EstimatedForm:
-    """The true system in the form in which an estimator has it."""
+    """The true system in the parametrisation of an estimator."""
 
     model: AdditiveModel | TransferFunction
     #: Degree of the numerator of a fraction; None for that of the model.
     zeros: int | None
-    #: Samples before this time [s] are not used; None where the delay is known.
+    #: Samples before this time [s] are not used; None for a known delay.
     delay_from: float | None
     instruments: Instruments
-    #: Whether the noise is modelled too, so that the errors are weighed by it.
+    #: Whether the noise is modelled too, so that the errors are prewhitened.
     weighed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedAccuracy:
-    """What theory says of one estimator on one kind of data."""
+    """Theoretical accuracy of one estimator on one kind of data."""
 
     parameters: ParameterAccuracy
-    #: Whether it is the limit for long records.
+    #: Whether it is the asymptotic limit for long records.
     limit: bool
     #: How it was computed, in words.
     formula: str
@@ -105,8 +105,8 @@ def accuracy_of_long_records(
     controller: DiscreteController | None = None,
     enters: Enters = "controller",
 ) -> ExpectedAccuracy:
-    """Limit for long records, with white Gaussian noise of a deviation as the input, or as the reference of a loop."""
-    # A level relative to the output counts from its mean square; a loop has none.
+    """Return the limit for long records, with white Gaussian noise as the input, or as the reference of a loop."""
+    # A noise level relative to the output refers to its mean square; in a loop levels are absolute.
     power = [] if controller else [np.sqrt([output_variance(form.model, interval, deviation)])]
     parameters = limiting_accuracy(
         form.model,
@@ -138,12 +138,12 @@ def accuracy_of_records(
     noise: Noise,
     why_no_limit: str,
 ) -> ExpectedAccuracy:
-    """Accuracy on simulated records of a system, averaged over them."""
+    """Return the accuracy on simulated records of a system, averaged over them."""
     covariance = np.mean([_record_covariance(form, system, record, noise) for record in records], axis=0)
     if not np.isfinite(covariance).all():
         raise DataError("the data would not determine the parameters, even without noise")
     parameters = ParameterAccuracy.of(form.model, covariance, form.zeros, form.delay_from is not None)
-    # Instruments other than the input itself are not the best there are.
+    # Instruments other than the input are not optimal.
     best = form.instruments == "open_loop"
     start = f"{'the Cramér-Rao bound ' if best else ''}sigma^2 (psi' psi)^-1"
     if form.weighed and noise.coloured:
@@ -159,7 +159,7 @@ def accuracy_of_records(
 def _record_covariance(
     form: EstimatedForm, system: AdditiveModel | TransferFunction, record: Record, noise: Noise
 ) -> Array:
-    """Covariance of an estimate from one data set; NaN where it does not determine the parameters."""
+    """Return the covariance of an estimate from one data set; NaN if it does not determine the parameters."""
     signal = record.input
     if form.instruments == "closed_loop" and record.loop is not None and record.loop.controller is not None:
         loop, law, interval = record.loop, record.loop.controller, record.interval or 0.0
@@ -171,7 +171,7 @@ def _record_covariance(
     if form.weighed and noise.coloured:
         variance = noise.innovation_variance_of(record.noise_free)
         law = ArmaNoise(*noise.filter, innovation_variance=variance)
-        # psi' R^-1 psi is that of the innovations.
+        # psi' R^-1 psi is the product of the whitened sensitivities.
         white = SampledNoise(law, steps_of(np.ones(len(psi), dtype=bool))).whitened(psi)
         return finite_record_covariance(white, variance)
     lags = np.arange(psi.shape[0] if noise.coloured else 1)
@@ -184,11 +184,11 @@ def _psi_in_words(form: EstimatedForm, loop: object | None) -> str:
 
 
 def finite_record_covariance(psi: Array, autocovariances: ArrayLike) -> Array:
-    r"""Covariance of an unweighted output-error estimate from one record with noise of known autocovariances.
+    r"""Return the covariance of an unweighted output-error estimate with noise of known autocovariances.
 
     With ``M = psi' psi`` and the covariance matrix R of the noise, ``M^-1 psi' R psi M^-1``, to first order in the
-    noise: ``sigma^2 M^-1`` for white noise. Unlike the limit of long records it knows the start from rest, which counts
-    as long as the memory of the system or of its loop is not short against the record.
+    noise: ``sigma^2 M^-1`` for white noise. Unlike the limit for long records it includes the start from rest, which
+    matters unless the memory of the system or of its loop is short compared with the record.
     """
     from scipy.linalg import matmul_toeplitz
 
@@ -212,7 +212,7 @@ def cramer_rao_bound(
     start: float = 0.0,
     estimate_delay: bool = True,
 ) -> Array:
-    """Cramér-Rao bound for white Gaussian output noise.
+    """Return the Cramér-Rao bound for white Gaussian output noise.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def cramer_rao_bound(
     start : float, default 0.0
         Samples earlier than this after the first input break [s] are not used.
     estimate_delay : bool, default True
-        Whether the delay is unknown too.
+        Whether the delay is estimated too.
 
     Returns
     -------
@@ -242,15 +242,15 @@ def cramer_rao_bound(
     return finite_record_covariance(psi[used], noise_standard_deviation**2)
 
 
-#: What the estimator's instruments are made from: the input, or the noise-free input of the loop.
+#: Source of the estimator's instruments: the measured input, or the noise-free input of the loop.
 Instruments = Literal["open_loop", "closed_loop"]
-#: A controller that does nothing.
+#: Zero controller.
 OPEN = DiscreteController([0.0], [1.0])
-#: Amplitude at which the response to a pulse counts as died away: its square is below rounding.
+#: Amplitude at which a pulse response counts as zero: its square is below rounding.
 FORGOTTEN = 1e-12
-#: Longest response to a pulse that is summed [samples], and the least magnitude of a pole that its length allows for.
+#: Greatest length of a pulse response [samples], and least magnitude of the slowest pole used to compute its length.
 LONGEST_MEMORY, DEADBEAT = 1_000_000, 0.1
-#: Noise that is white: its filter has the numerator and the denominator 1.
+#: Filter of white noise: numerator and denominator are 1.
 WHITE: tuple[Sequence[float], Sequence[float]] = ((1.0,), (1.0,))
 
 
@@ -267,7 +267,7 @@ def limiting_accuracy(
     instruments: Instruments = "closed_loop",
     zeros: int | None = None,
 ) -> ParameterAccuracy:
-    r"""Accuracy for white noise held between the samples as the input, or as the reference of a closed loop.
+    r"""Return the asymptotic accuracy for held white noise as the input, or as the reference of a closed loop.
 
     With the sensitivities ``psi = dx/d theta`` and ``M = E psi psi'`` the estimates of SRIVC and of its additive form
     approach [1]_
@@ -275,23 +275,23 @@ def limiting_accuracy(
     .. math:: \operatorname{cov} \sqrt N\,\hat\theta = M^{-1} \Sigma M^{-1}, \qquad
               \Sigma = \sum_\tau R_v(\tau)\, E\,\psi(t+\tau)\psi(t)' = \sigma_e^2 \operatorname{cov} H(q)\psi,
 
-    which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances are sums over the exact responses
-    to one pulse, which solve the discrete Lyapunov equations of the sampled system.
+    which for white noise is ``sigma^2 M^-1``, the Cramér-Rao bound. Both covariances are sums over exact pulse
+    responses, which solve the discrete Lyapunov equations of the sampled system.
 
-    In a closed loop psi are driven by its noise-free input, ``S r``. With the input itself, ``u = S (r - v)`` for a
-    reference that enters at the controller, and white noise, psi has the part of the noise too: feedback then is a
-    second reference, and the variances are somewhat smaller [1]_. That needs a sample of delay around the loop.
+    In a closed loop psi are driven by its noise-free input, ``S r``. With the measured input, ``u = S (r - v)`` for a
+    reference that enters at the controller, and white noise, psi also depends on the noise, which acts as a second
+    reference, and the variances are somewhat smaller [1]_. This requires a delay of one sample in the loop.
     """
     from scipy.signal import lfilter  # slow to import
 
-    # Without a controller what drives the loop is the input, and no noise comes back.
+    # Without a controller the driving signal is the input, and there is no feedback of noise.
     if controller is None:
         controller, enters = OPEN, "input"
     count = _memory(model, interval, controller, noise_filter)
     pulse, times = np.zeros(count), np.asarray(interval * np.arange(count), dtype=float)
     pulse[0] = 1.0
     inputs: list[Array] = [standard_deviation * simulate_loop(model, controller, pulse, 0.0, interval, enters).u]
-    # What drives the instruments besides the reference: the noise, where they come from the input itself.
+    # Instruments from the measured input are also driven by the noise.
     if instruments == "open_loop":
         gain = float(np.ravel(noise_filter[0])[0] / np.ravel(noise_filter[1])[0])
         noise = math.sqrt(innovation_variance) * gain * pulse
@@ -299,8 +299,8 @@ def limiting_accuracy(
     responses = [sensitivities(model, HeldSignal(times, u), times, zeros) for u in inputs]
     found = unit_inverse(_moments(responses))
     if found is None:
-        wrong = "the parameters are not determined, even by endless data"
-        raise DataError(f"{wrong}: some have no effect of their own, as where a pole cancels a zero or a gain is zero")
+        wrong = "the parameters are not identifiable"
+        raise DataError(f"{wrong}: some have no separate effect, as when a pole cancels a zero or a gain is zero")
     inverse, scale = found
     filtered = [lfilter(*noise_filter, psi * scale, axis=0) for psi in responses]
     covariance = sandwich(inverse, scale, innovation_variance * _moments(filtered), samples)
@@ -313,16 +313,16 @@ def require_uncorrelated_input(
     controller: DiscreteController,
     noise_filter: tuple[ArrayLike, ArrayLike],
 ) -> None:
-    """Refuse instruments made from the input of a loop if they are correlated with the noise at the same sample."""
+    """Raise an error if instruments from the input of a loop are correlated with the noise at the same sample."""
     why = "the noise is coloured" if any(np.size(part) > 1 for part in noise_filter) else ""
     if not why and sampled_model(model, interval).state_space()[3].any() and controller.direct != 0.0:
-        why = "model and controller both react at once"
+        why = "model and controller both have direct feedthrough"
     if why:
         raise BiasedError(f"{why}, so that the input is correlated with the noise (closed_loop instruments are not)")
 
 
 def output_variance(model: AdditiveModel | TransferFunction, interval: float, input_deviation: float) -> float:
-    """Variance of the noise-free output of a stable model, for white noise held between the samples as the input."""
+    """Return the variance of the noise-free output of a stable model for held white noise as the input."""
     pulse = np.zeros(_memory(model, interval, OPEN, WHITE))
     pulse[0] = input_deviation
     x = simulate_loop(model, OPEN, pulse, 0.0, interval, "input").x
@@ -335,8 +335,8 @@ def _memory(
     controller: DiscreteController,
     noise_filter: tuple[ArrayLike, ArrayLike],
 ) -> int:
-    """Samples after which the responses to one pulse have died away."""
-    # Integrators of a submodel are in the loop only, the poles that its sensitivities repeat outside of it too.
+    """Return the number of samples after which pulse responses have decayed."""
+    # Integrators of a submodel are inside the loop only; its other poles also occur in sensitivities outside the loop.
     denominators = [s.denominator for s in model.submodels] if isinstance(model, AdditiveModel) else [model.denominator]
     own = np.exp(interval * np.concatenate([np.roots(part) for part in denominators]).real).max(initial=0.0)
     radius = max(loop_radius(model, controller, interval), float(own))
@@ -346,10 +346,10 @@ def _memory(
     slowest = max(radius, float(np.abs(np.roots(np.ravel(noise_filter[1]))).max(initial=0.0)), DEADBEAT)
     count = math.ceil(math.log(FORGOTTEN) / math.log(slowest) + model.delay / interval) + controller.order
     if count > LONGEST_MEMORY:
-        raise DataError(f"the system forgets too slowly for a limit of long records: it takes {count} samples")
+        raise DataError(f"the system is too slow for the limit of long records: its memory is {count} samples")
     return count
 
 
 def _moments(responses: Sequence[Array]) -> Array:
-    """Covariance of outputs driven by independent white noises, from the responses to one pulse of each."""
+    """Return the covariance of outputs driven by independent white noises, from the pulse responses to each."""
     return np.asarray(np.sum([response.T @ response for response in responses], axis=0))

@@ -1,4 +1,4 @@
-"""Covariance of output-error estimates in white and in coloured noise, and what an ill-conditioned one means."""
+"""Covariance of output-error estimates in white and in coloured noise, and warnings about ill-conditioning."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,15 +9,15 @@ from ctid_cli.arrays import Array
 from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model, fit_residual_noise
 from ctid_cli.text import listed
 
-#: Beyond this condition number the inverse holds no correct digit: NaN says so, a tidy number would not.
+#: Beyond this condition number the inverse has no correct digit and is replaced by NaN.
 LARGEST_CONDITION = 1e14
 
 
 def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> Array:
-    r"""Covariance ``s^2 (sum psi psi')^-1`` with ``s^2 = sum eps^2 / (N - p)``.
+    r"""Return the covariance ``s^2 (sum psi psi')^-1`` with ``s^2 = sum eps^2 / (N - p)``.
 
     Valid for a converged estimate of a model that contains the system, and white output noise. Refined instrumental
-    variables then are as good as maximum likelihood, so this is also the Cramér-Rao bound with the estimated variance.
+    variables are then asymptotically efficient, so this is also the Cramér-Rao bound with the estimated variance.
     """
     size = hessian.shape[0]
     found = unit_inverse(hessian) if count > size else None
@@ -29,13 +29,13 @@ def white_noise_covariance(hessian: Array, squared_error: float, count: int) -> 
 
 
 def sandwich(inverse: Array, scale: Array, middle: Array, left: float = 1.0) -> Array:
-    """``M^-1 Sigma M^-1`` over a divisor, from what `unit_inverse` makes of M and from Sigma in its units."""
+    """Return ``M^-1 Sigma M^-1`` over a divisor, from the result of `unit_inverse` for M and from scaled Sigma."""
     covariance: Array = inverse @ middle @ inverse * np.outer(scale, scale) / left
     return 0.5 * (covariance + covariance.T)
 
 
 def unit_inverse(hessian: Array) -> tuple[Array, Array] | None:
-    """Inverse of ``sum psi psi'`` with unit diagonal, and the scales of psi that make it so; None if singular."""
+    """Return the inverse of ``sum psi psi'`` scaled to unit diagonal, and the scales of psi; None if singular."""
     if not condition_number(hessian) <= LARGEST_CONDITION:
         return None
     scale = 1.0 / np.sqrt(np.diag(hessian))
@@ -43,7 +43,7 @@ def unit_inverse(hessian: Array) -> tuple[Array, Array] | None:
 
 
 def condition_number(hessian: Array) -> float:
-    """Condition number of ``sum psi psi'`` with unit diagonal, whatever the units of the parameters."""
+    """Return the condition number of ``sum psi psi'`` scaled to unit diagonal, independent of parameter units."""
     diagonal = np.diag(hessian)
     if not np.isfinite(hessian).all() or (diagonal <= 0).any():
         return float("inf")
@@ -52,19 +52,19 @@ def condition_number(hessian: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
 
-#: A clock of which 95 % of the intervals are this close to their median counts as regular for the noise.
+#: A clock counts as regular for the noise if 95 % of its intervals are within this fraction of their median.
 NEARLY_REGULAR = 0.05
 
 
 def nearly_regular(times: Array) -> bool:
-    """Whether lags counted in samples are lags in time, up to jitter."""
+    """Return whether lags in samples are lags in time, up to jitter."""
     intervals = np.diff(times)
     middle = float(np.median(intervals))
     return bool(np.mean(np.abs(intervals - middle) <= NEARLY_REGULAR * middle) >= 0.95)
 
 
 def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regular: bool) -> tuple[Array, NoiseModel]:
-    r"""Covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate under coloured noise, and that noise.
+    r"""Return the covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate, and the coloured noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'``,
 
@@ -75,16 +75,16 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
     experiments.
 
     *Regular clock*: ``R_v`` is that of this autoregression. White residuals give ``s^2 M^-1``. With missing samples
-    lags count the samples that are left: those of a stationary noise at random places, or around a few long gaps, are
-    nearly stationary again.
+    lags count the remaining samples: a stationary noise with samples missing at random, or with a few long gaps, is
+    still nearly stationary.
 
     *Irregular clock*: a heteroskedasticity and autocorrelation consistent Sigma of ``psi eps`` in the order of the
     samples: each column is whitened by an autoregression whose order Akaike's criterion chooses, and the covariance of
-    the whitened columns is divided by the autoregressions' gains, times ``N/(N - p)``. It does not ask the noise to be
-    stationary from sample to sample, at the price of precision: standard errors are more often too large than too
-    small, after steps by up to a half. The autoregression then only tells how much the samples are worth.
+    the whitened columns is divided by the autoregressions' gains, times ``N/(N - p)``. It does not require stationary
+    noise from sample to sample, but is less precise: standard errors are more often too large than too small, for step
+    inputs by up to a half. The autoregression of the noise then only determines the effective sample size.
 
-    With feedback from the output to the input the noise is not independent of psi, and neither form holds.
+    With feedback from the output to the input the noise is not independent of psi, and neither form is valid.
     """
     size, count = psi[0].shape[1], sum(block.size for block in residuals)
     found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
@@ -101,7 +101,7 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
 
 
 def _long_run_covariance(scores: Sequence[Array]) -> Array:
-    """Covariance of the sum of the rows of independent blocks, an autoregression for every column."""
+    """Return the covariance of the sum of the rows of independent blocks, by an autoregression for every column."""
     models = [fit_noise_model([block[:, j] for block in scores]) for j in range(scores[0].shape[1])]
     start = max(model.order for model in models)
     white = [np.column_stack([m.innovations(block[:, j]) for j, m in enumerate(models)])[start:] for block in scores]
@@ -115,7 +115,7 @@ def _long_run_covariance(scores: Sequence[Array]) -> Array:
 
 #: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.
 LARGE_STANDARD_ERROR = 10.0
-#: Beyond this (multiple) correlation, estimates are called hard to tell apart.
+#: Beyond this (multiple) correlation, estimates are reported as hardly distinguishable.
 CLOSE_TO_ONE = 0.999
 #: Beyond this condition number of the scaled matrix ``sum psi psi'`` half the digits are lost: nearly singular.
 NEARLY_SINGULAR = 1e8
@@ -124,12 +124,12 @@ NEARLY_SINGULAR = 1e8
 def describe_conditioning(
     covariance: Array, estimates: Array, names: Sequence[str], condition_number: float, hessian: Array
 ) -> list[str]:
-    """Sentences on parameters that the data do not determine, none if all is well.
+    """Return warnings about parameters that the data do not determine.
 
     Three rules. A standard error is not defined, or the condition number exceeds 1e8: the parameters with more than a
     tenth of the singular direction (unit diagonal) are named. A standard error exceeds ten times the magnitude of a
-    coefficient or of the delay; initial states and offsets may well be zero and are not looked at. Two estimates have
-    a correlation beyond 0.999, or one has such a multiple correlation with several others.
+    coefficient or of the delay; initial states and offsets may be zero and are not checked. Two estimates have a
+    correlation beyond 0.999, or one has such a multiple correlation with several others.
     """
     variances = np.diag(covariance)
     defined = bool(np.isfinite(covariance).all() and (variances > 0).all())
@@ -137,17 +137,17 @@ def describe_conditioning(
     singular = not condition_number <= NEARLY_SINGULAR
     if singular or not defined:
         group = [names[i] for i in _singular_direction(hessian)]
-        what = listed(group) if 0 < len(group) < len(names) else "all the parameters together"
+        what = listed(group) if 0 < len(group) < len(names) else "the parameters"
         number = f"condition number {condition_number:.1e}" if np.isfinite(condition_number) else "singular equations"
-        start = f"These data do not determine {what} one by one ({number})"
+        start = f"These data do not determine {what} separately ({number})"
         if len(group) == 1:
-            start = f"{what} has no effect that these data show ({number})"
+            start = f"{what} has no detectable effect in these data ({number})"
         end = "their standard errors are not reliable" if defined else "no standard errors can be given"
         sentences.append(f"{start}; {end}.")
     if defined:
         errors = np.sqrt(variances)
         sentences += _large_errors(estimates, errors, names)
-        # Of singular equations the correlations would say the same again.
+        # For singular equations the correlations would repeat the warning.
         sentences += [] if singular else _correlated(covariance / np.outer(errors, errors), names)
     return sentences
 
@@ -157,32 +157,32 @@ def _large_errors(theta: Array, errors: Array, names: Sequence[str]) -> Iterator
         if re.fullmatch(r"[ab]\d+|delay", name) and error > LARGE_STANDARD_ERROR * abs(value):
             times = f"{error / abs(value):.2g} times its value" if value else "its value being zero"
             start = f"{name} = {value:.3g} has a standard error of {error:.3g}, {times}"
-            yield f"{start}: these data do not determine it, not even its sign."
+            yield f"{start}: these data do not even determine its sign."
 
 
 def _correlated(correlation: Array, names: Sequence[str]) -> Iterator[str]:
-    def told(group: Sequence[int], how: str, combinations: str) -> str:
+    def warning(group: Sequence[int], how: str, combinations: str) -> str:
         several = [names[i] for i in group]
-        start = f"{listed(several)} can hardly be told apart by these data ({how}): only"
+        start = f"These data can hardly distinguish {listed(several)} ({how}): only"
         return f"{start} {combinations} well determined.{_of_delay(several)}"
 
     size = len(names)
     pairs = [(j, i) for i in range(size) for j in range(i) if abs(correlation[i, j]) > CLOSE_TO_ONE]
-    for alike in _connected(pairs):
-        if len(alike) == 2:
-            yield told(alike, f"correlation {correlation[tuple(alike)]:.5f}", "a combination of them is")
+    for correlated in _connected(pairs):
+        if len(correlated) == 2:
+            yield warning(correlated, f"correlation {correlation[tuple(correlated)]:.5f}", "a combination of them is")
         else:
-            yield told(alike, f"correlations above {CLOSE_TO_ONE}", "combinations of them are")
+            yield warning(correlated, f"correlations above {CLOSE_TO_ONE}", "combinations of them are")
     with np.errstate(invalid="ignore", divide="ignore"):
         multiple = np.sqrt(1.0 - 1.0 / np.diag(np.linalg.inv(correlation)))
     paired = {index for pair in pairs for index in pair}
     group = [i for i in range(size) if multiple[i] > CLOSE_TO_ONE and i not in paired]
     if len(group) > 1:
-        yield told(group, f"multiple correlations above {CLOSE_TO_ONE}", "combinations of them are")
+        yield warning(group, f"multiple correlations above {CLOSE_TO_ONE}", "combinations of them are")
 
 
 def _connected(pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Return groups of numbers, each joined by pairs."""
+    """Return the groups of numbers that are connected by pairs."""
     groups: list[set[int]] = []
     for pair in pairs:
         joined = set(pair).union(*(group for group in groups if group.intersection(pair)))
@@ -191,7 +191,7 @@ def _connected(pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
 
 
 def _singular_direction(hessian: Array) -> list[int]:
-    """Parameters with more than a tenth of the direction that changes the output least; none if unknown."""
+    """Return the parameters with more than a tenth of the singular direction; none if unknown."""
     diagonal = np.diag(hessian)
     if not np.isfinite(hessian).all():
         return []
@@ -203,7 +203,7 @@ def _singular_direction(hessian: Array) -> list[int]:
 
 
 def _of_delay(group: Sequence[str]) -> str:
-    """Return why a delay can hardly be told from coefficients."""
+    """Return why a delay can hardly be distinguished from coefficients."""
     if "delay" not in group or not any(re.fullmatch(r"b\d+", name) for name in group):
         return ""
     return " The input hardly shows when the response begins."

@@ -12,12 +12,12 @@ from ctid_cli.inference.residual_tests import orthonormal
 
 
 def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
-    """Fit of a simulated output: ``100 (1 - ||y - x|| / ||y - mean y||)``.
+    """Return the fit of a simulated output: ``100 (1 - ||y - x|| / ||y - mean y||)``.
 
     Parameters
     ----------
     y : array_like, shape (N,)
-        Measured output; NaN marks a missing sample and is left out.
+        Measured output; NaN marks a missing sample and is ignored.
     x : array_like, shape (N,)
         Simulated output.
 
@@ -35,12 +35,12 @@ def fit_percent(y: ArrayLike, x: ArrayLike) -> float:
 
 
 def percent_from_r_squared(r2: float) -> float:
-    """Fit that belongs to a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``."""
+    """Return the fit from a coefficient of determination: ``100 (1 - sqrt(1 - R^2))``."""
     return 100.0 * (1.0 - float(np.sqrt(max(1.0 - r2, 0.0))))
 
 
 def r_squared(y: ArrayLike, x: ArrayLike) -> float:
-    """Coefficient of determination of a simulated output: ``1 - ||y - x||^2 / ||y - mean y||^2``."""
+    """Return the coefficient of determination of a simulated output: ``1 - ||y - x||^2 / ||y - mean y||^2``."""
     measured = np.asarray(y, dtype=float)
     error = measured - np.asarray(x, dtype=float)
     valid = np.isfinite(measured)
@@ -50,7 +50,7 @@ def r_squared(y: ArrayLike, x: ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class InformationCriteria:
-    """Criteria of one fit; smaller is better, and only differences between fits to the same samples mean anything."""
+    """Criteria of one fit; smaller is better; only differences between fits to the same samples are meaningful."""
 
     #: Akaike's, the small-sample corrected, and the Bayesian criterion [-].
     aic: float
@@ -63,7 +63,7 @@ class InformationCriteria:
 
 
 def information_criteria(squared_error: float, count: int, parameters: int) -> InformationCriteria:
-    r"""AIC, AICc, BIC and FPE of an output-error model with white Gaussian noise.
+    r"""Return AIC, AICc, BIC and FPE of an output-error model with white Gaussian noise.
 
     With ``V = squared_error / N``:
 
@@ -73,11 +73,11 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
         BIC &= N \ln V + p \ln N, \\
         FPE &= V \frac{N + p}{N - p}.
 
-    Constants common to all models are left out: ``N (ln 2 pi + 1)``, and what counting the noise variance as one more
-    parameter would add. The correction of AICc does count it, because it is derived for an unknown variance. MATLAB's
-    ``aic`` adds ``N (ln 2 pi + 1)`` and corrects with p in the place of ``p + 1``.
+    Constants common to all models are omitted: ``N (ln 2 pi + 1)``, and the term of the noise variance as a parameter.
+    The correction of AICc counts that parameter, because it is derived for an unknown variance. MATLAB's ``aic`` adds
+    ``N (ln 2 pi + 1)`` and corrects with p instead of ``p + 1``.
 
-    The criteria take residuals as independent: with coloured residuals all of them favour too many parameters.
+    The criteria assume independent residuals: with coloured residuals all of them favour too many parameters.
     """
     undefined = float("nan")
     variance = squared_error / count
@@ -91,17 +91,17 @@ def information_criteria(squared_error: float, count: int, parameters: int) -> I
 
 
 def r_t_squared(residuals: Array, output: Array) -> float:
-    """``R_T^2 = 1 - s_e^2 / s_y^2``, the coefficient of determination of the simulated output by variances.
+    """Return ``R_T^2 = 1 - s_e^2 / s_y^2``, the coefficient of determination from variances.
 
-    Both variances are taken about the means, as in CONTSID and CAPTAIN: unlike :func:`r_squared`, it does not see a
-    constant error.
+    Both variances are about the means, as in CONTSID and CAPTAIN: unlike :func:`r_squared`, it ignores a constant
+    error.
     """
     output_variance = float(np.var(output))
     return 1.0 - float(np.var(residuals)) / output_variance if output_variance > 0 else float("nan")
 
 
 def young_information_criterion(residuals: Array, output: Array, estimates: Array, covariance: Array) -> float:
-    r"""Young's criterion: fit and relative parameter errors in one number; the more negative the better.
+    r"""Return Young's criterion, which combines fit and relative parameter errors; the more negative the better.
 
     .. math:: YIC = \ln \frac{s_e^2}{s_y^2} + \ln NEVN, \qquad NEVN = \frac{1}{p} \sum_i \frac{s^2 p_{ii}}{\theta_i^2},
 
@@ -115,24 +115,24 @@ def young_information_criterion(residuals: Array, output: Array, estimates: Arra
         return float(np.log(np.var(residuals) / output_variance) + np.log(normalised))
 
 
-#: Directions of the sensitivities with less than this share of the greatest singular value are none.
+#: Directions of the sensitivities with less than this share of the greatest singular value are ignored.
 RANK = 1e-9
-#: Parts of each record that are left out in turn.
+#: Number of blocks of each record for cross-validation.
 BLOCKS = 10
-#: A block that gives a larger share of what is known of a direction has it for itself.
-OWN = 0.9
+#: Largest share of the information on a direction that may come from the omitted block.
+LARGEST_SHARE = 0.9
 
 
 def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise: NoiseModel) -> float:
-    r"""V of a fit; the first samples of each record, without those before them, are left out.
+    r"""Return the sum of squared innovations V of a fit, without the first samples of each record.
 
-    Criteria that count parameters take residuals as independent. Coloured noise is made white first, by one
-    autoregressive model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the
-    residuals and sensitivities of a fit,
+    Information criteria assume independent residuals. Coloured noise is therefore prewhitened by one autoregressive
+    model for all fits, so that their criteria remain comparable: with c(q) that model and e, psi the residuals and
+    sensitivities of a fit,
 
     .. math:: V = \min_x \| c(q) (e - \psi x) \|^2
 
-    is the squared innovation of the fit by generalised least squares, one Gauss-Newton step from that by least squares.
+    is that of the fit by generalised least squares, one Gauss-Newton step from the least-squares fit.
     """
     order = noise.order
     errors = np.concatenate([noise.innovations(e)[order:] for e in residuals])
@@ -145,15 +145,15 @@ def squared_innovations(residuals: Sequence[Array], psi: Sequence[Array], noise:
 
 
 def innovations_count(residuals: Sequence[Array], noise: NoiseModel) -> int:
-    """Number of samples in V."""
+    """Return the number of samples in V."""
     return sum(max(e.size - noise.order, 0) for e in residuals)
 
 
 def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> tuple[Array, ...]:
-    """Output errors of each tenth of each record with the parameters of the fit to all the rest, linearised.
+    """Return the output errors of each block of each record for the linearised fit to all other blocks.
 
     Without block B, ``e_B + Q_B (I - Q_B'Q_B)^-1 Q_B' e_B``, Q an orthonormal basis of the sensitivities. Directions
-    that hardly anything but the block itself determines, such as the state before it, are taken from it.
+    determined almost only by the block, such as the state before it, keep their estimate.
     """
     stacked = np.concatenate(psi)
     basis = stacked @ orthonormal(stacked, RANK)
@@ -162,8 +162,9 @@ def cross_validated_errors(residuals: Sequence[Array], psi: Sequence[Array]) -> 
     for e, q in zip(residuals, np.split(basis, splits), strict=True):
         parts = []
         for rows in np.array_split(np.arange(e.size), BLOCKS):
-            own, directions = np.linalg.eigh(q[rows].T @ q[rows])
-            told = q[rows] @ directions[:, own < OWN]
-            parts.append(e[rows] + told @ ((told.T @ e[rows]) / (1.0 - own[own < OWN])))
+            shares, directions = np.linalg.eigh(q[rows].T @ q[rows])
+            kept = shares < LARGEST_SHARE
+            along = q[rows] @ directions[:, kept]
+            parts.append(e[rows] + along @ ((along.T @ e[rows]) / (1.0 - shares[kept])))
         found.append(np.concatenate(parts))
     return tuple(found)

@@ -14,15 +14,15 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
-HELD = "It is held at a bound: one that was given, or of the admissible models, where the record does not determine it."
-#: A quantity that changes by less than this fraction where a free pole changes by its own size is held [-].
+HELD = "It is at a bound: a given one, or one of the admissible models, because the record does not determine it."
+#: A quantity counts as fixed if it changes by less than this fraction for a relative change of 1 of a free pole [-].
 UNMOVED = 1e-6
 #: Standard errors to each side of a quantity with a given gradient by the leading parameters.
 Quantile = Callable[[Array], float]
 
 
 def normal_interval(gradient: Array) -> float:
-    """The same for every quantity: that of the normal distribution, 95 %."""
+    """Return the 95 % quantile of the normal distribution for any quantity."""
     return normal_quantile()
 
 
@@ -32,17 +32,17 @@ def derived_parameters(
     quantile: Quantile = normal_interval,
     tangent: Array | None = None,
 ) -> tuple[UncertainValue, ...]:
-    r"""What users read off a model, or the submodels of a sum, with standard errors by the delta method.
+    r"""Return poles, time constants, frequencies, damping and gain of a model or of submodels, by the delta method.
 
     ``var g = (dg/dtheta) C (dg/dtheta)'`` with analytic derivatives, those of the poles from :func:`pole_jacobian`, and
     ``g +- z se``. The linearisation only holds where a pole moves little compared with its distance to the others. A
     pole whose ``z`` standard errors, ``sqrt(var Re p + var Im p)``, reach another pole is called undetermined: its
     accuracy is NaN and the reason is given. Natural frequency and damping of a pair only need it to be far
-    from the *other* poles: they are regular where the pair meets on the real axis. What does not change along the
-    tangent, the directions in which the coefficients were free, is held and has no standard error.
+    from the *other* poles: they are regular where the pair meets on the real axis. Quantities that are constant along
+    the tangent, the directions in which the coefficients were free, are fixed and have no standard error.
 
-    Each quantity depends on the parameters of its own submodel alone, so a pole is undetermined only where it cannot
-    be told from another one of the same submodel.
+    Each quantity depends on the parameters of its submodel only, so a pole is undetermined only if it cannot be
+    distinguished from another one of the same submodel.
     """
     found: list[UncertainValue] = []
     first, additive = 0, isinstance(model, AdditiveModel)
@@ -53,13 +53,13 @@ def derived_parameters(
         poles, jacobian = part.pole_slopes()
         rows.add_poles(poles, jacobian, number_lone=not additive)
         if additive and poles.size == 2 and a[0] > 0 and not poles.imag.any():
-            # Of two real poles, however close: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
+            # Two real poles, also close ones: natural frequency a_2^(-1/2) and damping a_1 a_2^(-1/2) / 2.
             frequency, slope = a[0] ** -0.5, -0.5 * a[0] ** -1.5
             turning = 0.5 * np.array([frequency, a[1] * slope])
             rows.add_mode("", frequency, np.array([0.0, slope]), 0.5 * a[1] * frequency, turning)
         integrates = part.integrators > 0 or last == 0
         gain = math.inf if integrates else float(part.numerator[-1] / last)
-        # Only the coefficients of p^0 count: of B, and of A where it has a free one.
+        # Only the coefficients of p^0 matter: of B, and of A if it is free.
         slopes = [-gain if power == 0 else 0.0 for power in part.a_powers]
         slopes += [float(power == 0) for power in part.b_powers]
         which = "This submodel integrates" if additive else "The model integrates (a pole at the origin)"
@@ -77,7 +77,7 @@ class _Rows:
     covariance: Array
     quantile: Quantile
     tangent: Array | None = None
-    #: Place of the first parameter that the gradients are for, and what the names of the quantities begin with.
+    #: Index of the first parameter of the gradients, and prefix of the names of the quantities.
     first: int = 0
     prefix: str = ""
     found: list[UncertainValue] = field(default_factory=list)
@@ -95,32 +95,32 @@ class _Rows:
         self.found.append(UncertainValue.symmetric(self.prefix + name, estimate, error, unit, reach, reason))
 
     def _own(self, size: int) -> Array:
-        """Covariance of the parameters that a gradient is for."""
+        """Return the covariance of the parameters of a gradient."""
         own = slice(self.first, self.first + size)
         return self.covariance[own, own]
 
     def _reach(self, gradient: Array) -> float:
-        """Standard errors to each side of a quantity."""
+        """Return the half-width of the interval of a quantity in standard errors."""
         return self.quantile(np.concatenate((np.zeros(self.first), gradient)))
 
     def add_mode(
         self, label: str, frequency: float, radial: Array, damping: float, turning: Array, reason: str = ""
     ) -> None:
-        """Natural frequency, in rad/s and Hz, and damping of two poles."""
+        """Add natural frequency, in rad/s and Hz, and damping of two poles."""
         hertz = frequency / (2 * np.pi), radial / (2 * np.pi)
         self.add(f"natural_frequency{label}", frequency, radial, "rad/s", reason)
         self.add(f"natural_frequency{label}_hz", *hertz, "Hz", reason)
         self.add(f"damping{label}", damping, turning, "-", reason)
 
     def add_poles(self, poles: ComplexArray, jacobian: ComplexArray, *, number_lone: bool = True) -> None:
-        """Poles, time constants, natural frequencies and damping, for whatever parameters the poles depend on."""
+        """Add poles, time constants, natural frequencies and damping."""
         upper = [k for k, pole in enumerate(poles) if pole.imag >= 0]
         for number, k in enumerate(upper, 1):
             label = f"_{number}" if number_lone or len(upper) > 1 else ""
             pole, slope = poles[k], jacobian[k]
             x, y = float(pole.real), float(pole.imag)
-            everyone_else = np.arange(poles.size) != k
-            reason = self._undetermined(poles, k, slope, everyone_else)
+            others = np.arange(poles.size) != k
+            reason = self._undetermined(poles, k, slope, others)
             if pole.imag == 0:
                 self.add(f"pole{label}", x, slope.real, "rad/s", reason)
                 if x == 0:
@@ -135,20 +135,20 @@ class _Rows:
             # d(x^2 + y^2) = 2 Re(conj(p) dp)
             radial = (x * slope.real + y * slope.imag) / frequency
             turning = y * (x * slope.imag - y * slope.real) / frequency**3
-            reason = self._undetermined(poles, k, slope, everyone_else & (poles != np.conj(pole)))
+            reason = self._undetermined(poles, k, slope, others & (poles != np.conj(pole)))
             self.add_mode(label, frequency, radial, -x / frequency, turning, reason)
 
     def _undetermined(self, poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray) -> str:
-        """Reason for which pole k has no standard error, or nothing."""
+        """Return the reason why pole k has no standard error, or an empty string."""
         if indistinct(poles, k, slope, others, self._own(slope.size), self._reach):
-            return "This pole has no standard error: so far as these data determine it, it may be another pole too."
+            return "This pole has no standard error: these data cannot distinguish it from another pole."
         return ""
 
 
 def indistinct(
     poles: ComplexArray, k: int, slope: ComplexArray, others: BoolArray, covariance: Array, quantile: Quantile
 ) -> bool:
-    """Whether the interval of pole k, whose derivatives are given, reaches one of the others."""
+    """Return whether the interval of pole k, with the given derivatives, reaches another pole."""
     if not others.any():
         return False
     distance = float(np.abs(poles[others] - poles[k]).min())
@@ -160,7 +160,7 @@ def indistinct(
 
 
 def modes_of(poles: ComplexArray) -> list[tuple[float, float | None]]:
-    """Return natural frequency [1/time unit] and damping of each real pole and each pair; no damping of an integrator.
+    """Return natural frequency [1/time unit] and damping of each real pole and pair; an integrator has no damping.
 
     The frequency ``|p|/(2 pi)`` is in hertz where poles are in rad/s; the damping is ``-Re p/|p|``.
     """

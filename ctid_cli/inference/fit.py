@@ -32,17 +32,17 @@ class Status(Enum):
         "below what rounding allows."
     )
     AT_BOUND = (
-        "The least cost is at the border of the admissible models: a pole is as fast, as slow or as "
-        "little damped as may be, or a parameter at a bound that was given."
+        "The least cost is at the bound of the admissible models: a pole has its largest or smallest allowed "
+        "speed, or its smallest allowed damping; or a parameter is at a given bound."
     )
     RIDGE = (
-        "The cost is least and hardly changes along a line as far as models are admissible: the data do "
-        "not determine all parameters."
+        "The cost is minimal and nearly constant along a line up to the bound of the admissible models: the data "
+        "do not determine all parameters."
     )
     DELAY_AT_BOUND = "The delay stopped at one of its bounds."
     LOCAL = "A local minimum: at another delay within the bounds the cost is lower; start there, or use delay_profile."
     REFLECTED = (
-        "The last step led to an unstable model, whose poles were mirrored: this is no minimum of the "
+        "The last step led to an unstable model, whose poles were reflected: this is not a minimum of the "
         "cost; use fewer poles or another start, or closed-loop instruments for an unstable plant in a loop."
     )
     SINGULAR = (
@@ -53,21 +53,21 @@ class Status(Enum):
 
     @property
     def succeeded(self) -> bool:
-        """Whether the estimate may be used as it stands."""
+        """Whether the estimate may be used."""
         return self in (Status.CONVERGED, Status.AT_BOUND, Status.RIDGE, Status.LEAST_SQUARES)
 
 
 class DeferredFields:
-    """A result whose numbers for single samples may be left out until they are used.
+    """A result whose per-sample fields are computed on first use.
 
-    A loaded result has a model and its covariance without its records; residuals need these. The fields that
-    ``deferred`` names must have no default but a factory, so that the class has no such attributes.
+    A loaded result has a model and its covariance without its records, which residuals need. The fields in ``deferred``
+    must have no default value (a factory is allowed), so that the class has no such attributes.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ()
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
-        """Forget the fields of ``deferred``; the first of them that is asked for fills them all."""
+        """Delete the fields in ``deferred``; the first access to one of them fills them all."""
         for name in self.deferred:
             self.__dict__.pop(name, None)
         self.__dict__["_fill"] = fill
@@ -99,7 +99,7 @@ class IterationRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(FittedModel, Shown):
-    """An estimated model, its accuracy, and how it was reached.
+    """An estimated model, its accuracy, and the iterations.
 
     Parameters
     ----------
@@ -126,10 +126,9 @@ class Fit(FittedModel, Shown):
     history : sequence of IterationRecord
         The accepted iterations.
     law : Uncertainty, optional
-        What the covariance is from, and how many standard errors intervals reach; None where that is not known, and
-        intervals are then those of the normal distribution.
+        Distribution of the estimates: covariance formula and quantiles; None for the normal distribution.
     in_ignored_loop : bool, default False
-        Whether the input responds to the output through a loop of which the estimator knows nothing.
+        Whether the input responds to the output through a loop that the estimator ignores.
     """
 
     model: TransferFunction
@@ -168,16 +167,16 @@ class Fit(FittedModel, Shown):
 
     @property
     def quantiles(self) -> dict[str, float]:
-        """Standard errors to each side of the 95 % intervals of the parameters, by name [-]."""
+        """Half-widths of the 95 % intervals of the parameters in standard errors, by name [-]."""
         law = self.law or Uncertainty.known(self.covariance)
         return dict(zip(self.parameter_names, law.quantiles().tolist(), strict=True))
 
     @property
     def parametrised(self) -> TransferFunction | AdditiveModel:
-        """The model in the form that has the parameters."""
+        """The model in the estimated parametrisation."""
         return self.model
 
     def _estimated(self) -> Estimated:
-        """The model with the joint law of its parameters."""
+        """Return the model with the joint distribution of its parameters."""
         law = self.law or Uncertainty.known(self.covariance)
         return Estimated(Parametric(self.parametrised, self.parameter_names), law)

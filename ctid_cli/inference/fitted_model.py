@@ -1,4 +1,4 @@
-"""An estimated model as a model that one can use: responses with bands, poles, and export to other tools."""
+"""Use of an estimated model: responses with confidence bands, poles, and export to other tools."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.model_responses import Bands, Estimated, FrequencyBand, PoleBand, ResponseBand, instants
 from ctid_cli.signals.held import HeldSignal
 
-#: A step of size one at time zero.
+#: Unit step at time zero.
 STEP = HeldSignal(np.zeros(1), np.ones(1))
-#: What MATLAB calls units of time, by the labels that files use.
+#: MATLAB's names of units of time, by the labels in files.
 MATLAB_UNITS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), "seconds"),
     **dict.fromkeys(("ms", "millisecond", "milliseconds"), "milliseconds"),
@@ -27,9 +27,9 @@ MATLAB_UNITS = {
     **dict.fromkeys(("h", "hr", "hour", "hours"), "hours"),
     **dict.fromkeys(("d", "day", "days"), "days"),
 }
-#: How the delay is called in each kind of object.
+#: Name of the delay property of each kind of object.
 DELAYS = {"idtf": "IODelay", "tf": "InputDelay"}
-#: Module of each library, and the name it is imported by.
+#: Module of each library, and its alias.
 LIBRARIES: dict[str, tuple[str, str | None]] = {"control": ("control", None), "scipy": ("scipy.signal", "signal")}
 
 
@@ -42,24 +42,24 @@ class SystemWithDelay(NamedTuple):
 
 
 class FittedModel(ABC):
-    r"""An estimated model as a model that one can use.
+    r"""Responses, poles and exports of an estimated model.
 
     Bands are pointwise. ``linearised``, the default, has the standard errors of
 
     .. math:: \operatorname{var} g = \frac{\partial g}{\partial\theta} C \frac{\partial g}{\partial\theta}^{\!\top}
 
-    with the joint covariance C of all parameters that the fit reports, the delay's among them, for white or coloured
-    noise, and exact derivatives; intervals reach as many standard errors as those of the parameters do. ``sampled``
-    draws 1000 sets of parameters with that covariance and takes quantiles of what these models give: slower, and
-    right where a quantity is not linear over a standard error, as a step response is not about an uncertain delay.
-    Parameters that were given or lie at a bound are taken as known. Without a covariance all bands are NaN.
+    with the joint covariance C of all reported parameters, including the delay, for white or coloured noise, and exact
+    derivatives; half-widths in standard errors are those of the parameters. ``sampled`` draws 1000 sets of parameters
+    with that covariance and takes quantiles of the responses: slower, but correct for quantities that are not linear
+    over a standard error, such as a step response with an uncertain delay. Parameters that were given or lie at a bound
+    count as known. Without a covariance all bands are NaN.
 
-    Times are in the unit of time of the record that the model is from, frequencies in radians over it.
+    Times are in the unit of time of the record, frequencies in radians per that unit.
     """
 
     @abstractmethod
     def _estimated(self) -> Estimated:
-        """The model and the joint law of its parameters."""
+        """Return the model and the joint distribution of its parameters."""
 
     def simulate(
         self,
@@ -69,7 +69,7 @@ class FittedModel(ABC):
         level: float = 0.95,
         bands: Bands = "linearised",
     ) -> ResponseBand:
-        """Output for another input, from rest.
+        """Return the output for another input, from rest.
 
         Parameters
         ----------
@@ -85,8 +85,7 @@ class FittedModel(ABC):
         Returns
         -------
         ResponseBand
-            The noise-free output; a measured one lies around it by its noise. Initial states and offsets that were
-            estimated belong to their own record and are not part of it.
+            The noise-free output. Estimated initial states and offsets belong to their record and are not included.
 
         Raises
         ------
@@ -106,7 +105,7 @@ class FittedModel(ABC):
     def step_response(
         self, times: ArrayLike | None = None, *, level: float = 0.95, bands: Bands = "linearised"
     ) -> ResponseBand:
-        """Output for a step of size one at time zero, from rest.
+        """Return the output for a unit step at time zero, from rest.
 
         Parameters
         ----------
@@ -135,7 +134,7 @@ class FittedModel(ABC):
     def impulse_response(
         self, times: ArrayLike | None = None, *, level: float = 0.95, bands: Bands = "linearised"
     ) -> ResponseBand:
-        """Derivative of the step response.
+        """Return the derivative of the step response.
 
         Parameters
         ----------
@@ -164,7 +163,7 @@ class FittedModel(ABC):
     def frequency_response(
         self, frequencies: ArrayLike | None = None, *, level: float = 0.95, bands: Bands = "linearised"
     ) -> FrequencyBand:
-        r"""Gain and phase over frequency, delay included.
+        r"""Return gain and phase over frequency, delay included.
 
         Parameters
         ----------
@@ -195,7 +194,7 @@ class FittedModel(ABC):
         return self._estimated().over_frequency(frequencies, level, bands)
 
     def poles(self, *, level: float = 0.95) -> PoleBand:
-        """Poles with their uncertainty.
+        """Return the poles with their uncertainty.
 
         Parameters
         ----------
@@ -205,8 +204,8 @@ class FittedModel(ABC):
         Returns
         -------
         PoleBand
-            Poles with the covariance of their real and imaginary parts, by the delta method; NaN where the interval of
-            one reaches another. Of a sum of submodels in the order of the submodels.
+            Poles with the covariance of their real and imaginary parts, by the delta method; NaN if the interval of a
+            pole reaches another. The poles of a sum are in the order of the submodels.
 
         Raises
         ------
@@ -216,18 +215,18 @@ class FittedModel(ABC):
         return self._estimated().poles(level)
 
     def to_control(self, pade: int | None = None) -> SystemWithDelay:
-        """The model for python-control.
+        """Return the model for python-control.
 
         Parameters
         ----------
         pade : int, optional
-            Order of a Padé approximation of the delay, which then is part of the system; by default it is kept apart,
-            because python-control knows no delays in continuous time.
+            Order of a Padé approximation of the delay, which then is part of the system; by default the delay is
+            separate, because python-control has no delays in continuous time.
 
         Returns
         -------
         SystemWithDelay
-            ``system``, a ``control.TransferFunction``, and the ``delay`` that it does not have [s].
+            ``system``, a ``control.TransferFunction``, and the separate ``delay`` [s].
 
         Raises
         ------
@@ -246,12 +245,12 @@ class FittedModel(ABC):
         return SystemWithDelay(system * control.TransferFunction(*control.pade(model.delay, pade)), 0.0)
 
     def to_scipy(self) -> SystemWithDelay:
-        """The model for SciPy.
+        """Return the model for SciPy.
 
         Returns
         -------
         SystemWithDelay
-            ``system``, a ``scipy.signal.TransferFunction``, and the ``delay`` that it does not have [s].
+            ``system``, a ``scipy.signal.TransferFunction``, and the separate ``delay`` [s].
         """
         from scipy.signal import TransferFunction as ScipyTransferFunction  # slow to import
 
@@ -259,33 +258,32 @@ class FittedModel(ABC):
         return SystemWithDelay(ScipyTransferFunction(model.numerator, model.denominator), model.delay)
 
     def to_matlab(self, name: str = "G", kind: Literal["idtf", "tf"] = "idtf", time_unit: str = "s") -> str:
-        """MATLAB code that builds the model.
+        """Return MATLAB code that builds the model.
 
         Parameters
         ----------
         name : str, default "G"
-            Variable that gets the model.
+            Name of the variable.
         kind : {"idtf", "tf"}, default "idtf"
             For the System Identification Toolbox, with the delay as ``IODelay``, or for the Control System Toolbox,
             with the delay as ``InputDelay``.
         time_unit : str, default "s"
-            Unit of time of the record: the model's rates and delay are in it.
+            Unit of time of the record and of the model.
 
         Returns
         -------
         str
-            Lines of code. All digits are there: the numbers read back are the same. The covariance of the parameters
-            follows as a comment.
+            Lines of code with all digits. The covariance of the parameters follows as a comment.
 
         Raises
         ------
         UsageError
-            If the name is none that MATLAB takes, the kind is neither, or MATLAB has no such unit of time.
+            If the name, the kind or the unit of time is not valid in MATLAB.
         """
         if not re.fullmatch(r"[A-Za-z]\w{0,62}", name, re.ASCII):
-            raise UsageError(f"a variable of MATLAB is a letter, then letters, digits and underscores; got {name!r}")
+            raise UsageError(f"a MATLAB variable must be a letter, then letters, digits and underscores; got {name!r}")
         if kind not in DELAYS:
-            raise UsageError(f"the kind of a MATLAB model is {' or '.join(DELAYS)}; got {kind!r}")
+            raise UsageError(f"the kind of a MATLAB model must be {' or '.join(DELAYS)}; got {kind!r}")
         unit = MATLAB_UNITS.get(time_unit)
         if unit is None:
             raise UsageError(
@@ -307,16 +305,16 @@ class FittedModel(ABC):
     def to_python(
         self, name: str = "G", library: Literal["control", "scipy"] = "control", pade: int | None = None
     ) -> str:
-        """Python code that builds the model without ctid.
+        """Return Python code that builds the model without ctid.
 
         Parameters
         ----------
         name : str, default "G"
-            Variable that gets the model.
+            Name of the variable.
         library : {"control", "scipy"}, default "control"
-            Library that it is built with.
+            Library of the model object.
         pade : int, optional
-            Order of a Padé approximation of the delay, for python-control only; by default the delay is kept apart.
+            Order of a Padé approximation of the delay, for python-control only; by default the delay is separate.
 
         Returns
         -------
@@ -326,10 +324,10 @@ class FittedModel(ABC):
         Raises
         ------
         UsageError
-            If the name is no variable's, or the order is not positive.
+            If the name is not a valid identifier, or the order is not positive.
         """
         if not name.isidentifier() or keyword.iskeyword(name):
-            raise UsageError(f"a variable of Python is a letter, then letters, digits and underscores; got {name!r}")
+            raise UsageError(f"a Python variable must be a letter, then letters, digits and underscores; got {name!r}")
         _check_pade(pade)
         found = self._estimated()
         model = found.parametric.fraction
@@ -358,5 +356,5 @@ def _check_pade(order: int | None) -> None:
 
 
 def _row(values: Array) -> str:
-    """Numbers with all their digits."""
+    """Return numbers with all digits."""
     return f"[{' '.join('NaN' if np.isnan(value) else repr(value) for value in values.tolist())}]"

@@ -1,4 +1,4 @@
-"""The frequency response that a record shows without any model, and how far it can be trusted."""
+"""Nonparametric frequency response of a record, with its uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,20 +25,19 @@ from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import ResponseMethod
 
-#: How a response was estimated.
+#: Method of estimation.
 Estimate = Literal["periodic", "local-polynomial", "welch"]
-#: Up to this share of missing outputs is bridged by straight lines.
+#: Largest share of missing outputs that are interpolated linearly.
 MOST_MISSING = 0.05
-#: A change of the input belongs to a sample that is no further away than this fraction of the interval.
+#: Tolerance within which a change of the input counts as at a sample [sampling intervals].
 ON_GRID = 1e-5
-#: The images of a hold are worth a word where they may exceed this share of the response.
+#: Images of a hold are reported if they may exceed this share of the response.
 IMAGES_MATTER = 0.05
-#: Places at which a response is estimated, unless another number is asked for.
+#: Default number of frequencies.
 POINTS = 400
-#: Frequencies on each side of one whose phases must mostly be known for its own, and unknown ones that a phase is
-#: followed across.
-BESIDE, BRIDGED = 2, 2
-#: Fewer frequencies than these are no response over frequency.
+#: Neighbours on each side most of which must have a known phase, and largest gap across which a phase is unwrapped.
+NEIGHBOURS, BRIDGED = 2, 2
+#: Fewest frequencies of a response.
 FEWEST = 3
 
 
@@ -51,31 +50,30 @@ class FrequencyResponse:
     frequencies : ndarray, shape (K,)
         Frequencies [rad/s], rising.
     response : ndarray, shape (K,)
-        Complex response ``G(jw)`` [output unit/input unit], with what the hold does to the input taken out.
+        Complex response ``G(jw)`` [output unit/input unit], corrected for the hold of the input.
     variance : ndarray, shape (K,)
-        Variance ``E |error|^2`` of the response by the noise [(output unit/input unit)^2]; of several realisations by
-        noise and nonlinear distortions.
+        Variance ``E |error|^2`` of the response due to the noise [(output unit/input unit)^2]; for several realisations
+        due to noise and nonlinear distortions.
     freedom : ndarray, shape (K,)
-        Degrees of freedom of the complex residuals that the variance is from [-].
+        Degrees of freedom of the complex residuals of the variance [-].
     coherence : ndarray, shape (K,)
-        Share of the output's power at that frequency that follows the input linearly [-].
+        Share of the output's power at that frequency that is linear in the input [-].
     distortion : ndarray or None, shape (K,)
-        Variance that nonlinear distortions give the response to one realisation of the input [(output unit/input
-        unit)^2]; None where the record does not tell.
+        Variance of the response to one realisation of the input due to nonlinear distortions [(output unit/input
+        unit)^2]; None if the record does not determine it.
     bias : ndarray, shape (K,)
-        Bound of what the images of a sampled input add [output unit/input unit], for a gain that falls like 1/w or
-        faster beyond the highest frequencies.
+        Bound of the images of a sampled input [output unit/input unit], for a gain that falls like 1/w or faster beyond
+        the highest frequencies.
     method : {"periodic", "local-polynomial", "welch"}
-        How it was estimated.
+        Method of estimation.
     hold : {"zoh", "foh", "band-limited"}
-        What the input was taken to do between its samples.
+        Assumed intersample behaviour of the input.
     notes : tuple of str
-        What was chosen, and what to know before believing the numbers; where there is no interval, why.
-    told : ndarray of bool, shape (K,)
+        Choices, limitations, and reasons for missing intervals.
+    has_interval : ndarray of bool, shape (K,)
         Whether an interval is given.
     interval : float, default 0.0
-        Sampling interval of the values of samples that the response of a zero-order hold was divided out of [s]; 0
-        where none was.
+        Sampling interval [s] if the response was corrected for a zero-order hold; else 0.
     """
 
     frequencies: Array
@@ -88,7 +86,7 @@ class FrequencyResponse:
     method: Estimate
     hold: Hold
     notes: tuple[str, ...]
-    told: BoolArray
+    has_interval: BoolArray
     interval: float = 0.0
 
     def __repr__(self) -> str:
@@ -97,7 +95,7 @@ class FrequencyResponse:
 
     @property
     def data(self) -> FrequencyData:
-        """The response as data for a model: of a clock with a zero-order hold the values of samples."""
+        """The response as data for a model; with a zero-order hold as the sampled response."""
         values = self.frequencies, self.response, self.standard_error
         others: Any = {"correlated": self.method != "periodic", "freedom": float(np.median(self.freedom))}
         if self.interval:
@@ -110,7 +108,7 @@ class FrequencyResponse:
         return np.asarray(np.sqrt(self.variance))
 
     def radius(self, level: float = 0.95) -> Array:
-        """Radius of the circles in the complex plane that hold the true values, each with that probability.
+        """Return the radius of the confidence circles in the complex plane, pointwise.
 
         Parameters
         ----------
@@ -121,12 +119,12 @@ class FrequencyResponse:
         -------
         ndarray, shape (K,)
             Radii [output unit/input unit]: with d degrees of freedom ``|error|^2`` over its variance has the
-            F-distribution of 2 and 2 d degrees of freedom. NaN where no interval is given.
+            F-distribution of 2 and 2 d degrees of freedom. NaN if no interval is given.
         """
-        return np.where(self.told, self._radius(level), np.nan)
+        return np.where(self.has_interval, self._radius(level), np.nan)
 
     def gain_band(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Pointwise interval of the gain; its lower end is zero where the response may be.
+        """Return the pointwise interval of the gain; its lower end is zero if the circle contains zero.
 
         Parameters
         ----------
@@ -136,14 +134,14 @@ class FrequencyResponse:
         Returns
         -------
         low, high : ndarray, shape (K,)
-            Ends [output unit/input unit]; NaN where no interval is given.
+            Ends [output unit/input unit]; NaN if no interval is given.
         """
-        gain, half = np.abs(self.response), np.where(self.told, self._half_width(level), np.nan)
+        gain, half = np.abs(self.response), np.where(self.has_interval, self._half_width(level), np.nan)
         low = np.where(gain > self._radius(level), gain - half, 0.0)
-        return np.where(self.told, low, np.nan), gain + half
+        return np.where(self.has_interval, low, np.nan), gain + half
 
     def phase_known(self, level: float = 0.95) -> BoolArray:
-        """Whether the phase is known to better than a quarter of a turn to each side.
+        """Return whether the phase is known to better than 90 degrees to each side.
 
         Parameters
         ----------
@@ -153,28 +151,27 @@ class FrequencyResponse:
         Returns
         -------
         ndarray of bool, shape (K,)
-            True where an interval is given, the circle of that probability around the response leaves out zero, and
-            the same holds for most of the five frequencies around: of many frequencies with noise alone some leave out
-            zero by chance.
+            True if an interval is given and the confidence circle excludes zero, at this frequency and at most of the
+            five frequencies around it: with noise only, some circles of many exclude zero.
         """
-        clear = self.told & (np.abs(self.response) > self._radius(level))
-        around = np.ones(2 * BESIDE + 1)
+        clear = self.has_interval & (np.abs(self.response) > self._radius(level))
+        around = np.ones(2 * NEIGHBOURS + 1)
         share = np.convolve(clear, around, "same") / np.convolve(np.ones(clear.size), around, "same")
         return np.asarray(clear & (share > 0.5))
 
     def phase(self, level: float = 0.95) -> Array:
-        """Phase, followed over the frequencies at which it is known.
+        """Return the phase, unwrapped over the frequencies at which it is known.
 
         Parameters
         ----------
         level : float, default 0.95
-            Probability of the intervals that decide where it is known [-].
+            Confidence level for a known phase [-].
 
         Returns
         -------
         ndarray, shape (K,)
-            Phases [rad]; NaN where unknown. After more than two unknown frequencies, and where the turn to the next
-            known one may be more than half a turn, it begins anew between -pi and pi.
+            Phases [rad]; NaN if unknown. After more than two unknown frequencies, and if the change to the next known
+            one may exceed pi, the phase restarts between -pi and pi.
         """
         phase = np.full(self.response.size, np.nan)
         places = np.flatnonzero(self.phase_known(level))
@@ -186,7 +183,7 @@ class FrequencyResponse:
         return phase
 
     def phase_band(self, level: float = 0.95) -> Array:
-        """Half the width of the pointwise interval of the phase.
+        """Return the half-width of the pointwise interval of the phase.
 
         Parameters
         ----------
@@ -196,17 +193,17 @@ class FrequencyResponse:
         Returns
         -------
         ndarray, shape (K,)
-            Half-widths [rad], below pi/2; NaN where the phase is not known.
+            Half-widths [rad], below pi/2; NaN if the phase is unknown.
         """
         share = self._half_width(level) / np.maximum(np.abs(self.response), 1e-300)
         return np.where(self.phase_known(level), np.arcsin(np.minimum(share, 1.0)), np.nan)
 
     def _radius(self, level: float) -> Array:
-        """Radius of the circle around each estimate, whether or not it can be given."""
+        """Return the radius of the circle around each estimate, also without an interval."""
         return np.asarray(np.sqrt(self.variance * self.freedom * ((1.0 - level) ** (-1.0 / self.freedom) - 1.0)))
 
     def _half_width(self, level: float) -> Array:
-        """Half the width of an interval of one part of the response."""
+        """Return the half-width of the interval of one component of the response."""
         from scipy.special import stdtrit
 
         return np.asarray(stdtrit(2 * self.freedom, 0.5 + level / 2) * np.sqrt(0.5 * self.variance))
@@ -222,53 +219,53 @@ def estimate_frequency_response(
     points: int = POINTS,
     time_unit: str = "s",
 ) -> FrequencyResponse:
-    r"""Frequency response of what lies between input and output, without a model.
+    r"""Estimate the frequency response from input to output without a parametric model.
 
     Parameters
     ----------
     records : Record or sequence of Record
-        A record; or several of one periodic experiment, each with another realisation of the input.
+        A record; or several of one periodic experiment with different realisations of the input.
     method : {"auto", "periodic", "local-polynomial", "welch"}, default "auto"
-        "periodic" from whole periods of a steady state, which "auto" takes where the input repeats itself;
-        "local-polynomial" from any other record; "welch" by averages over segments, which "auto" takes where the input
-        excites too few lines for the local polynomial.
+        "periodic" from whole periods of a steady state, which "auto" uses for a periodic input; "local-polynomial" from
+        any other record; "welch" by averages over segments, which "auto" uses if the input excites too few lines for
+        the local polynomial.
     period : int, optional
-        Period of the input [samples]; by default the first after which it repeats itself.
+        Period of the input [samples]; by default the first repetition.
     half_width : int, optional
-        Half-width of the local polynomial, 4 or more [lines of the record's own spectrum]; by default chosen for each
-        frequency where the lines around it are best foretold by their neighbours.
+        Half-width of the local polynomial, 4 or more [lines of the record's spectrum]; by default chosen for each
+        frequency from the residuals.
     segment : int, optional
         Length of Welch's segments [samples]; by default an eighth of the record.
     points : int, default 400
-        Frequencies at which a local polynomial estimates the response, at most [-].
+        Largest number of frequencies of a local polynomial estimate [-].
     time_unit : str, default "s"
-        Unit of time that the notes name.
+        Unit of time in the notes.
 
     Returns
     -------
     FrequencyResponse
-        Response, variance, coherence, level of nonlinear distortions.
+        Response, variance, coherence and level of nonlinear distortions.
 
     Raises
     ------
     DataError
-        If the record is too short, its input excites nothing, or its clock is irregular and the method is not by local
-        polynomials.
+        If the record is too short, its input is not exciting, or its clock is irregular and the method is not
+        "local-polynomial".
     ValueError
-        If an option cannot be.
+        If an option is invalid.
 
     Notes
     -----
-    Spectra of samples add up the true spectra of all frequencies that look alike. What a hold does to the frequency
-    itself is taken out; its images stay, ``sum_m G(j(w + m w_s)) H(w + m w_s)/H(w)`` with m ≠ 0, and are bounded in
-    ``bias``. Without a hold (band-limited signals) there are none.
+    Spectra of samples are sums of the true spectra over all aliased frequencies. The response is corrected for the
+    hold; the images ``sum_m G(j(w + m w_s)) H(w + m w_s)/H(w)``, m ≠ 0, remain and are bounded in ``bias``. Without a
+    hold (band-limited signals) there are none.
 
-    The estimate by local polynomials has a variance from their residuals, which also hold what the polynomials cannot
-    follow; no interval is given on peaks that are narrower than its lines. Neighbouring estimates share lines. Welch's
-    method gives no intervals: leakage and flattened peaks are not in the scatter of its segments. On an irregular
-    clock, with an input that moves between the samples, or with many samples missing, local polynomials take the exact
-    spectrum of the held input and that of straight lines through the output; what these miss is noise-like and in the
-    variance.
+    The variance of local polynomials is from their residuals, which include the approximation error of the polynomials;
+    no interval is given on peaks that are narrower than the window. Neighbouring estimates share lines. Welch's method
+    gives no intervals: leakage and flattened peaks do not show in the scatter of its segments. On an irregular clock,
+    with an input that changes between the samples, or with many samples missing, local polynomials use the exact
+    spectrum of the held input and that of the linearly interpolated output; the interpolation error is noise-like and
+    included in the variance.
 
     References
     ----------
@@ -306,14 +303,14 @@ def estimate_frequency_response(
     if method in ("auto", "periodic"):
         period = period or _common_period([u for u, _ in signals])
     if method == "periodic" and period is None:
-        raise DataError("the input does not repeat itself; give its period in samples, or take another method")
+        raise DataError("the input is not periodic; give its period in samples, or choose another method")
     if len(every) > 1:
-        _require_alike(every, period)
+        _require_one_experiment(every, period)
     if period is not None and method in ("auto", "periodic"):
         return _finished(from_periods(signals, period, interval), "periodic", first, time_unit)
-    # A long delay turns the phase fast: the output is advanced to where it begins to respond.
+    # A long delay makes the phase steep: the output is advanced to the beginning of its response.
     u, y = signals[0]
-    shift = min(int(_begins(first) / interval), u.size // 2)
+    shift = min(int(_earliest_response(first) / interval), u.size // 2)
     u, y = u[: u.size - shift], y[shift:]
     if method != "welch":
         inputs, outputs = (np.fft.rfft(x - x.mean())[1 : (x.size + 1) // 2] / x.size for x in (u, y))
@@ -327,29 +324,29 @@ def estimate_frequency_response(
 def _on_any_clock(
     records: list[Record], reason: str, method: ResponseMethod, points: int, half_width: int | None, time_unit: str
 ) -> FrequencyResponse:
-    """The same from the exact spectrum of the held input and from straight lines between the samples of the output."""
+    """Estimate from the exact spectrum of the held input and that of the linearly interpolated output."""
     (record, *more) = records
     if method not in ("auto", "local-polynomial") or more:
-        wanted = "several records are taken as realisations" if more else f"--method {method}"
+        wanted = "several records" if more else f"--method {method}"
         raise DataError(
-            f"{named(record)}{wanted} on one regular clock, but {reason}; use --method local-polynomial, one record "
+            f"{named(record)}{wanted} need one regular clock, but {reason}; use --method local-polynomial, one record "
             "at a time"
         )
-    late = min(_begins(record), 0.5 * record.duration)
+    late = min(_earliest_response(record), 0.5 * record.duration)
     spectra = record_spectra(record, late, np.inf, late, keep_mean=False)
     base = 2 * np.pi / spectra.duration
     found = _delayed(local_polynomial(spectra.inputs(late), spectra.outputs, base, points, half_width, time_unit), late)
     note = (
-        f"Since {reason}, the spectrum of the output is that of straight lines between its samples, corrected for what "
-        f"they damp; towards {np.pi / float(np.median(np.diff(record.t))):.3g} rad/{time_unit} that is rough."
+        f"Since {reason}, the output is interpolated linearly and its spectrum is corrected for the damping; near "
+        f"{np.pi / float(np.median(np.diff(record.t))):.3g} rad/{time_unit} the correction is approximate."
     )
     _require_some(found, record)
-    # The spectrum of the input is that of all its movements: no image of a hold is left.
+    # The spectrum of the held input is exact: there are no images.
     return _response(found, "local-polynomial", record, np.zeros(found.frequencies.size), note)
 
 
-def _begins(record: Record) -> float:
-    """Time before which the output does not respond [s]."""
+def _earliest_response(record: Record) -> float:
+    """Return the time before which the output does not respond [s]."""
     hint = analyse_response(record).delay
     return hint.early if hint is not None else 0.0
 
@@ -361,13 +358,13 @@ def _delayed(lines: ResponseLines, delay: float) -> ResponseLines:
 def _require_some(lines: ResponseLines, record: Record) -> None:
     if lines.frequencies.size < FEWEST:
         raise DataError(
-            f"{named(record)}the input excites too few frequencies for a response over frequency; record an input that"
-            " switches often, a multisine or a chirp"
+            f"{named(record)}the input excites too few frequencies; record an input that switches often, a multisine or"
+            " a chirp"
         )
 
 
 def _finished(lines: ResponseLines, method: Estimate, record: Record, time_unit: str) -> FrequencyResponse:
-    """The response to the input as it was between its samples."""
+    """Return the response corrected for the hold of the input."""
     _require_some(lines, record)
     hold, interval = record.input.hold, float(record.interval or 0.0)
     factor = hold_factor(hold, lines.frequencies, interval)
@@ -380,29 +377,29 @@ def _finished(lines: ResponseLines, method: Estimate, record: Record, time_unit:
 
 
 def _response(lines: ResponseLines, method: Estimate, record: Record, bias: Array, note: str) -> FrequencyResponse:
-    """The result, with sentences on missing samples and on where its phase is unknown, and why."""
+    """Return the result, with notes on missing samples and unknown phases."""
     notes = (*lines.notes, note, *_of_record(record))
-    found = FrequencyResponse(*lines[:6], bias, method, record.input.hold, notes, lines.told)
-    unknown = int(np.count_nonzero(found.told & ~found.phase_known()))
+    found = FrequencyResponse(*lines[:6], bias, method, record.input.hold, notes, lines.has_interval)
+    unknown = int(np.count_nonzero(found.has_interval & ~found.phase_known()))
     if not unknown:
         return found
     text = (
-        f"No phase at {unknown} of the {found.response.size} frequencies, where the interval of the response holds "
-        "zero, or that of most frequencies around does."
+        f"No phase at {unknown} of the {found.response.size} frequencies, because the interval of the response, or of "
+        "most neighbouring frequencies, contains zero."
     )
     return replace(found, notes=(*found.notes, text))
 
 
 def _of_hold(hold: Hold, frequencies: Array, bias: Array, gain: Array, time_unit: str) -> str:
-    """What the hold means for the estimate."""
+    """Return a note on the effect of the hold on the estimate."""
     if hold == "band-limited":
         return (
-            "Input and output are taken to have no power above half the sampling frequency (--hold band-limited): then "
-            "nothing between the samples biases the estimate."
+            "Input and output are assumed to have no power above half the sampling frequency (--hold band-limited), so "
+            "that sampling causes no bias."
         )
-    shape = "constant" if hold == "zoh" else "straight lines"
-    text = f"The input is taken as {shape} between its samples (--hold {hold}); what that does to it is divided out."
-    # From where on nearly all frequencies are concerned: noise makes some gains small.
+    shape = "constant" if hold == "zoh" else "linear"
+    text = f"The input is assumed {shape} between its samples (--hold {hold}), and the response is corrected for that."
+    # First frequency from which on nearly all are affected, because noise makes some gains small.
     large = bias > IMAGES_MATTER * gain
     onward = np.cumsum(large[::-1])[::-1] >= 0.8 * np.arange(large.size, 0, -1)
     if (large & onward).any():
@@ -419,7 +416,7 @@ def _of_record(record: Record) -> list[str]:
 
 
 def _not_on_one_clock(record: Record) -> str | None:
-    """Why samples of input and output do not tell all that was recorded."""
+    """Return why input and output are not on one regular clock; None if they are."""
     signal = record.input
     if record.interval is None:
         return "the clock is irregular"
@@ -428,7 +425,7 @@ def _not_on_one_clock(record: Record) -> str | None:
     inside = signal.t[(signal.t > record.t[0]) & (signal.t <= record.t[-1])]
     places = (inside - record.t[0]) / record.interval
     moves = bool(np.abs(places - np.round(places)).max(initial=0.0) > ON_GRID)
-    return "the input moves between the instants of the output" if moves else None
+    return "the input changes between the instants of the output" if moves else None
 
 
 def _common_period(inputs: list[Array]) -> int | None:
@@ -436,15 +433,15 @@ def _common_period(inputs: list[Array]) -> int | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _require_alike(records: list[Record], period: int | None) -> None:
-    """Refuse records that are no realisations of one periodic experiment."""
+def _require_one_experiment(records: list[Record], period: int | None) -> None:
+    """Raise an error if records are not realisations of one periodic experiment."""
     first = records[0]
     if period is None:
         raise DataError(
-            f"{len(records)} records are taken as realisations of one periodic input, and they do not all repeat "
-            "themselves after the same number of samples; give the period in samples, or one record at a time"
+            f"{len(records)} records must be realisations of one periodic input, but they do not all have the same "
+            "period; give the period in samples, or one record at a time"
         )
     for record in records[1:]:
         same = abs((record.interval or 0.0) - (first.interval or 0.0)) <= REGULARITY * (first.interval or 0.0)
         if not same or record.input.hold != first.input.hold:
-            raise DataError(f"{named(record)}its clock or hold is not that of {first.name or 'the first record'}")
+            raise DataError(f"{named(record)}its clock or hold differs from that of {first.name or 'the first record'}")

@@ -2,7 +2,7 @@ r"""ARMA models of output noise by exact maximum likelihood, their innovations a
 
 With ``v = C(q)/D(q) e`` in the state space of :class:`~ctid_cli.signals.noise.ArmaNoise`, ``z+ = F z + G e`` and
 ``v = z_1 + e``, a Kalman filter that starts from the stationary covariance gives the innovations i_t of a record and
-their variances ``s^2 f_t``, the first sample included; where samples are missing it goes on without them. So
+their variances ``s^2 f_t``, including the first sample; at missing samples it predicts only. So
 
 .. math:: v'V^{-1}v = \sum_t i_t^2 / f_t, \qquad \ln|V| = \sum_t \ln f_t,
 
@@ -28,16 +28,15 @@ from ctid_cli.signals.noise import ArmaNoise
 
 #: Numbers of coefficients of D and of C.
 Orders = tuple[int, int]
-#: Greatest orders among which BIC chooses, and greatest ones that can be given.
+#: Greatest orders for the choice by BIC, and greatest orders that can be given.
 MOST_CHOSEN, MOST_GIVEN = 3, 8
 #: Greatest inverse hyperbolic tangent of a partial correlation, which is then 1 - 1.7e-6.
 FARTHEST = 7.0
-#: Lags of the autoregression whose residuals start Hannan and Rissanen's regression, for each coefficient, and at
-#: least this number of samples for each lag.
+#: Lags per coefficient of the long autoregression of Hannan and Rissanen's method, and least number of samples per lag.
 LONG_LAGS, SAMPLES_PER_LAG = 10, 10
-#: Relative falls of the scaled squares at which a fit has ended, the rough ones where orders are compared; evaluations.
+#: Relative decrease of the scaled squares at which a fit ends, final and in comparisons of orders; most evaluations.
 EXACT, ROUGH, EVALUATIONS = 1e-12, 1e-6, 40
-#: Step of differences by the transformed partial correlations.
+#: Step of central differences by the transformed partial correlations.
 DIFFERENCE = 1e-5
 
 
@@ -45,17 +44,17 @@ DIFFERENCE = 1e-5
 def filter_innovations(
     rows: Array, steps: IntArray, denominator: Array, gain: Array, states: Array, covariance: Array, after: Array
 ) -> float:
-    """Make innovations over their standard deviations of each row, in place; states and covariance go on.
+    """Replace rows by their innovations over standard deviations, and update states and covariance, in place.
 
-    ``steps`` are the intervals of the clock from the sample before to each sample, 0 or 1 at the first one. F shifts,
-    and has minus the denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of the
-    variances; ``after``, unless empty, gets the predicted states of the first row.
+    ``steps`` are the intervals of the clock from the previous sample to each sample, 0 or 1 at the first one. F is a
+    shift matrix with the negative denominator ``d_1 ... d_r`` in its first column. Returns the sum of the logarithms of
+    the variances; ``after``, unless empty, gets the predicted states of the first row.
     """
     r, logarithms, known = gain.size, 0.0, False
-    # A column and a row of zeros save questions at the ends.
+    # A column and a row of zeros avoid branches at the ends.
     moved, feedback, old = np.zeros((r + 1, r + 1)), gain.copy(), np.zeros(r + 1)
     for t in range(steps.size):
-        # An interval without a sample, any number of times, then one with it, which ends in the prediction of the next.
+        # Intervals without a sample, then one with it, which ends with the prediction of the next.
         for left in range(max(steps[t], 1) - 1, -1, -1):
             variance = 1.0
             if not known or left:
@@ -77,7 +76,7 @@ def filter_innovations(
                             value -= variance * feedback[i] * feedback[j]
                         covariance[i, j] = value
                         largest = max(largest, abs(value))
-                # Once the state is known it stays known, while no sample is missing.
+                # A known state stays known until a sample is missing.
                 known = not left and largest < 1e-14
             for k in range(rows.shape[0]):
                 for i in range(r):
@@ -94,7 +93,7 @@ def filter_innovations(
 
 
 class Whitener:
-    """The filter of one record on its way over the samples, for any number of rows."""
+    """State of the innovations filter of one record, for any number of rows."""
 
     def __init__(self, noise: ArmaNoise, rows: int) -> None:
         self.transition, self.gain, _ = noise.state_space
@@ -112,19 +111,19 @@ class Whitener:
 
 @dataclass(frozen=True, eq=False)
 class SampledNoise:
-    """The noise of one record at its used samples."""
+    """Noise of one record at its used samples."""
 
     noise: ArmaNoise
     #: Intervals of the clock from each used sample to the next; 0 at the first one, shape (count,).
     steps: IntArray
 
     def whitened(self, columns: Array) -> Array:
-        """Innovations, over their standard deviations, of a signal or of columns of them."""
+        """Return the innovations over their standard deviations of a signal or of columns."""
         rows = np.array(np.atleast_2d(columns.T), dtype=float, order="C")
         return np.asarray(Whitener(self.noise, len(rows))(rows, self.steps).T.reshape(columns.shape))
 
     def predicted(self, errors: Array, ahead: int) -> Array:
-        """Prediction of the noise from samples that are at least ``ahead`` intervals old; zero without any."""
+        """Return the prediction of the noise from samples at least ``ahead`` intervals old; zero without any."""
         states = np.zeros((errors.size, self.steps.size and Whitener(self.noise, 1).gain.size))
         whitener, places = Whitener(self.noise, 1), np.cumsum(self.steps)
         whitener(errors[None].copy(), self.steps, states)
@@ -137,13 +136,13 @@ class SampledNoise:
 
 
 def steps_of(used: BoolArray) -> IntArray:
-    """Intervals of a regular clock from each used sample to the next, 0 at the first one."""
+    """Return the intervals of a regular clock from each used sample to the next, 0 at the first one."""
     places = np.flatnonzero(used)
     return np.diff(places, prepend=places[:1])
 
 
 def sampled(noise: ArmaNoise, used: Sequence[BoolArray]) -> tuple[SampledNoise, ...]:
-    """The noise at the used samples of records with regular clocks."""
+    """Return the noise at the used samples of records with regular clocks."""
     return tuple(SampledNoise(noise, steps_of(use)) for use in used)
 
 
@@ -151,7 +150,7 @@ class NoiseFit(NamedTuple):
     """ARMA noise of the greatest likelihood."""
 
     noise: ArmaNoise
-    #: ``-2 ln L`` but for a constant.
+    #: ``-2 ln L`` up to a constant.
     deviance: float
     samples: int
 
@@ -162,24 +161,24 @@ class NoiseFit(NamedTuple):
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, the coefficients of the noise alone being counted."""
+        """Schwarz's criterion, counting the coefficients of the noise only."""
         return self.deviance + sum(self.orders) * float(np.log(self.samples))
 
 
 class _Likelihood:
-    """Least squares that have the likelihood, by the transformed partial correlations z of D and C."""
+    """Likelihood as least squares, as a function of the transformed partial correlations z of D and C."""
 
     def __init__(self, errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders) -> None:
         self.errors, self.steps, self.orders = errors, steps, orders
         self.count = sum(e.size for e in errors)
 
     def noise(self, z: Array, variance: float = 1.0) -> ArmaNoise:
-        """The model with some innovation variance."""
+        """Return the model with an innovation variance."""
         d, c = (levinson(part)[0].tolist() for part in np.split(np.tanh(z), [self.orders[0]]))
         return ArmaNoise(tuple(c), tuple(d), innovation_variance=variance)
 
     def innovations(self, z: Array) -> tuple[Array, float]:
-        """Innovations over their standard deviations, and ``ln|V|``."""
+        """Return the innovations over their standard deviations, and ``ln|V|``."""
         noise, parts, logarithm = self.noise(z), [], 0.0
         for e, steps in zip(self.errors, self.steps, strict=True):
             whitener = Whitener(noise, 1)
@@ -188,12 +187,12 @@ class _Likelihood:
         return np.concatenate(parts), logarithm
 
     def scaled(self, z: Array) -> Array:
-        """The same times ``|V|^(1/2N)``."""
+        """Return the standardised innovations times ``|V|^(1/2N)``."""
         white, logarithm = self.innovations(z)
         return np.asarray(white * np.exp(logarithm / (2 * self.count)))
 
     def found(self, z: Array, tolerance: float) -> NoiseFit:
-        """The minimum that a start leads to."""
+        """Return the local minimum from a start."""
         if z.size:
             from scipy.optimize import least_squares  # slow to import
 
@@ -208,7 +207,7 @@ class _Likelihood:
 def fit_arma(
     errors: Sequence[Array], steps: Sequence[IntArray], orders: Orders, *near: NoiseFit, tolerance: float = EXACT
 ) -> NoiseFit:
-    """ARMA noise of given orders with the greatest likelihood, from Hannan and Rissanen's and from nearby models."""
+    """Return the maximum-likelihood ARMA noise of given orders, started from Hannan-Rissanen and from near models."""
     starts = [_transformed(*_padded(fit.noise, orders)) for fit in near]
     if not any(fit.orders == orders for fit in near):
         starts.append(_transformed(*_hannan_rissanen(errors, orders)))
@@ -219,7 +218,7 @@ def fit_arma(
 def all_arma(
     errors: Sequence[Array], steps: Sequence[IntArray], near: Mapping[Orders, NoiseFit]
 ) -> dict[Orders, NoiseFit]:
-    """ARMA noises up to ARMA(3,3), each from a nearby one of its orders, or else also from those that it contains."""
+    """Return ARMA noises up to (3, 3), each started from a near model, or from models of lower order."""
     fits: dict[Orders, NoiseFit] = {}
     for p, q in sorted(product(range(MOST_CHOSEN + 1), repeat=2), key=sum):
         inner = [near[p, q]] if near else [fits[each] for each in ((p - 1, q), (p, q - 1)) if each in fits]
@@ -228,7 +227,7 @@ def all_arma(
 
 
 def coefficient_slopes(noise: ArmaNoise, errors: Sequence[Array], steps: Sequence[IntArray]) -> Array:
-    """Derivatives of the scaled innovations by the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (N, P + Q)."""
+    """Return derivatives of the scaled innovations by ``d_1 ... d_P, c_1 ... c_Q``, shape (N, P + Q)."""
     orders = len(noise.denominator) - 1, len(noise.numerator) - 1
     if not sum(orders):
         return np.zeros((sum(e.size for e in errors), 0))
@@ -242,13 +241,13 @@ def coefficient_slopes(noise: ArmaNoise, errors: Sequence[Array], steps: Sequenc
 
 
 def _padded(noise: ArmaNoise, orders: Orders) -> tuple[Array, Array]:
-    """D and C with coefficients that are zero."""
+    """Return D and C padded with zeros."""
     d, c = np.array(noise.denominator), np.array(noise.numerator)
     return np.pad(d, (0, orders[0] + 1 - d.size)), np.pad(c, (0, orders[1] + 1 - c.size))
 
 
 def _transformed(*polynomials: Array) -> Array:
-    """Inverse hyperbolic tangents of the partial correlations, of unstable polynomials those of the mirrored ones."""
+    """Return inverse hyperbolic tangents of the partial correlations, with unstable roots reflected."""
     found = []
     for polynomial in polynomials:
         roots = np.roots(polynomial)
@@ -265,7 +264,7 @@ def _transformed(*polynomials: Array) -> Array:
 
 
 def _hannan_rissanen(errors: Sequence[Array], orders: Orders) -> tuple[Array, Array]:
-    """D and C by regression on the noise before and on the residuals of a long autoregression; gaps are not seen."""
+    """Return D and C by regression on past noise and past residuals of a long autoregression, ignoring gaps."""
     (p, q), count = orders, sum(e.size for e in errors)
     lags = max(min(LONG_LAGS * (p + q), count // SAMPLES_PER_LAG), p, q)
     blocks = [_lagged(e, lags) for e in errors]
@@ -279,7 +278,7 @@ def _hannan_rissanen(errors: Sequence[Array], orders: Orders) -> tuple[Array, Ar
 
 
 def _lagged(e: Array, lags: int) -> Array:
-    """A signal and its past, zero before the first sample, shape (N, lags + 1)."""
+    """Return a signal and its lagged values, zero before the first sample, shape (N, lags + 1)."""
     return np.column_stack(
         [np.concatenate((np.zeros(min(k, e.size)), e[: max(e.size - k, 0)])) for k in range(lags + 1)]
     )

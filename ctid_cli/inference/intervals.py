@@ -13,34 +13,34 @@ from ctid_cli.arrays import Array
 
 
 def normal_quantile(level: float = 0.95) -> float:
-    """Half the width of a two-sided interval of that probability [standard errors]."""
+    """Return the half-width of a two-sided normal interval of given probability [standard errors]."""
     return NormalDist().inv_cdf(0.5 + level / 2)
 
 
 def student_quantile(degrees_of_freedom: float, level: float = 0.95) -> float:
-    """The same where the standard error itself is known only as well as these degrees of freedom tell."""
+    """Return the half-width of a two-sided interval of Student's t distribution [standard errors]."""
     from scipy.special import stdtrit
 
     return float(stdtrit(degrees_of_freedom, 0.5 + level / 2))
 
 
 def robust_deviation(x: Array) -> float:
-    """Standard deviation from the median size of values about zero, which outliers hardly change."""
+    """Return a robust standard deviation from the median absolute value."""
     return 1.4826 * float(np.median(np.abs(x)))
 
 
-#: Standard errors to each side of a normal estimate.
+#: Half-width of a 95 % interval of a normal estimate [standard errors].
 NORMAL = normal_quantile()
-#: Why a fit that ignores the loop of its record has no standard errors.
+#: Reason why a fit that ignores the loop of its record has no standard errors.
 BIASED = (
-    "There are no standard errors: the input answers to the output through a loop that this fit ignores, and the "
+    "There are no standard errors: the input responds to the output through a loop that this fit ignores, and the "
     "residuals are coloured, so that the estimate is biased."
 )
 
 
 @dataclass(frozen=True)
 class UncertainValue:
-    """An estimate with its accuracy, all in its unit; NaN stands for what is not defined."""
+    """An estimate with its accuracy, all in its unit; NaN if not defined."""
 
     name: str
     estimate: float
@@ -64,7 +64,7 @@ class UncertainValue:
         quantile: float = NORMAL,
         reason: str = "",
     ) -> UncertainValue:
-        """An interval of ``estimate -+ quantile`` standard errors."""
+        """Return an estimate with the interval ``estimate -+ quantile standard_error``."""
         reach = quantile * standard_error
         return cls(name, estimate, standard_error, estimate - reach, estimate + reach, unit, reason=reason)
 
@@ -74,13 +74,13 @@ class UncertainValue:
         return 100 * self.standard_error / abs(self.estimate) if self.estimate else math.nan
 
 
-#: The rise of the cost two standard errors away is called quadratic if its square root is right to this share.
+#: Largest relative error of the square root of the cost rise at two standard errors for a quadratic profile.
 QUADRATIC_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class DelayInterval:
-    """Delays that the data do not reject."""
+    """Confidence interval of the delay; open ends are at the bounds of the search."""
 
     #: Ends [s].
     low: float
@@ -91,7 +91,7 @@ class DelayInterval:
 
 @dataclass(frozen=True)
 class CostOfDelay:
-    r"""The least squared error as a function of the delay, about an estimate."""
+    r"""Profile of the squared error over the delay near an estimate."""
 
     squared_error_at: Callable[[float], float]
     #: The delay of least squared error [s], and that [output unit^2].
@@ -100,11 +100,11 @@ class CostOfDelay:
     count: int
     parameters: int
     bounds: tuple[float, float]
-    #: By what factor coloured noise raises the variance of the delay [-].
+    #: Factor by which coloured noise increases the variance of the delay [-].
     inflation: float = 1.0
 
     def interval(self, quantile: float) -> DelayInterval:
-        r"""Interval of delays around the estimate whose best fits are not significantly worse.
+        r"""Return the interval of delays around the estimate whose best fits are not significantly worse.
 
         The delays with
 
@@ -112,9 +112,8 @@ class CostOfDelay:
 
         c the inflation and t the quantile [standard errors]: with that of Student's t for ``N - p`` degrees of freedom
         the F version of ``N ln(S/S_min) <= chi2_1(level)``, which it becomes for large N. Where S is a parabola, this
-        is the interval ``estimate +- t se`` exactly. Each end is bracketed by steps that grow from a
-        small one outward, then found by Brent's method to 1e-6 of its distance from the estimate. A second basin
-        further away is not looked for.
+        is the interval ``estimate +- t se`` exactly. Each end is bracketed by growing steps outward, then found by
+        Brent's method to 1e-6 of its distance from the estimate. Separate regions further away are not searched.
         """
         allowed = self.allowed(quantile)
         if not np.isfinite(allowed) or not self.squared_error >= 0:
@@ -126,7 +125,7 @@ class CostOfDelay:
                 return 1.0
             if self.squared_error == 0:
                 return 1.0 if value > 0 else -1.0
-            # The root is linear in the delay where the cost is quadratic: Brent's method then needs a step or two.
+            # The square root is linear in the delay for a quadratic cost: Brent's method then needs a step or two.
             return float(np.sqrt(max(value / self.squared_error - 1.0, 0.0) / allowed)) - 1.0
 
         low, at_low = _crossing(excess, self.estimate, self.bounds[0])
@@ -134,17 +133,17 @@ class CostOfDelay:
         return DelayInterval(low, high, at_low, at_high)
 
     def allowed(self, quantile: float) -> float:
-        """By what share the squared error may rise within the interval; NaN where nothing is spare."""
+        """Return the relative rise of the squared error at the ends of the interval; NaN without degrees of freedom."""
         freedom = self.count - self.parameters
         return self.inflation * quantile**2 / freedom if freedom > 0 else float("nan")
 
     def quadratic_is_doubtful(self, standard_error: float) -> bool:
-        r"""Whether the interval ``estimate +- z se`` of the delay should not be trusted.
+        r"""Return whether the interval ``estimate +- z se`` of the delay is unreliable.
 
         A quadratic profile rises by ``c (2 se)^2 s^2 / se^2 = 4 c s^2`` at ``estimate +- 2 se``, ``s^2 = S_min / (N -
-        p)``, c the inflation. The interval is doubtful if the square root of the actual rise, which is the length of
-        the interval, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or
-        above 97 %.
+        p)``, c the inflation. The interval is unreliable if the square root of the actual rise, which determines its
+        length, differs from that by more than 10 % on either side: a 95 % interval would cover below 93 % or above
+        97 %.
         """
         if self.count <= self.parameters or not (0 < standard_error < np.inf and self.inflation > 0):
             return True
@@ -159,7 +158,7 @@ class CostOfDelay:
 
 
 def _crossing(excess: Callable[[float], float], start: float, bound: float) -> tuple[float, bool]:
-    """First point from the start towards the bound at which the excess becomes positive, or the bound and True."""
+    """Return the first point towards the bound at which the excess becomes positive, or the bound and True."""
     from scipy.optimize import brentq  # slow to import
 
     room = bound - start

@@ -1,10 +1,10 @@
 r"""Responses of an estimated model with confidence bands, from the joint covariance of its parameters.
 
-Linearised, a quantity g has the variance ``(dg/dtheta) C (dg/dtheta)'`` with exact derivatives, and its interval
-reaches as many standard errors to both sides as those of the parameters do. Sampled, parameters are drawn from the
-normal distribution with covariance C, or Student's t where C itself is uncertain, and the interval lies between
-quantiles of what the drawn models give: it need not be symmetric, and knows what a linearisation does not, such as
-what an uncertain delay does to the first instants of a step response.
+Linearised, a quantity g has the variance ``(dg/dtheta) C (dg/dtheta)'`` with exact derivatives, and its interval has
+the same half-width in standard errors as those of the parameters. Sampled, parameters are drawn from the normal
+distribution with covariance C, or Student's t if C is uncertain, and the interval is between quantiles of the drawn
+responses: it need not be symmetric, and includes nonlinear effects, such as that of an uncertain delay on the first
+instants of a step response.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ResponseBand:
     standard_error : ndarray, shape (N,)
         Standard error of each value; NaN where it is not defined.
     lower, upper : ndarray, shape (N,)
-        Ends of the interval of each instant; a band that holds the whole curve is wider.
+        Pointwise interval ends; a simultaneous band of the whole curve is wider.
     level : float
         Confidence level of each interval [-].
     """
@@ -100,13 +100,13 @@ class PoleBand:
     value : ndarray of complex, shape (n,)
         Poles of the estimate [rad/s].
     covariance : ndarray, shape (n, 2, 2)
-        Covariance of real and imaginary part [rad^2/s^2]; NaN of a pole that the data cannot tell from another.
+        Covariance of real and imaginary part [rad^2/s^2]; NaN for a pole that the data cannot distinguish from another.
     standard_error : ndarray, shape (n,)
         ``sqrt(var Re p + var Im p)`` [rad/s].
     lower, upper : ndarray of complex, shape (n,)
-        Ends of the intervals of real and imaginary part, each by itself [rad/s].
+        Ends of the marginal intervals of real and imaginary part [rad/s].
     reach : ndarray, shape (n,)
-        Axes of the ellipse that holds a complex pole with probability ``level``, over those of the covariance [-].
+        Axes of the confidence ellipse of a complex pole, over those of the covariance [-].
     level : float
         Confidence level [-].
     """
@@ -120,9 +120,9 @@ class PoleBand:
     level: float
 
 
-#: Whether bands come from a linearisation or from drawn parameters.
+#: Bands by linearisation or from drawn parameters.
 Bands = Literal["linearised", "sampled"]
-#: Parameters that are drawn, and the seed: one fit always gets one band.
+#: Number of parameter draws, and their fixed seed, for reproducible bands.
 DRAWS, SEED = 1000, 20261122
 #: Default number of points of a curve.
 POINTS = 400
@@ -130,19 +130,19 @@ POINTS = 400
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """A model with the joint law of the parameters of its fit."""
+    """A model with the joint distribution of the parameters of its fit."""
 
     parametric: Parametric
     law: Uncertainty
 
     @cached_property
     def reported(self) -> Array:
-        """Covariance of all parameters; NaN where it is not defined or a parameter is held, shape (p, p)."""
+        """Covariance of all parameters; NaN if it is not defined or a parameter is fixed, shape (p, p)."""
         return self.law.covariance
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance that takes held parameters as known."""
+        """Covariance with fixed parameters as known."""
         held = np.isnan(np.diag(self.reported))
         if held.all():
             return self.reported
@@ -150,18 +150,18 @@ class Estimated:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Of the t distribution that parameters are drawn from [-]; infinite for the normal one."""
+        """Degrees of freedom of the t distribution of the draws [-]; infinite for the normal distribution."""
         return self.law.degrees_of_freedom if self.law.bootstrap is None else np.inf
 
     def intervals(self, slopes: Array, level: float) -> tuple[Array, Array]:
-        """Standard errors of quantities from their gradients, shape (N, p), and half the widths of their intervals."""
+        """Return standard errors and half-widths of quantities from their gradients, shape (N, p)."""
         with np.errstate(invalid="ignore"):
             variances = np.maximum(np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes), 0.0)
         errors = np.asarray(np.sqrt(variances))
         return errors, self.law.reach(slopes, level) * errors
 
     def of_parts(self, slopes: ComplexArray) -> Array:
-        """Covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
+        """Return the covariances of real and imaginary parts from their gradients, shape (N, 2, 2)."""
         parts = np.stack((slopes.real, slopes.imag), axis=1)
         return np.asarray(np.einsum("nki,ij,nlj->nkl", parts, self.covariance, parts))
 
@@ -171,7 +171,7 @@ class Estimated:
         return not np.isfinite(self.covariance).all()
 
     def draws(self) -> Iterator[Parametric]:
-        """Models with drawn parameters; those that are none are left out."""
+        """Yield models with drawn parameters, without invalid ones."""
         mine, _ = self.parametric.free
         values, vectors = np.linalg.eigh(self.covariance[np.ix_(mine, mine)])
         rng = np.random.default_rng(SEED)
@@ -183,7 +183,7 @@ class Estimated:
                 yield self.parametric.at(change)
 
     def response_times(self, times: ArrayLike | None) -> Array:
-        """Instants that are asked for, or until the slowest mode has settled."""
+        """Return the given instants, or default ones until the slowest mode has settled."""
         if times is not None:
             return instants(times)
         model = self.parametric.model
@@ -192,12 +192,12 @@ class Estimated:
         decay, speeds = decay[decay > 1e-9 * speeds.max(initial=0.0)], speeds[speeds > 0]
         longest = 5.0 / float(decay.min()) if decay.size else 0.0
         if speeds.size:
-            # A mode that hardly decays is shown for thirty periods, one much slower than all others in part.
+            # A mode with little damping is shown for thirty periods of the slowest pole.
             longest = min(longest or np.inf, 60.0 * np.pi / float(speeds.min()))
         return np.linspace(0.0, model.delay + (longest or 10.0 * (model.delay or 1.0)), POINTS)
 
     def over_time(self, model: Parametric, signal: HeldSignal, t: Array, level: float, bands: Bands) -> ResponseBand:
-        """Return the output from rest of the model, or of the model behind a differentiator."""
+        """Return the output from rest of the model, or of its derivative."""
         _check(level, bands)
         value, slopes = model.simulated(signal, t), model.output_slopes(signal, t)
         errors, half = self.intervals(slopes, level)
@@ -209,7 +209,7 @@ class Estimated:
         return ResponseBand(t, value, errors, lower, upper, level)
 
     def over_frequency(self, frequencies: ArrayLike | None, level: float, bands: Bands) -> FrequencyBand:
-        """Gain and phase: the parts of ``d ln G = dG/G`` are the relative change of the gain and that of the phase."""
+        """Return gain and phase; the parts of ``d ln G = dG/G`` are the changes of relative gain and of phase."""
         _check(level, bands)
         model = self.parametric.model
         w = _grid(self.parametric) if frequencies is None else _checked_frequencies(frequencies)
@@ -245,7 +245,7 @@ class Estimated:
         )
 
     def poles(self, level: float) -> PoleBand:
-        """Poles by the delta method."""
+        """Return the poles with their uncertainty by the delta method."""
         _check(level, "linearised")
         value, slopes = self.parametric.poles()
         slopes[~np.isfinite(slopes).all(axis=1)] = np.nan
@@ -264,29 +264,29 @@ class Estimated:
 
 
 def _quantiles(drawn: Array, level: float) -> tuple[Array, Array]:
-    """Ends of the middle part of what was drawn; what overflows lies beyond both."""
+    """Return the ends of the central interval of draws; NaN are ignored."""
     low, high = np.nanquantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
     return low, high
 
 
 def _ellipse(level: float, degrees_of_freedom: float) -> float:
-    """Radius of the region of two numbers with unit covariance that holds both with a probability."""
+    """Return the radius of the confidence region of two numbers with unit covariance."""
     if not np.isfinite(degrees_of_freedom):
         return float(np.sqrt(-2.0 * np.log1p(-level)))
-    # Of Hotelling's T^2 of two numbers: 2 F(2, d), whose quantile has a closed form.
+    # Hotelling's T^2 of two numbers, 2 F(2, d), whose quantile has a closed form.
     d = degrees_of_freedom
     return float(np.sqrt(d * ((1.0 - level) ** (-2.0 / d) - 1.0)))
 
 
 def _check(level: float, bands: str) -> None:
     if not 0.0 < level < 1.0:
-        raise UsageError(f"the level of a confidence band lies between 0 and 1, such as 0.95; got {level:g}")
+        raise UsageError(f"the level of a confidence band must be between 0 and 1, such as 0.95; got {level:g}")
     if bands not in get_args(Bands):
-        raise UsageError(f"bands are {' or '.join(map(repr, get_args(Bands)))}; got {bands!r}")
+        raise UsageError(f"bands must be {' or '.join(map(repr, get_args(Bands)))}; got {bands!r}")
 
 
 def instants(times: ArrayLike) -> Array:
-    """Return instants that are asked for, checked."""
+    """Return the given instants, checked."""
     t = np.atleast_1d(np.array(times, dtype=float))
     if t.ndim != 1 or not np.isfinite(t).all():
         raise DataError("the instants of a response must be a list of finite numbers")
@@ -295,7 +295,7 @@ def instants(times: ArrayLike) -> Array:
 
 
 def _grid(parametric: Parametric) -> Array:
-    """Frequencies from well below to well above all corners."""
+    """Return frequencies from well below to well above all corner frequencies."""
     model = parametric.fraction
     corners = np.abs(np.concatenate((model.poles, model.zeros)))
     corners = corners[corners > 0]
@@ -312,7 +312,7 @@ def _checked_frequencies(frequencies: ArrayLike) -> Array:
 
 
 def _phase(parametric: Parametric, w: Array) -> Array:
-    """Phase [rad], continuous over frequency: that of the value, on the branch of the sum over poles and zeros."""
+    """Return the phase [rad] of the response, unwrapped by the sum of the phases of poles and zeros."""
     model, s = parametric.fraction, np.asarray(1j * w, dtype=complex)
     with np.errstate(invalid="ignore"):
         undelayed = parametric.model.frequency_response(w) * np.exp(s * model.delay)

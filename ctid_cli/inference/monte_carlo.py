@@ -2,11 +2,11 @@
 
 The Monte Carlo standard errors are those of T. P. Morris, I. R. White and M. J. Crowther, Using simulation studies to
 evaluate statistical methods, Statistics in Medicine 38 (2019) 2074-2102, Table 6, with one change. Their formula for an
-empirical standard deviation holds for normal errors only: of exponential errors its 95 % intervals hold the truth in
-67 % of the cases, however many the data sets. The jackknife needs no such assumption, and is the same as their
-formulas for bias, mean square error and coverage. Intervals of what is positive are those of its logarithm, so that the
-interval of a reciprocal or a root is the reciprocal or the root of the interval; intervals of quantiles go from one
-order statistic to another.
+empirical standard deviation is valid for normal errors only: for exponential errors its 95 % intervals cover the true
+value in 67 % of the cases, for any number of data sets. The jackknife needs no such assumption, and equals their
+formulas for bias, mean square error and coverage. Intervals of positive quantities are those of the logarithm, so that
+the interval of a reciprocal or a root is the reciprocal or the root of the interval; intervals of quantiles are between
+order statistics.
 """
 
 import math
@@ -22,18 +22,18 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.intervals import normal_quantile, student_quantile
 from ctid_cli.text import did_you_mean
 
-#: Standard errors on either side of a normal estimate that make a 95 % interval.
+#: Half-width of a 95 % interval of a normal estimate [standard errors].
 QUANTILE = normal_quantile()
-#: Standard deviation of normal values over the median of their sizes.
+#: Standard deviation of normal values over their median absolute value.
 NORMAL_MAD = 1.4826
-#: Largest factor from a positive value to an end of its interval. A wider interval holds the truth in 98 to 100 % of
-#: the cases (normal, t5, t3 and exponential errors, 5 to 300 data sets) but spans more than two decades: one error that
-#: is 100 times as large as 59 others makes the factor of their mean square 2.5e4.
+#: Largest factor from a positive value to an end of its interval. Wider intervals cover the true value in 98 to 100 %
+#: of the cases (normal, t5, t3 and exponential errors, 5 to 300 data sets) but span more than two decades: one error
+#: 100 times as large as 59 others gives a factor of 2.5e4 for their mean square.
 LARGEST_FACTOR = 10.0
 
 
 class Measured(NamedTuple):
-    """A measure, its Monte Carlo standard error, and its 95 % interval; None for what so few data sets do not tell."""
+    """A measure, its Monte Carlo standard error, and its 95 % interval; None if there are too few data sets."""
 
     value: float | None = None
     error: float | None = None
@@ -46,31 +46,31 @@ class Sample(NamedTuple):
 
     #: Shape (n,).
     errors: Array
-    #: Standard errors that the estimator gave; NaN where it gave none, shape (n,).
+    #: Standard errors from the estimator; NaN if missing, shape (n,).
     widths: Array
-    #: Least variance that an unbiased estimator can have; NaN where it is not known.
+    #: Least variance of an unbiased estimator; NaN if unknown.
     bound: float = math.nan
-    #: Standard errors on either side of each estimate that make its 95 % interval, shape (n,).
+    #: Half-widths of the 95 % intervals in standard errors, shape (n,).
     quantiles: Array | float = QUANTILE
 
     def with_widths(self) -> "Sample":
-        """Return the part of the data sets that have a standard error."""
+        """Return the sample of the data sets with a standard error."""
         known = np.isfinite(self.widths)
         reach = np.broadcast_to(self.quantiles, known.shape)
         return self._replace(errors=self.errors[known], widths=self.widths[known], quantiles=reach[known])
 
 
 def complete(values: Array) -> BoolArray:
-    """Which values of parameters count: those of data sets with all parameters but the ones that none has.
+    """Return which values count: those of data sets with all parameters that any data set has.
 
-    All parameters so count the same data sets. NaN marks what is missing, shape (R, p).
+    All parameters thus use the same data sets. NaN marks missing values, shape (R, p).
     """
     known: BoolArray = np.isfinite(values)
     return known & known[:, known.any(axis=0)].all(axis=1, keepdims=True)
 
 
 def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval for a proportion.
+    """Return Wilson's score interval for a proportion.
 
     With z the normal quantile and p = k / n, the limits are
     ``(p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)``. They stay inside [0, 1] and are useful for
@@ -85,14 +85,14 @@ def wilson_interval(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
     centre = p + z**2 / (2 * n)
     half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     scale = 1 + z**2 / n
-    # Rounding would otherwise leave 0 or 1 by a hair.
+    # Exactly 0 or 1 without rounding errors.
     low = 0.0 if k == 0 else (centre - half) / scale
     high = 1.0 if k == n else (centre + half) / scale
     return low, high
 
 
 def share(hits: BoolArray) -> Measured:
-    """How many of the data sets do [%], with Wilson's interval."""
+    """Return the share of true values [%], with Wilson's interval."""
     n, k = hits.size, int(hits.sum())
     if not n:
         return Measured()
@@ -101,26 +101,26 @@ def share(hits: BoolArray) -> Measured:
 
 
 def total(values: Array) -> Measured:
-    """Sum of the values that are finite, without an error."""
+    """Return the sum of the finite values, without an error."""
     known = values[np.isfinite(values)]
     return Measured(float(known.sum()) if known.size else None)
 
 
 def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = True) -> Measured:
-    r"""Return a function of means over the data sets and of their number, with the error of the jackknife.
+    r"""Return a function of means over the data sets and of their number, with its jackknife error.
 
     With ``r_(i)`` the value of all n data sets but i,
 
     .. math:: s^2 = \frac{n-1}{n} \sum_i \left(r_{(i)} - \frac1n \sum_j r_{(j)}\right)^2.
 
     The interval of a positive value is that of its logarithm, with the jackknife of the logarithm: ``s`` over the value
-    has no bound where a reciprocal has an outlier. Ends that are farther than ``LARGEST_FACTOR`` are None.
+    is unbounded if a reciprocal has an outlier. Ends beyond ``LARGEST_FACTOR`` are None.
     """
     n = columns[0].size
     if not n:
         return Measured()
     sums = [column.sum() for column in columns]
-    with np.errstate(all="ignore"):  # what has no value is None
+    with np.errstate(all="ignore"):  # undefined values become None
         value = float(statistic(*(total / n for total in sums), n))
         if n == 1:
             return Measured(_finite(value))
@@ -138,15 +138,15 @@ def of_means(statistic: Callable[..., Array], *columns: Array, positive: bool = 
 
 
 def _jackknife(without: Array) -> float:
-    """Return the standard error from the n values without one data set each."""
+    """Return the standard error from the n leave-one-out values."""
     n = without.size
     return float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
 
 
 def quantile(values: Array, level: float = 0.5) -> Measured:
-    """A quantile between the order statistics that hold it with 95 %, whatever the distribution; values may be inf.
+    """Return a quantile with its distribution-free 95 % interval between order statistics; values may be infinite.
 
-    The number of values below it is binomial. The error is that of a normal interval as wide.
+    The number of values below it is binomial. The error is that of a normal interval of the same width.
     """
     from scipy.special import bdtr
 
@@ -160,46 +160,46 @@ def quantile(values: Array, level: float = 0.5) -> Measured:
     error = None if low is None or high is None else (high - low) / (2 * QUANTILE)
     before, part = divmod((n - 1) * level, 1.0)
     k = int(before)
-    # Nothing is interpolated between values of which one is infinite, unless the quantile is a value itself.
+    # No interpolation if the quantile is a value of the sample, because the next value may be infinite.
     value = float(ordered[k] if part == 0.0 else (1.0 - part) * ordered[k] + part * ordered[k + 1])
     return Measured(_finite(value), error, low, high)
 
 
 def bias(sample: Sample) -> Measured:
-    """Mean error."""
+    """Return the mean error."""
     return of_means(lambda mean, _: mean, sample.errors, positive=False)
 
 
 def deviation(sample: Sample) -> Measured:
-    """Standard deviation of the estimates."""
+    """Return the standard deviation of the estimates."""
     centred = _centred(sample.errors)
     return of_means(_scatter, centred, centred**2) if centred.size > 1 else Measured()
 
 
 def mean_square(sample: Sample) -> Measured:
-    """Mean square error."""
+    """Return the mean square error."""
     return of_means(lambda mean, _: mean, sample.errors**2)
 
 
 def root_mean_square(sample: Sample) -> Measured:
-    """Root of the mean square error."""
+    """Return the root mean square error."""
     return of_means(_root, sample.errors**2)
 
 
 def robust_deviation(sample: Sample) -> Measured:
-    """Standard deviation from the median distance to the median, which outliers hardly change."""
+    """Return a robust standard deviation from the median absolute deviation."""
     if not sample.errors.size:
         return Measured()
     return quantile(NORMAL_MAD * np.abs(sample.errors - np.median(sample.errors)))
 
 
 def standard_error(sample: Sample) -> Measured:
-    """Return the root mean square of the standard errors that the estimator gave."""
+    """Return the root mean square of the standard errors from the estimator."""
     return of_means(_root, sample.with_widths().widths ** 2)
 
 
 def error_ratio(sample: Sample) -> Measured:
-    """Return the same over the standard deviation of these estimates: below 1, intervals are too short."""
+    """Return the RMS standard error over the standard deviation of the estimates: below 1, intervals are too short."""
     known = sample.with_widths()
     centred = _centred(known.errors)
     if centred.size < 2:
@@ -208,17 +208,17 @@ def error_ratio(sample: Sample) -> Measured:
 
 
 def covered(sample: Sample) -> BoolArray:
-    """Which 95 % intervals hold the true value; a standard error that could not be computed covers nothing."""
+    """Return which 95 % intervals cover the true value; intervals without a standard error do not."""
     return np.asarray(np.abs(sample.errors) <= sample.quantiles * sample.widths)
 
 
 def coverage(sample: Sample) -> Measured:
-    """How many of the 95 % intervals hold the true value [%]."""
+    """Return the coverage of the 95 % intervals [%]."""
     return share(covered(sample)) if np.isfinite(sample.widths).any() else Measured()
 
 
 def efficiency(sample: Sample) -> Measured:
-    """Least possible variance over the mean square error [%]."""
+    """Return the least possible variance over the mean square error [%]."""
     return of_means(lambda mean, _: 100.0 * sample.bound / mean, sample.errors**2)
 
 
@@ -231,7 +231,7 @@ def _centred(errors: Array) -> Array:
 
 
 def _scatter(mean: Array, square: Array, n: int) -> Array:
-    # Rounding may leave the variance of equal values below zero.
+    # Rounding may make the variance of equal values negative.
     # One value has no standard deviation.
     return np.sqrt(np.maximum(square - mean**2, 0.0) * n / (n - 1) if n > 1 else np.full_like(square, np.nan))
 
@@ -242,12 +242,12 @@ def _finite(value: float) -> float | None:
 
 @dataclass(frozen=True)
 class Measure:
-    """What can be asked for by name."""
+    """A measure that can be requested by name."""
 
     meaning: str
-    #: ``""`` stands for that of the parameter, ``^2`` for its square.
+    #: ``""`` means that of the parameter, ``^2`` its square.
     unit: str
-    #: What it is computed from: ``errors`` of parameters, ``distance`` between models, whether estimates ``converged``,
+    #: Source of its values: ``errors`` of parameters, ``distance`` between models, whether estimates ``converged``,
     #: their ``status``, ``measures`` of tracks, or a column of the estimates.
     source: str
     compute: Callable[..., Measured]
@@ -256,7 +256,7 @@ class Measure:
 
 
 def requested(name: str, custom: Mapping[str, Measure] = MappingProxyType({})) -> Measure:
-    """A measure by its name: ``rmse``, ``rmse:delay`` of one parameter, ``rmse:poles``, or ``response:1.5`` [rad/s]."""
+    """Return a measure by name: ``rmse``, ``rmse:delay`` (one parameter), ``rmse:poles``, ``response:1.5`` [rad/s]."""
     base, colon, argument = name.partition(":")
     known = {**MEASURES, **custom}
     if base not in known:
@@ -271,7 +271,7 @@ def requested(name: str, custom: Mapping[str, Measure] = MappingProxyType({})) -
         if not usable:
             raise UsageError(f"{name!r} needs a frequency [rad/s] above zero, such as response:1.5")
     elif colon and (measure.source != "errors" or not argument):
-        raise UsageError(f"{name!r} is about the estimate as a whole; ask for {base}")
+        raise UsageError(f"{name!r} must not have a parameter; use {base}")
     return measure
 
 
@@ -300,13 +300,13 @@ MEASURES: Mapping[str, Measure] = {
 }
 #: Data sets of the first block.
 AT_LEAST = 200
-#: From the end of one block to that of the next: data sets come in steps of a quarter of those that are there.
+#: Ratio of the numbers of data sets at the ends of successive blocks.
 GROWTH = 1.25
 
 
 @dataclass(frozen=True)
 class Until:
-    """Largest half-widths of 95 % intervals that are asked for; None where it does not matter."""
+    """Required half-widths of 95 % intervals; None without requirement."""
 
     #: Of percentages [percentage points].
     percent_half_width: float | None = None
@@ -318,7 +318,7 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Replications(NamedTuple):
-    """What an estimator gave on the first data sets of a data cell, in their order."""
+    """Results of an estimator on the first data sets of a data cell, in order."""
 
     #: Which meet the success rule, shape (R,); None without a rule.
     hits: BoolArray | None
@@ -331,13 +331,13 @@ class Replications(NamedTuple):
     start: str = "none"
 
     def first(self, count: int) -> "Replications":
-        """Return the same on fewer data sets."""
+        """Return the results on the first ``count`` data sets."""
         return self._replace(hits=None if self.hits is None else self.hits[:count], errors=self.errors[:count])
 
 
 @dataclass(frozen=True)
 class Widest:
-    """The measure of a data cell whose interval is farthest from what is asked for."""
+    """The measure of a data cell whose interval exceeds the required one most."""
 
     estimator: str
     #: Its swept options.
@@ -346,35 +346,35 @@ class Widest:
     #: ``percent`` or ``rmse``.
     measure: str
     parameter: str | None
-    #: Half-width of the 95 % interval, [percentage points] or as a fraction [-]; None where it is not known.
+    #: Half-width of the 95 % interval, [percentage points] or as a fraction [-]; None if unknown.
     half_width: float | None
-    #: The largest that is asked for.
+    #: The required half-width.
     asked: float
 
     @property
     def excess(self) -> float:
-        """Half-width over what is asked for; at most 1 where it is narrow enough."""
+        """Half-width over the required one; at most 1 if sufficient."""
         return math.inf if self.half_width is None else self.half_width / self.asked
 
 
 @dataclass(frozen=True)
 class CellPrecision:
-    """How well a data cell is known, and whether its data sets are enough."""
+    """Precision of a data cell, and whether it has enough data sets."""
 
     #: Hash of the data cell, and its swept values.
     cell: str
     swept: Mapping[str, Any]
-    #: ``enough``; ``open``, more are needed; ``at_most``, as many as are allowed and not precise enough.
+    #: ``enough``; ``open``: more are needed; ``at_most``: the largest allowed number is not precise enough.
     state: Literal["enough", "open", "at_most"]
-    #: Data sets at the end of the last finished block, and those that are needed as far as is known.
+    #: Data sets at the end of the last finished block, and number currently known to be needed.
     finished: int
     needed: int
-    #: None before the end of the first block, and where there is nothing to measure.
+    #: None before the end of the first block, and without any measure.
     widest: Widest | None
 
 
 def block_ends(at_most: int) -> Iterator[int]:
-    """Numbers of data sets after which the intervals are looked at; they depend on nothing that was computed."""
+    """Yield the numbers of data sets after which the intervals are checked, independent of any results."""
     end = AT_LEAST
     while end < at_most:
         yield end
@@ -385,16 +385,15 @@ def block_ends(at_most: int) -> Iterator[int]:
 def decide(
     until: Until, estimators: Sequence[Replications], at_most: int, cell: str = "", swept: Mapping[str, Any] = _NOTHING
 ) -> CellPrecision:
-    """Look at the intervals at the end of each block, up to the first one that leaves none too wide.
+    """Check the intervals at the end of each block, up to the first block after which all are narrow enough.
 
-    Data sets come in blocks. At the end of each the 95 % intervals of all measures of all estimators are looked at, and
-    the data cell has enough data sets once none is wider than asked for. Looking again and again favours samples that
-    seem more precise than they are, so that an interval at the end holds the truth a little less often than one from a
-    number of data sets fixed before (Y. S. Chow and H. Robbins, On the asymptotic theory of fixed-width sequential
-    confidence intervals for the mean, Annals of Mathematical Statistics 36 (1965) 457-462). Blocks that grow keep the
-    looks few, and the first one is large enough for the widths themselves to be known: of percentages up to 98 and of
-    nearly normal errors the intervals hold the truth in 93 % of the cases or more, without a correction
-    (docs/measures.md).
+    At the end of each block of data sets the 95 % intervals of all measures of all estimators are checked, and the data
+    cell has enough data sets once all have the required width. Repeated checks favour samples that seem more precise
+    than they are, so that the final intervals cover the true value slightly less often than those of a fixed number of
+    data sets (Y. S. Chow and H. Robbins, On the asymptotic theory of fixed-width sequential confidence intervals for
+    the mean, Annals of Mathematical Statistics 36 (1965) 457-462). Growing blocks keep the number of checks small, and
+    the first block is large enough for reliable widths: for percentages up to 98 and nearly normal errors the intervals
+    cover the true value in 93 % of the cases or more, without a correction (docs/measures.md).
     """
     stored = min(len(one.errors) for one in estimators)
     finished, widest = 0, None
@@ -410,7 +409,7 @@ def decide(
 
 
 def _half_widths(until: Until, found: Replications) -> Iterator[Widest]:
-    """Yield how well each measure is known; parameters that have no value in any data set do not count."""
+    """Yield the half-width of each measure; parameters without a value in any data set are ignored."""
     of = found.estimator, found.options, found.start
     if until.percent_half_width is not None and found.hits is not None:
         low, high = wilson_interval(int(found.hits.sum()), found.hits.size)
@@ -423,9 +422,9 @@ def _half_widths(until: Until, found: Replications) -> Iterator[Widest]:
 
 
 def _relative(errors: Array) -> float | None:
-    """Half-width of the interval of a root mean square error, as a fraction of it [-]."""
+    """Return the half-width of the interval of a root mean square error, as a fraction of it [-]."""
     found = root_mean_square(Sample(errors, errors))
     if found.error is None or found.value is None:
         return None
-    # What is the same in all data sets, such as a delay that was given, has no Monte Carlo error.
+    # Constants over all data sets, such as a given delay, have no Monte Carlo error.
     return QUANTILE * found.error / found.value if found.error else 0.0

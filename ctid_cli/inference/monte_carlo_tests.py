@@ -1,6 +1,6 @@
-"""Tests of Monte Carlo measures of an estimator against what theory expects of it.
+"""Tests of Monte Carlo measures of an estimator against asymptotic theory.
 
-Finite records are not ideal: small departures are allowed for, and each test asks whether one is larger than that.
+Theory is approximate for finite records: each test has a tolerance, and the null hypothesis is a smaller departure.
 """
 
 import math
@@ -12,10 +12,10 @@ from scipy.special import bdtr, stdtr
 
 from ctid_cli.inference.monte_carlo import QUANTILE, Measured
 
-#: Fewer data sets than these say nothing.
+#: Fewest data sets for a test.
 FEWEST = 50
-#: What is allowed for: a bias in standard deviations of one estimate, standard errors that are too small or too large
-#: by a factor, and an RMSE above theory by one.
+#: Tolerances: bias in standard deviations of one estimate; factors by which standard errors are too small or too large;
+#: factor of the RMSE above theory.
 BIAS, SMALL, LARGE, EXCESS = 0.25, 1.1, 1.25, 1.25
 #: Coverage of intervals that are shorter by that factor.
 COVERAGE = 2.0 * NormalDist().cdf(QUANTILE / SMALL) - 1.0
@@ -30,14 +30,14 @@ class Departure(NamedTuple):
 
     #: ``small``, ``large``: of the standard errors.
     kind: Kind
-    #: Bias in standard errors, the factor by which standard errors are off, intervals that miss the truth [%], or RMSE
-    #: over that of theory: the larger, the worse.
+    #: Bias in standard errors, factor of the error of standard errors, intervals that miss the true value [%], or RMSE
+    #: over its theoretical value: the larger, the worse.
     size: float
     p_value: float
 
 
 def departures(measured: Mapping[str, Measured], n: int, with_widths: int) -> Iterator[Departure]:
-    """Test the measures of one parameter, which are of n estimates; some of them have standard errors."""
+    """Yield tests of the measures of one parameter from n estimates, ``with_widths`` of them with standard errors."""
     value = {name: each.value for name, each in measured.items()}
     error = {name: each.error or 0.0 for name, each in measured.items()}
     bias, deviation = value["bias"], value["deviation"]
@@ -46,7 +46,7 @@ def departures(measured: Mapping[str, Measured], n: int, with_widths: int) -> It
     scale = value["standard_error"] or deviation
     yield Departure("bias", abs(bias) / scale, _p_value(bias, BIAS * deviation, error["bias"], n))
     if (ratio := value["error_ratio"]) and with_widths >= FEWEST:
-        # Where errors with heavy tails happened to be small, the jackknife believes too much in their deviation.
+        # For heavy-tailed errors without large ones in the sample, the jackknife error is too small.
         uncertain = max(error["error_ratio"] / ratio, 1.0 / math.sqrt(2.0 * with_widths))
         margin = math.log(SMALL if ratio < 1.0 else LARGE)
         p_value = _p_value(math.log(ratio), margin, uncertain, with_widths)
@@ -60,7 +60,7 @@ def departures(measured: Mapping[str, Measured], n: int, with_widths: int) -> It
 
 
 def _p_value(value: float, margin: float, error: float, n: int) -> float:
-    """Return the chance of a value as far from zero as this if the true one is at most the margin away."""
+    """Return the p-value of a value for the null hypothesis that its true magnitude is at most the margin."""
     return _tail((abs(value) - margin) / error, n) + _tail((abs(value) + margin) / error, n)
 
 

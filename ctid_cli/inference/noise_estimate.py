@@ -1,7 +1,7 @@
 r"""The noise model that is estimated with a plant, and Hausman's test of the plant against its output-error estimate.
 
-Both estimates of the plant are right if the models of plant and noise are; where either is too small they weigh
-what is missing differently. The joint one being efficient, their difference has the covariance ``C_oe - C_joint`` [1]_.
+Both estimates of the plant are consistent if the models of plant and noise are correct; otherwise their asymptotic
+biases differ. Since the joint estimate is efficient, their difference has the covariance ``C_oe - C_joint`` [1]_.
 
 References
 ----------
@@ -21,18 +21,18 @@ from ctid_cli.inference.innovations import MOST_GIVEN, NoiseFit, Orders, coeffic
 from ctid_cli.inference.residual_tests import orthonormal
 from ctid_cli.signals.noise import ArmaNoise
 
-#: Level of Hausman's test.
+#: Significance level of Hausman's test.
 LEVEL = 0.01
-#: Directions in which the output-error estimate has at most this share more variance than the joint one tell nothing.
+#: Directions in which the output-error variance exceeds the joint one by at most this share are not tested.
 NO_GAIN = 0.05
-#: Directions of the noise's coefficients below this share of the greatest one cannot be told apart.
+#: Directions of the noise coefficients below this share of the greatest one cannot be distinguished.
 RANK = 1e-6
-#: Eigenvalues of a correlation matrix below this share of the greatest one are rounding.
+#: Eigenvalues of a correlation matrix below this share of the greatest one are rounding errors.
 ROUNDING = 1e-10
 
 
 def orders_of(noise_model: str) -> Orders | None:
-    """Orders of D and C that an option gives, (0, 0) for white noise; None where they are to be chosen."""
+    """Return the orders of D and C of an option, (0, 0) for white noise; None for automatic choice."""
     if noise_model in ("white", "auto"):
         return None if noise_model == "auto" else (0, 0)
     found = re.fullmatch(r"arma:(\d{1,2}),(\d{1,2})", noise_model) if isinstance(noise_model, str) else None
@@ -43,11 +43,11 @@ def orders_of(noise_model: str) -> Orders | None:
 
 
 class Hausman(NamedTuple):
-    """F statistic of the difference of two estimates of the plant."""
+    """F test of the difference of two estimates of the plant."""
 
     statistic: float
     freedom: int
-    #: Probability of a larger one if both models are right; NaN where they have the same accuracy.
+    #: Probability of a larger statistic if both models are correct; NaN if they have the same accuracy.
     p_value: float
 
 
@@ -58,15 +58,15 @@ UNTESTED = Hausman(0.0, 0, np.nan)
 def hausman(difference: Array, robust: Array, efficient: Array, degrees_of_freedom: float) -> Hausman:
     """Test a difference of estimates in the directions in which one is more accurate than the other.
 
-    The less accurate covariance is known as well as some degrees of freedom tell: those of Student's t of intervals.
-    Measured at the level of 1 %, 600 samples of a noise with two poles at .99: 5 % false alarms by the chi-square
-    distribution, none by F; 58 % of models with a pole too few are detected by either.
+    The degrees of freedom of the less accurate covariance are those of Student's t of intervals. Measured at the level
+    of 1 %, 600 samples of a noise with two poles at .99: 5 % false alarms by the chi-square distribution, none by F;
+    58 % of models with a pole too few are detected by either.
     """
     from scipy.special import fdtrc  # slow to import
 
     if not (np.isfinite(robust).all() and np.isfinite(efficient).all() and difference.size):
         return UNTESTED
-    # In units of the efficient standard errors, whatever those of the parameters are.
+    # In units of the efficient standard errors, independent of parameter units.
     scale = 1.0 / np.sqrt(np.diag(efficient))
     lengths, axes = np.linalg.eigh(efficient * np.outer(scale, scale))
     kept = lengths > ROUNDING * lengths[-1]
@@ -82,24 +82,24 @@ def hausman(difference: Array, robust: Array, efficient: Array, degrees_of_freed
 
 
 def noise_covariance(fit: NoiseFit, errors: Sequence[Array], used: Sequence[BoolArray]) -> Array:
-    """Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``; that of a common factor is large."""
+    """Return the covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``; it is large for a common factor."""
     slopes = coefficient_slopes(fit.noise, errors, [steps_of(use) for use in used])
     return np.asarray(np.exp(fit.deviance / fit.samples) * np.linalg.pinv(slopes.T @ slopes, hermitian=True))
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """The noise of a joint fit, and the output-error fit beside it."""
+    """Noise of a joint fit, and the output-error fit for comparison."""
 
     #: ``v = C(q)/D(q) e``, with the variance of e [output unit^2].
     noise: ArmaNoise
     #: Covariance of the coefficients ``d_1 ... d_P, c_1 ... c_Q``, shape (P + Q, P + Q).
     covariance: Array = field(repr=False)
-    #: ``-2 ln L`` of the joint fit but for a constant: N times the logarithm of the variance of e.
+    #: ``-2 ln L`` of the joint fit up to a constant: N times the logarithm of the variance of e.
     deviance: float
-    #: Whether BIC has chosen the orders.
+    #: Whether the orders were chosen by BIC.
     chosen: bool
-    #: Parameters of the output-error fit, as those of the joint fit, and their errors for coloured noise, shape (p,).
+    #: Parameters of the output-error fit, and their standard errors for coloured noise, shape (p,).
     output_error: Array = field(repr=False)
     output_error_errors: Array = field(repr=False)
     #: Fit of its simulated output [%].
@@ -121,29 +121,29 @@ class NoiseEstimate:
 
     @property
     def differs(self) -> bool:
-        """Whether the estimates of the plant differ by more than chance gives."""
+        """Whether the estimates of the plant differ significantly."""
         return self.test.p_value < LEVEL
 
     def error_ratios(self, covariance: Array) -> Array:
-        """Return the standard errors of the output-error fit over those of the joint one; NaN where there are none."""
+        """Return the standard errors of the output-error fit over those of the joint one; NaN if undefined."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(self.output_error_errors / np.sqrt(np.diag(covariance)))
 
     def prediction_errors(self, errors: Sequence[Array], used: Sequence[BoolArray], ahead: int) -> list[Array]:
-        """Errors of predictions from outputs that are at least ``ahead`` samples old, from output errors."""
+        """Return the ``ahead``-step prediction errors from output errors."""
         each = zip(sampled(self.noise, used), errors, strict=True)
         return [e - noise.predicted(e, ahead) for noise, e in each]
 
     def whitened(
         self, psi: Sequence[Array], errors: Sequence[Array], used: Sequence[BoolArray]
     ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Sensitivities and innovations of the joint fit, less what the coefficients of the noise take with them."""
+        """Return whitened sensitivities, projected off those of the noise coefficients, and innovations."""
         noises = sampled(self.noise, used)
         innovations = tuple(noise.whitened(e) for noise, e in zip(noises, errors, strict=True))
         columns = np.concatenate([noise.whitened(block) for noise, block in zip(noises, psi, strict=True)])
-        beside = coefficient_slopes(self.noise, errors, [noise.steps for noise in noises])
-        if beside.shape[1]:
-            basis = beside @ orthonormal(beside, RANK)
+        of_noise = coefficient_slopes(self.noise, errors, [noise.steps for noise in noises])
+        if of_noise.shape[1]:
+            basis = of_noise @ orthonormal(of_noise, RANK)
             columns = columns - basis @ (basis.T @ columns)
         return tuple(np.split(columns, np.cumsum([e.size for e in errors])[:-1])), innovations
 

@@ -1,9 +1,9 @@
 r"""Autoregressive models of stationary output noise, from residuals on a regular clock: Yule and Walker's, and REML.
 
-Yule and Walker's equations take residuals as the noise itself. A fit takes from the residuals whatever its
-sensitivities explain. On a short record of slow noise that is much of the noise's power at low frequency, and the
-autocovariances of the residuals are too small. REML maximises the likelihood of what is left, whatever the parameters
-[1]_: with V the covariance matrix of the noise over its innovation variance,
+Yule and Walker's equations treat residuals as the noise. A fit removes from the residuals the part of the noise that
+its sensitivities explain. On a short record of slow noise that is much of the noise's power at low frequency, and the
+autocovariances of the residuals are too small. REML maximises the likelihood of the part that does not depend on the
+parameters [1]_: with V the covariance matrix of the noise over its innovation variance,
 
 .. math:: \min\; (N - p) \ln s^2 + \ln|V| + \ln|\Psi'V^{-1}\Psi|,\qquad
           s^2 = \min_x (e - \Psi x)' V^{-1} (e - \Psi x) / (N - p).
@@ -23,36 +23,36 @@ from numba import njit
 
 from ctid_cli.arrays import Array
 
-#: Orders up to this are tried in turn, until the criterion has risen so often.
+#: Greatest order tried, and number of successive rises of the criterion after which the search stops.
 ORDERS, RISES = 8, 3
 #: Greatest partial correlation.
 INSIDE = 0.9999
-#: Fisher's steps end where they promise less than this of the criterion, or after this number.
+#: Fisher scoring ends at a predicted decrease of the criterion below this, or after this number of steps.
 PROMISE, STEPS = 1e-10, 60
-#: Residuals of which the sensitivities leave less than this fraction are rounding.
+#: Residuals whose unexplained part is below this fraction are rounding errors.
 NO_NOISE = 1e-12
-#: The greatest order is that of the samples over this, and half of the shortest experiment.
+#: Least number of samples per order; the order is also at most half of the shortest experiment.
 SAMPLES_PER_ORDER = 10
-#: Rows of a block: a few dozen columns of them stay in the processor's cache.
+#: Rows of a block: a few dozen columns of them fit into the processor's cache.
 ROWS = 4096
 
 
 class Rows(Protocol):
-    """Columns that are made, or looked up, a block of rows at a time."""
+    """Columns that are computed, or read, in blocks of rows."""
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
 
     def __getitem__(self, rows: slice, /) -> Array:
-        """Some rows, shape (count, columns)."""
+        """Return a slice of rows, shape (count, columns)."""
 
 
 def row_blocks(count: int) -> Iterator[slice]:
-    """Slices that cover ``count`` rows."""
+    """Return slices that cover ``count`` rows."""
     return (slice(first, min(first + ROWS, count)) for first in range(0, count, ROWS))
 
 
-#: Share of the energy of a noise that is rounding.
+#: Relative rounding error of the energy of a noise.
 ROUNDING = 1e-17
 
 
@@ -67,7 +67,7 @@ class NoiseModel:
     first_autocovariances: Array
     #: Variance of e [output unit^2].
     innovation_variance: float
-    #: Partial correlations at the lags 1 ... r, of the opposite sign [-], where they are known, shape (order,).
+    #: Negative partial correlations at the lags 1 ... r [-], if known, shape (order,).
     partial: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
@@ -76,21 +76,21 @@ class NoiseModel:
         return int(self.coefficients.size - 1)
 
     def effective_count(self, count: int) -> float:
-        """Number of independent samples whose mean is as uncertain, at most the number of these samples."""
+        """Return the effective sample size for the mean, at most ``count``."""
         gain = float(self.coefficients.sum()) ** 2
         ratio = gain * float(self.first_autocovariances[0]) / self.innovation_variance if self.order else 1.0
         return count * min(ratio, 1.0)
 
     def innovations(self, v: Array) -> Array:
-        """The white noise e behind successive samples of v, which is taken as zero before."""
+        """Return the innovations e of successive samples of v, which is zero before the first one."""
         white: Array = np.convolve(v, self.coefficients)[: v.size]
         return white
 
     def covariance_of(self, columns: Rows) -> Array:
-        r"""Covariance of the products of successive samples of v with columns.
+        r"""Return the covariance of the products of successive samples of v with columns.
 
         R is symmetric in time, so ``columns' R columns = s^2 sum g g'`` with ``g = c(q)^{-1} columns``, over all times,
-        those after the last row included: there the last r rows go on by themselves.
+        including the free response of the recursion after the last row.
         """
         r = self.order
         if not len(columns):
@@ -103,11 +103,11 @@ class NoiseModel:
             total += block[r:].T @ block[r:]
             before = block[block.shape[0] - r :]
         if r:
-            # Each step of the recursion moves the rows on; doubling the step sums the energy of all to come.
+            # Energy of the free response, summed by doubling the step of the recursion.
             step = np.eye(r, k=1)
             step[-1] = -self.coefficients[:0:-1]
             energy = np.outer(step[-1], step[-1])
-            # Rounding may leave poles of a very slow noise outside the unit circle: then nothing is finite.
+            # Rounding may put poles of a very slow noise outside the unit circle: the result is then not finite.
             with np.errstate(over="ignore", invalid="ignore"):
                 while (more := step.T @ energy @ step).max() > ROUNDING * energy.max():
                     energy, step = energy + more, step @ step
@@ -117,20 +117,20 @@ class NoiseModel:
 
 @njit(cache=True, nogil=True)
 def autoregress(columns: Array, coefficients: Array) -> None:
-    """Columns behind ``1/c(q)``, in place; the first r rows are outputs already."""
+    """Filter columns by ``1/c(q)`` in place; the first r rows are outputs already."""
     r = coefficients.size - 1
     for t in range(r, columns.shape[0]):
-        # Row by row, so that all columns advance side by side in memory.
+        # Row by row, for contiguous memory access.
         for i in range(1, r + 1):
             for j in range(columns.shape[1]):
                 columns[t, j] -= coefficients[i] * columns[t - i, j]
 
 
 def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None, penalty: float = 2.0) -> NoiseModel:
-    """Yule-Walker model of the noise, of the order that Akaike's criterion chooses, or that with another penalty.
+    """Return a Yule-Walker model of the noise; the order is chosen by Akaike's criterion or with another penalty.
 
-    The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero; no product reaches from one experiment
-    into another. An ARMA noise is approximated: the order grows with the record.
+    The autocovariances are ``sum v(t) v(t - lag) / N``, about a mean of zero, within experiments. An ARMA noise is
+    approximated: the order grows with the record.
     """
     count = sum(block.size for block in blocks)
     if max_order is None:
@@ -160,17 +160,17 @@ def fit_noise_model(blocks: Sequence[Array], max_order: int | None = None, penal
 
 
 class _Likelihood(NamedTuple):
-    """The criterion at one model, with what Fisher's scoring needs, and the innovation variance."""
+    """The criterion at one model, with gradient and information for Fisher scoring, and the innovation variance."""
 
     criterion: float
-    #: By the partial correlations, shape (r,), and the expected second derivatives, shape (r, r).
+    #: Derivatives by the partial correlations, shape (r,), and expected second derivatives, shape (r, r).
     gradient: Array
     information: Array
     variance: float
 
 
 def levinson(partial: Array) -> tuple[Array, Array, Array]:
-    """Coefficients ``(1, c_1 ... c_r)``, their slopes by the partial correlations, and autocovariances over s^2.
+    """Return ``(1, c_1 ... c_r)``, their slopes by the partial correlations, and autocovariances over s^2.
 
     Shapes (r + 1,), (r, r + 1) and (r + 1,).
     """
@@ -178,10 +178,10 @@ def levinson(partial: Array) -> tuple[Array, Array, Array]:
     c, slopes, covariances = np.eye(1, r + 1)[0], np.zeros((r, r + 1)), np.zeros(r + 1)
     covariances[0] = variance = 1.0 / np.prod(1.0 - partial**2)
     for k, value in enumerate(partial):
-        # The model of order k predicts the next autocovariance, but for the partial correlation.
+        # The model of order k predicts the next autocovariance, up to the partial correlation.
         covariances[k + 1] = -value * variance - c[1 : k + 1] @ covariances[k:0:-1]
         variance *= 1.0 - value * value
-        # c of order k + 1 is c of order k plus the partial correlation times the same backwards; so are its slopes.
+        # c of order k + 1 is c of order k plus the partial correlation times c reversed; likewise its slopes.
         backwards = c[k + 1 :: -1].copy()
         slopes[:k, : k + 2] += value * slopes[:k, k + 1 :: -1]
         slopes[k, : k + 2] = backwards
@@ -190,19 +190,19 @@ def levinson(partial: Array) -> tuple[Array, Array, Array]:
 
 
 def restricted_likelihood(products: Array, count: int, blocks: int, partial: Array) -> _Likelihood:
-    """The criterion from products of the columns (Q, e) at pairs of lags, shape (lags, lags, p + 1, p + 1).
+    """Return the criterion from products of the columns (Q, e) at pairs of lags, shape (lags, lags, p + 1, p + 1).
 
-    ``v'V^-1 v = sum_ij c_i c_j D_ij`` with ``D_ij = sum_t v(t + i) v(t + j)`` over ``0 <= t < n - i - j``: exactly, the
-    first samples included (Box and Jenkins, *Time Series Analysis*, appendix A7.4).
+    ``v'V^-1 v = sum_ij c_i c_j D_ij`` with ``D_ij = sum_t v(t + i) v(t + j)`` over ``0 <= t < n - i - j``: exact,
+    including the first samples (Box and Jenkins, *Time Series Analysis*, appendix A7.4).
     """
     p, r = products.shape[2] - 1, partial.size
     left = count - p
     c, slopes, covariances = levinson(partial)
     products = products[: r + 1, : r + 1]
-    # Cholesky's factor of (Q, e)' V^-1 (Q, e): its last diagonal entry is what the sensitivities do not explain.
+    # Cholesky's factor of (Q, e)' V^-1 (Q, e): its last diagonal entry is the unexplained part.
     factor = np.linalg.cholesky(np.tensordot(np.outer(c, c), products))
     squared = factor[p, p] ** 2
-    # d criterion = sum W d(gram): with L the factor, its inverse's last row is the residual's combination.
+    # d criterion = sum W d(gram): the last row of the inverse factor has the weights of the residual.
     inverse = np.linalg.inv(factor)
     weight = inverse[:p].T @ inverse[:p] + left * np.outer(inverse[p], inverse[p])
     gradient = slopes @ (2.0 * np.tensordot(products, weight) @ c)
@@ -211,21 +211,21 @@ def restricted_likelihood(products: Array, count: int, blocks: int, partial: Arr
     criterion = left * np.log(squared / left) + 2.0 * np.log(np.diag(factor)[:p]).sum()
     criterion -= blocks * (orders @ np.log(one))
     gradient += 2.0 * blocks * orders * partial / one
-    # The coefficients have the information of a regression on the samples before, N R(i - j) / s^2, twice in -2 ln L.
+    # Information of the coefficients as in a regression on earlier samples, N R(i - j) / s^2, twice in -2 ln L.
     toeplitz = 2.0 * left * covariances[np.abs(np.subtract.outer(orders, orders))]
     steps = slopes[:, 1:]
     return _Likelihood(float(criterion), gradient, steps @ toeplitz @ steps.T, float(squared / left))
 
 
 def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> NoiseModel:
-    """REML model of the noise behind the residuals of a fit with sensitivities psi, of full rank.
+    """Return the REML model of the noise from the residuals of a fit with sensitivities psi of full rank.
 
-    The order is that of the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
-    criterion chooses for the Yule-Walker model: the noise may have a memory much longer than its first lags show.
+    The order has the least AICc among those up to 8, until it has risen three times, and the one that Akaike's
+    criterion chooses for the Yule-Walker model, for noise with a long memory.
     """
     stacked, errors = np.concatenate(psi), np.concatenate(residuals)
     orthonormal = np.linalg.qr(stacked / np.linalg.norm(stacked, axis=0))[0]
-    # What the sensitivities explain tells nothing; away from an optimum it may be most.
+    # The part explained by the sensitivities contains no information; away from an optimum it may be most.
     left = errors - orthonormal @ (orthonormal.T @ errors)
     power = float(left @ left)
     if not power > NO_NOISE**2 * float(errors @ errors):
@@ -241,7 +241,7 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
         try:
             likelihood: _Likelihood = restricted_likelihood(products, count, number, partial)
         except np.linalg.LinAlgError:
-            # Residuals without noise, which so slow a model would explain altogether.
+            # Residuals without noise, which a very slow model would explain completely.
             r = partial.size
             return _Likelihood(np.inf, np.zeros(r), np.eye(r), np.nan)
         return likelihood
@@ -266,7 +266,7 @@ def fit_residual_noise(psi: Sequence[Array], residuals: Sequence[Array]) -> Nois
 
 
 def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
-    """Partial correlations of the least criterion nearby, by Fisher's scoring in their inverse hyperbolic tangents."""
+    """Return partial correlations at a local minimum, by Fisher scoring in their inverse hyperbolic tangents."""
     z = np.arctanh(np.clip(start, -INSIDE, INSIDE))
     here = at(np.tanh(z))
     for _ in range(STEPS):
@@ -288,7 +288,7 @@ def _scored(at: Callable[[Array], _Likelihood], start: Array) -> Array:
 
 
 def _products(blocks: Sequence[Array], order: int) -> Array:
-    """D of all pairs of lags."""
+    """Return D of all pairs of lags."""
     size = blocks[0].shape[1]
     products = np.zeros((order + 1, order + 1, size, size))
     for i in range(order + 1):

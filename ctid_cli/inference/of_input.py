@@ -1,4 +1,4 @@
-"""The transfer function of one of several inputs, as a model with the joint law of all parameters."""
+"""The transfer function of one of several inputs, with the joint distribution of all parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OWN = re.compile(r"[ab]\d+|delay")
 
 @dataclass(frozen=True, eq=False)
 class InputFit(FittedModel):
-    """What a fit with several inputs says of one of them."""
+    """Part of a fit with several inputs that belongs to one of them."""
 
     model: TransferFunction
     #: Names of all parameters of the fit; those that this transfer function does not have begin with "other".
@@ -26,10 +26,10 @@ class InputFit(FittedModel):
 
     @classmethod
     def of(cls, name: str, model: TransferFunction, names: tuple[str, ...], law: Uncertainty) -> InputFit:
-        """Return the transfer function of an input; parameters of a common denominator have names without one."""
+        """Return the transfer function of an input; parameters of a common denominator have no prefix."""
         own = [(each.removeprefix(f"{name}_"), each) for each in names]
         return cls(model, tuple(bare if _OWN.fullmatch(bare) else f"other {each}" for bare, each in own), law)
 
     def _estimated(self) -> Estimated:
-        """The transfer function with the joint law of all parameters."""
+        """Return the transfer function with the joint distribution of all parameters."""
         return Estimated(Parametric(self.model, self.parameter_names), self.law)

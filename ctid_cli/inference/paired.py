@@ -1,4 +1,4 @@
-"""Two estimators on the same data sets: how far apart they are, and whether that may be chance."""
+"""Paired comparison of two estimators on the same data sets: differences and their significance."""
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from ctid_cli.arrays import Array, IntArray
 from ctid_cli.inference.monte_carlo import QUANTILE
 
-#: Resamples of a bootstrap, its seed, and how many are drawn at a time.
+#: Resamples of a bootstrap, its seed, and the number drawn at a time.
 DRAWS, SEED, BLOCK = 4000, 20190130, 200
 NORMAL = NormalDist()
 
@@ -26,10 +26,10 @@ class Difference(NamedTuple):
 
 
 def mcnemar(first: int, second: int) -> float:
-    """Mid-p value of McNemar's test, from the data sets on which only the first, and only the second, succeeds.
+    """Return the mid-p value of McNemar's test, from the numbers of data sets with only one success.
 
     M. W. Fagerland, S. Lydersen and P. Laake, BMC Medical Research Methodology 13 (2013) 91: it keeps its level for any
-    number of data sets, while the exact test is too careful.
+    number of data sets, while the exact test is conservative.
     """
     from scipy.special import bdtr
 
@@ -42,9 +42,9 @@ def mcnemar(first: int, second: int) -> float:
 
 
 def tango_interval(first: int, second: int, n: int) -> tuple[float, float]:
-    r"""Score interval for the difference of two percentages on the same n data sets, as a fraction.
+    r"""Return the score interval for the difference of two percentages on the same n data sets, as a fraction.
 
-    T. Tango, Statistics in Medicine 17 (1998) 891-908. It holds the differences d with
+    T. Tango, Statistics in Medicine 17 (1998) 891-908. It contains the differences d with
 
     .. math:: |b - c - n d| \leq z \sqrt{n (2 q + d (1 - d))},
 
@@ -60,16 +60,16 @@ def tango_interval(first: int, second: int, n: int) -> tuple[float, float]:
 
     ends = []
     for z, outermost in ((QUANTILE, -1.0), (-QUANTILE, 1.0)):
-        # Beside the estimate itself, where the statistic of no discordant pairs is 0 / 0.
+        # Next to the estimate, where the statistic is 0 / 0 without discordant pairs.
         inner = (1 - 1e-9) * (first - second) / n + 1e-9 * outermost
-        # The interval may end where the probabilities do.
+        # The interval may end at -1 or 1.
         crosses = distance(outermost, z) * distance(inner, z) < 0
         ends.append(float(brentq(distance, outermost, inner, args=(z,))) if crosses else outermost)
     return ends[0], ends[1]
 
 
 def percent_difference(first: int, second: int, n: int) -> Difference:
-    """Difference of two percentages on the same n data sets, from those on which only one of the two succeeds [%]."""
+    """Return the difference of two percentages on n data sets, from the numbers with only one success [%]."""
     low, high = tango_interval(first, second, n)
     return Difference(100 * (first - second) / n, 100 * low, 100 * high, mcnemar(first, second))
 
@@ -80,10 +80,10 @@ def hit_difference(first: Array, second: Array) -> Difference:
 
 
 def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, second: Array) -> Difference:
-    """Difference of a statistic of two estimators, by resampling the data sets that both have, shapes (n,).
+    """Return the difference of a statistic of two estimators, by resampling common data sets, shapes (n,).
 
     The interval is bias-corrected and accelerated (B. Efron, Journal of the American Statistical Association 82 (1987)
-    171-185); the p-value is that of the interval which ends at zero. ``statistic`` goes along the last axis.
+    171-185); the p-value is the level of the interval that ends at zero. ``statistic`` acts along the last axis.
     """
     rng, n = np.random.default_rng(SEED), first.size
 
@@ -103,10 +103,10 @@ def bootstrap_difference(statistic: Callable[[Array], Array], first: Array, seco
     for z in (-QUANTILE, QUANTILE):
         reach = shift + (shift + z) / (1 - acceleration * (shift + z))
         ends.append(float(np.quantile(drawn, NORMAL.cdf(reach))))
-    # The same, solved for the level at which the end is zero.
+    # Solved for the level at which the end is zero.
     beyond = NORMAL.inv_cdf(_share(drawn, 0.0)) - shift
     z = beyond / (1 + acceleration * beyond) - shift
-    # A p-value below one over the number of resamples cannot be resolved, whatever the normal tail says.
+    # p-values below one over the number of resamples cannot be resolved.
     p_value = 1.0 if not drawn.any() else max(2 * NORMAL.cdf(-abs(z)), 2 / (DRAWS + 1))
     return Difference(value, ends[0], ends[1], p_value)
 
@@ -122,18 +122,18 @@ def median_difference(first: Array, second: Array) -> Difference:
 
 
 def _left_out(n: int) -> IntArray:
-    """Data sets that the jackknife leaves out one by one, a thousand at most: acceleration is a small correction."""
+    """Return the data sets for the jackknife, at most a thousand, because acceleration is a small correction."""
     return np.unique(np.linspace(0, n - 1, min(n, 1000)).astype(int))
 
 
 def _share(drawn: Array, limit: float) -> float:
-    """How many resamples are below a limit, ties half, never none or all."""
+    """Return the share of resamples below a limit, ties half, strictly between 0 and 1."""
     below = float(np.sum(drawn < limit) + 0.5 * np.sum(drawn == limit))
     return (below + 0.5) / (drawn.size + 1)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's correction for several tests.
+    """Return p-values with Holm's correction for several tests.
 
     With ``p_(1) <= ... <= p_(m)``, the adjusted p-value of ``p_(i)`` is the largest ``(m + 1 - j) p_(j)``, j <= i,
     and at most 1.
@@ -147,7 +147,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 @cache
 def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -> float:
-    """Two-sided p-value of Fisher's exact test that two percentages are equal [-]."""
+    """Return the two-sided p-value of Fisher's exact test that two percentages are equal [-]."""
     from scipy.stats import fisher_exact
 
     reference = [reference_converged, reference_n - reference_converged]
@@ -157,11 +157,11 @@ def fisher(converged: int, n: int, reference_converged: int, reference_n: int) -
 def smallest_detectable(
     n: int, reference_converged: int, reference_n: int, level: float, *, rise: bool = True, power: float = 0.8
 ) -> float | None:
-    """Smallest difference from a reference that n data sets show with the given power [percentage points].
+    """Return the smallest difference from a reference that n data sets detect with a power [percentage points].
 
-    The reference counts as given. Successes of the n data sets are binomial with probability q, and k of them or fewer
-    are significant at the level, so that the drop is the one to the q with P(K <= k) = 0.8. A rise of successes is a
-    drop of failures. None where not even 0 and n successes are significant.
+    The reference is given. Successes of the n data sets are binomial with probability q; if k or fewer are significant
+    at the level, the drop is to the q with P(K <= k) = 0.8. A rise of successes is a drop of failures. None if not even
+    0 and n successes are significant.
     """
     from scipy.stats import beta
 

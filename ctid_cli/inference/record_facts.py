@@ -1,4 +1,4 @@
-"""Facts on a record before any model of it: clock, input, output, and what stands beside the response to the input."""
+"""Facts about a record before modelling: clock, input, output, response to the input, and other parts of the output."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -25,23 +25,23 @@ from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
-#: An interval longer than this many median intervals is a gap.
+#: An interval longer than this number of median intervals is a gap.
 LONG_INTERVAL = 3.0
 #: Persistence of excitation is counted up to this order.
 HIGHEST_ORDER = 50
-#: Of longer records every n-th sample is compared with the response to the whole input.
+#: Largest number of samples for the response; longer records are subsampled.
 MOST_SAMPLES = 5000
-#: Fewer samples than this show no response beside noise.
+#: Fewest samples for the response.
 FEWEST_SAMPLES = 50
-#: An offset of more standard deviations of the output than this needs no test.
+#: An offset of more standard deviations of the output than this is significant without a test.
 FAR = 1000.0
-#: Quantiles between which the others lie where gross errors are left out.
+#: Quantiles of the range used to detect gross errors.
 TAILS = (0.01, 0.99)
-#: Rounds in which outliers are left out and looked for again.
+#: Iterations of removing outliers and searching for more.
 ROUNDS = 3
-#: Delays up to this fraction of the record are tried where it is asked whether the output responds at all.
+#: Longest delay in the test of the response [duration of the record].
 LONGEST_DELAY = 0.3
-#: An output moves no more than rounding where its deviation is below this fraction of its mean.
+#: An output is constant if its deviation is below this fraction of its mean.
 CONSTANT = 1e-9
 
 
@@ -56,29 +56,29 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class Beside:
-    """What a response without a structure shows, and what stands beside it; nan or None where nothing is shown."""
+class Decomposition:
+    """Nonparametric response of an output, slow terms, outliers and feedback; NaN or None if not determined."""
 
-    #: Variance of the response over that of the noise [dB], with a 95 % interval as all estimates.
+    #: Variance of the response over that of the noise [dB].
     signal_to_noise: Estimate = UNKNOWN
     #: Time after a step of the input until 63 % of the final response [s], the delay included.
     response_time: Estimate = UNKNOWN
     #: Time until the output begins to respond [s].
     delay: Estimate = UNKNOWN
-    #: Value of the input at rest, from which the offset counts [input unit].
+    #: Value of the input at rest, for which the offset is defined [input unit].
     input_at_rest: float = math.nan
     offset: SlowTerm | None = None
     drift: SlowTerm | None = None
     start: SlowTerm | None = None
     #: Instants of outliers [s].
     outliers: tuple[float, ...] = ()
-    #: Probability that an input which does not depend on the output goes with the noise so much [-].
+    #: p-value of the test for feedback from the output to the input [-].
     feedback_p_value: float = math.nan
 
 
 @dataclass(frozen=True)
 class RecordFacts:
-    """Facts on one record; nan stands for what the record does not show."""
+    """Facts about one record; NaN if the record does not determine a value."""
 
     name: str
     n_samples: int
@@ -101,12 +101,12 @@ class RecordFacts:
     input_deviation: float
     input_low: float
     input_high: float
-    #: Values that the input returns to [input unit]; empty where there are many.
+    #: Values that the input returns to [input unit]; empty if there are many.
     input_levels: tuple[float, ...]
     input_changes: int
     #: Shortest time between two changes [s].
     shortest_hold: float
-    #: Time after which the input repeats itself [s].
+    #: Period of the input [s].
     input_period: float
     #: Order of persistent excitation, counted up to 50 [-].
     excitation_order: int
@@ -117,34 +117,34 @@ class RecordFacts:
     output_deviation: float
     output_low: float
     output_high: float
-    #: Step in which the output was recorded [output unit]; nan where it is too fine to matter.
+    #: Quantisation step of the output [output unit]; NaN if negligible.
     output_quantum: float
-    #: Fraction of the output samples that sit exactly at its least or greatest value in runs [-]; 0 for none.
+    #: Fraction of the output samples in runs at its least or greatest value [-].
     saturated: float
     #: Frequency below which 95 % of the response to the input lies [rad/s].
     output_bandwidth: float
-    #: Probability that noise of the output's colour follows the input as much as the output does [-].
+    #: p-value of the test for a response to the input [-].
     answer_p_value: float = math.nan
-    beside: Beside = field(default_factory=Beside)
+    parts: Decomposition = field(default_factory=Decomposition)
 
 
 def record_facts(record: Record) -> RecordFacts:
-    """Return the facts on a record.
+    """Return the facts about a record.
 
-    The response to the input is a Gaussian process beside autoregressive noise (`response_model`), so that what stands
-    beside it is tested in noise of any colour, and no structure is taken for granted.
+    The response to the input is modelled as a Gaussian process in autoregressive noise (`response_model`), so that the
+    tests are valid for noise of any colour and assume no model structure.
     """
     moves = input_moves(record)
-    answer = analyse_response(record, moves)
+    response = analyse_response(record, moves)
     t, present = record.t, record.y[record.valid]
     steps = np.diff(t) if t.size > 1 else np.array([math.nan])
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
     moving = moves.kind != "constant" and float(present.std()) > CONSTANT * abs(float(present.mean()))
-    beside = beside_response(record) if moving and present.size >= FEWEST_SAMPLES else Beside()
+    parts = decompose(record) if moving and present.size >= FEWEST_SAMPLES else Decomposition()
     p_value = _response_p_value(record) if moving else math.nan
     if p_value > NO_RESPONSE:
-        beside = replace(beside, signal_to_noise=UNKNOWN, response_time=UNKNOWN, delay=UNKNOWN)
+        parts = replace(parts, signal_to_noise=UNKNOWN, response_time=UNKNOWN, delay=UNKNOWN)
     return RecordFacts(
         name=record.name,
         n_samples=record.n_samples,
@@ -162,44 +162,44 @@ def record_facts(record: Record) -> RecordFacts:
         input_levels=moves.levels,
         input_changes=int(moves.changes.size),
         shortest_hold=moves.shortest_hold,
-        input_period=answer.period,
-        excitation_order=excitation_order(record, moves, answer),
-        input_band=answer.input_band,
+        input_period=response.period,
+        excitation_order=excitation_order(record, moves, response),
+        input_band=response.input_band,
         output_quantum=quantum(present),
         saturated=saturated(present),
-        output_bandwidth=answer.bandwidth,
+        output_bandwidth=response.bandwidth,
         answer_p_value=p_value,
-        beside=beside,
+        parts=parts,
         **_range("input", record.input.at(t)),
         **_range("output", present),
     )
 
 
 def _range(signal: str, x: Array) -> dict[str, Any]:
-    """Fields on the values of a signal."""
+    """Return the fields with the range of a signal."""
     values = {"mean": x.mean(), "deviation": x.std(), "low": x.min(), "high": x.max()}
     return {f"{signal}_{name}": float(value) for name, value in values.items()}
 
 
 def _response_p_value(record: Record) -> float:
-    """Probability that the output follows the input by chance, with the system in equilibrium at first."""
+    """Return the p-value of the test for a response, with the system initially in equilibrium."""
     signal = record.input
     moved = HeldSignal(signal.t, signal.values - signal.at(record.t[:1]), signal.hold)
     test = response_test([record.driven_by(u=moved)], [record.valid], (0.0, LONGEST_DELAY * record.duration))
     return test.p_value
 
 
-def beside_response(record: Record) -> Beside:
-    """Fit the response of a record whose input varies, without outliers, and test what stands beside it."""
+def decompose(record: Record) -> Decomposition:
+    """Fit the response of a record with a varying input, without outliers, and test the other parts of the output."""
     every = -(-int(np.count_nonzero(record.valid)) // MOST_SAMPLES)
     interval, places = float(np.median(np.diff(record.t))), np.flatnonzero(record.valid)
     middle = float(np.median(record.y[places]))
-    # Products of so large an offset would round the rest away.
+    # A very large offset would cause rounding errors in products.
     shift = middle if abs(middle) > FAR * float(np.std(record.y[places])) else 0.0
-    wild, far = places[_gross(record.y[places])], np.zeros(0, dtype=np.int64)
+    removed, far = places[_gross(record.y[places])], np.zeros(0, dtype=np.int64)
     for _ in range(ROUNDS):
-        wild = np.union1d(wild, far)
-        used = np.setdiff1d(places[::every], wild)
+        removed = np.union1d(removed, far)
+        used = np.setdiff1d(places[::every], removed)
         model = fit_response(Signals(record.t[used], record.y[used] - shift, record.input, interval))
         terms = slow_terms(model, ("offset",) if shift else ())
         slow = slow_columns(model, terms)
@@ -210,32 +210,32 @@ def beside_response(record: Record) -> Beside:
     offset = terms["offset"]
     terms["offset"] = replace(offset, value=offset.value + shift, low=offset.low + shift, high=offset.high + shift)
     steps = step_responses(model, slow)
-    return Beside(
+    return Decomposition(
         signal_to_noise(model, slow),
         response_time(model, steps),
         delay(model, slow, steps),
         model.layout.before,
         **terms,
-        outliers=tuple(record.t[np.union1d(wild, far)].tolist()),
+        outliers=tuple(record.t[np.union1d(removed, far)].tolist()),
         feedback_p_value=feedback(record.input.at(record.t[used]), response, rest, model),
     )
 
 
 def _gross(y: Array) -> IntArray:
-    """Outliers so large that no response should be fitted to them: beyond the range of the others by as much again."""
+    """Return gross outliers, beyond the range of the other samples by at least that range."""
     low, high = np.quantile(y, TAILS)
     found = outliers(y)
     far: IntArray = found[np.abs(y[found] - 0.5 * (low + high)) > 1.5 * (high - low)]
     return far
 
 
-def excitation_order(record: Record, moves: InputMoves, answer: InputResponse) -> int:
-    """Rank of the autocovariance of the input, at most 50; directions 40 dB below the strongest do not count."""
+def excitation_order(record: Record, moves: InputMoves, response: InputResponse) -> int:
+    """Return the order of persistent excitation, at most 50: the rank of the autocovariance of the input to -40 dB."""
     grid = regular_grid(record)
     u = record.input.at(record.t[0] + grid.interval * (np.arange(grid.u.size) + 1e-6))
-    highest = answer.input_band[1]
+    highest = response.input_band[1]
     if moves.kind == "continuous" and highest > 0:
-        # Of a slow input, neighbouring samples are all alike: look at it as fast as it moves.
+        # Neighbouring samples of a slow input are nearly equal: subsample it according to its bandwidth.
         u = u[:: max(1, int(math.pi / (1.5 * highest * grid.interval)))]
     order = min(HIGHEST_ORDER, u.size // 3)
     if order < 1 or moves.kind == "constant":

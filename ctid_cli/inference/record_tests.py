@@ -1,4 +1,4 @@
-"""Tests of a record beside the response to its input: offset, drift, start, outliers and feedback."""
+"""Tests of a record for offset, drift, free response, outliers and feedback, given its response to the input."""
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -11,33 +11,32 @@ from ctid_cli.inference.residual_tests import normal_tail
 from ctid_cli.inference.response_layout import CONSTANT, LINE, START
 from ctid_cli.inference.response_model import ResponseModel, whitened
 
-#: Probability of each false alarm, if the noise is as modelled. With this 2.5 % of 400 clean records had any
-#: (`benchmarks/bench_facts.py`).
+#: False-alarm probability of each test, if the noise model is correct. With it 2.5 % of 400 clean records had a false
+#: alarm (`benchmarks/bench_facts.py`).
 LEVEL = 0.001
-#: Earlier inputs and responses from which the next input is told, and the delays of the answer of a controller.
-ORDER, ANSWERS = 6, 3
-#: Steps of the robust regression, and the residual in robust standard deviations from which on it counts no more.
+#: Earlier inputs and responses from which the next input is predicted, and lags of the response of a controller.
+ORDER, CONTROLLER_LAGS = 6, 3
+#: Steps of the robust regression, and limit at which residuals are clipped [robust standard deviations].
 REWEIGHTED, CLIPPED = 8, 1.5
-#: Outliers are looked for until so large a share of the samples are.
+#: Largest share of outliers among the samples.
 MOST_OUTLIERS = 0.02
-#: Smaller errors, as a share of the deviation of the output, are those of an impulse response in intervals.
+#: Smaller errors, as a share of the deviation of the output, may come from the discretised impulse response.
 SMALL = 0.002
-#: Neighbours on each side that show how large errors are about a sample, and the share of theirs that counts: the
-#: deviation of so few is uncertain.
-ABOUT, LOUDER = 30, 0.7
-#: Noise of less power than this, as a share of the output's, is rounding.
+#: Neighbours on each side for the local deviation of errors, and factor of it, because it is uncertain.
+LOCAL, LOCAL_FACTOR = 30, 0.7
+#: Noise of less power than this, as a share of the output's, is rounding error.
 NO_NOISE = 1e-20
 
-#: Columns of X of each.
+#: Columns of X of each slow term.
 SLOW_TERMS: Mapping[str, tuple[int, ...]] = {"offset": (CONSTANT,), "drift": (LINE,), "start": START}
 
 
 @dataclass(frozen=True)
 class SlowTerm:
-    """A part of the output that does not follow the input."""
+    """A part of the output that does not depend on the input."""
 
     detected: bool
-    #: Probability of one as large without any [-].
+    #: p-value of the test that there is none [-].
     p_value: float
     #: The constant, the change along the line over the record, or the free response at its beginning [output unit].
     value: float
@@ -47,10 +46,10 @@ class SlowTerm:
 
 
 def slow_terms(model: ResponseModel, known: tuple[str, ...] = ()) -> dict[str, SlowTerm]:
-    """Test offset, drift of the output, and free response of a record beside those that are known to be there.
+    """Test offset, drift and free response of a record, given the slow terms known to be present.
 
-    F tests by generalised least squares, the greatest first and the others beside it, as long as one is significant.
-    The noise has as many degrees of freedom as the record is worth independent samples.
+    Forward selection by F tests with generalised least squares, as long as a term is significant. The degrees of
+    freedom of the noise are from the effective sample size.
     """
     weighted, count = model.weighted, len(model.layout.columns)
     everything = (CONSTANT, LINE, *START, *model.own)
@@ -58,13 +57,13 @@ def slow_terms(model: ResponseModel, known: tuple[str, ...] = ()) -> dict[str, S
     least = NO_NOISE * float(weighted.products[0, -1, -1])
     variance = max(weighted.fit(everything)[2], least) / (count - len(everything))
 
-    def p_value(name: str, beside: Iterable[str]) -> float:
+    def p_value(name: str, included: Iterable[str]) -> float:
         from scipy.special import fdtrc
 
-        others = _columns(model, set(beside) - {name})
-        own = SLOW_TERMS[name]
-        gain = weighted.fit(others)[2] - weighted.fit((*others, *own))[2]
-        return float(fdtrc(len(own), freedom, max(gain, 0.0) / (len(own) * variance)))
+        others = _columns(model, set(included) - {name})
+        tested = SLOW_TERMS[name]
+        gain = weighted.fit(others)[2] - weighted.fit((*others, *tested))[2]
+        return float(fdtrc(len(tested), freedom, max(gain, 0.0) / (len(tested) * variance)))
 
     found = known
     while len(found) < len(SLOW_TERMS):
@@ -88,7 +87,7 @@ def slow_terms(model: ResponseModel, known: tuple[str, ...] = ()) -> dict[str, S
 
 
 def slow_columns(model: ResponseModel, terms: Mapping[str, SlowTerm]) -> tuple[int, ...]:
-    """Columns of X that belong to the response, and to slow terms that are detected."""
+    """Return the columns of X of the response and of detected slow terms."""
     return _columns(model, {name for name, term in terms.items() if term.detected})
 
 
@@ -97,25 +96,25 @@ def _columns(model: ResponseModel, names: Collection[str]) -> tuple[int, ...]:
 
 
 def outlying(model: ResponseModel, rest: Array) -> IntArray:
-    """Samples that lie farther from what the others tell than chance explains, in noise of any colour.
+    """Return significant additive outliers in noise of any colour.
 
-    The likelihood ratio of one sample with an error of its own (Chang, Tiao and Chen, Technometrics 30 (1988) 193-204),
-    against the deviation of those of all samples, or of its neighbours if that is larger: a model that is wrong leaves
-    large errors where the output moves most.
+    The likelihood ratio of an additional error of one sample (Chang, Tiao and Chen, Technometrics 30 (1988) 193-204) is
+    compared with the deviation over all samples, or over its neighbours if that is larger, because a wrong model has
+    large errors where the output changes most.
     """
     c, r = model.noise.coefficients, model.noise.order
     limit, rest, found = normal_quantile(1 - LEVEL / rest.size), rest.copy(), list[int]()
     least = SMALL * float(model.layout.columns[:, -1].std())
     energy = np.cumsum(c**2)[np.minimum(np.arange(rest.size)[::-1], r)]
-    # An error shows in its neighbours too, so that the greatest is taken away before the next is looked for.
+    # An outlier also affects its neighbours: the greatest is removed before the search for the next.
     for _ in range(int(MOST_OUTLIERS * rest.size)):
         ahead = np.append(whitened(rest[:, None], model.noise)[:, 0], np.zeros(r))
         errors = sum(c[k] * ahead[k : k + rest.size] for k in range(r + 1)) / energy
         score = np.abs(errors) * np.sqrt(energy)
         k = int(np.argmax(score))
-        about = score[max(k - ABOUT, 0) : k + ABOUT + 1]
-        sure = score[k] > limit * max(_deviation(score), LOUDER * robust_deviation(about))
-        if not sure or abs(errors[k]) < least:
+        nearby = score[max(k - LOCAL, 0) : k + LOCAL + 1]
+        significant = score[k] > limit * max(_deviation(score), LOCAL_FACTOR * robust_deviation(nearby))
+        if not significant or abs(errors[k]) < least:
             break
         found.append(k)
         rest[k] -= errors[k]
@@ -123,16 +122,16 @@ def outlying(model: ResponseModel, rest: Array) -> IntArray:
 
 
 def _deviation(sizes: Array) -> float:
-    """Standard deviation from sizes, of which a few may be far too large."""
+    """Return a standard deviation from absolute values with outliers."""
     return float(np.sqrt(np.mean(np.minimum(sizes, 3.0 * robust_deviation(sizes)) ** 2)))
 
 
 def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> float:
-    """Return the probability that an input which does not depend on the output goes so much with its noise.
+    """Return the p-value of the correlation of the input with past noise under the hypothesis of no feedback.
 
-    What the input and the response were does not tell all moves: those of a reference that is held are rare and large,
-    and would drown the answer to the noise. So they are clipped. Innovations of the noise are independent of any
-    function of an input that does not depend on the output.
+    The input is predicted from earlier inputs and responses. Prediction errors are clipped, because rare large changes
+    of a held reference would mask the response to the noise. Without feedback, the innovations of the noise are
+    independent of any function of the input.
     """
     windows = np.lib.stride_tricks.sliding_window_view
     before = np.column_stack([windows(u, ORDER + 1)[:, :-1], windows(response, ORDER + 1), np.ones(u.size - ORDER)])
@@ -148,6 +147,6 @@ def feedback(u: Array, response: Array, rest: Array, model: ResponseModel) -> fl
         weight = 1.0 / np.maximum(np.abs(moves) / spread, 1.0)
     moves = np.clip(moves / spread, -CLIPPED, CLIPPED)
     white = whitened(rest[:, None], model.noise)[:, 0]
-    products = [moves * white[ORDER - k : white.size - k] for k in range(ANSWERS)]
+    products = [moves * white[ORDER - k : white.size - k] for k in range(CONTROLLER_LAGS)]
     scores = [abs(float(each.sum())) / max(float(np.sqrt(each @ each)), np.finfo(float).tiny) for each in products]
-    return min(1.0, 2 * ANSWERS * normal_tail(max(scores)))
+    return min(1.0, 2 * CONTROLLER_LAGS * normal_tail(max(scores)))

@@ -1,4 +1,4 @@
-"""Tests of the residuals: whether they are white, and whether they still depend on the input."""
+"""Tests of residuals: whiteness, and dependence on the input."""
 
 import math
 from collections.abc import Sequence
@@ -14,20 +14,20 @@ from ctid_cli.signals.record import Record
 
 
 def normal_tail(z: float) -> float:
-    """Probability that a standard normal variable exceeds z."""
+    """Return the probability that a standard normal variable exceeds z."""
     return 0.5 * math.erfc(z / math.sqrt(2.0))
 
 
 def chi_square_tail(degrees_of_freedom: int, x: float) -> float:
-    """Probability that a chi-square variable exceeds x."""
+    """Return the probability that a chi-square variable exceeds x."""
     from scipy.special import chdtrc
 
     return float(chdtrc(degrees_of_freedom, x))
 
 
 @dataclass(frozen=True, eq=False)
-class SideBySide:
-    """The columns of several."""
+class Concatenated:
+    """Columns of several blocks."""
 
     parts: tuple[Rows, ...]
 
@@ -39,49 +39,49 @@ class SideBySide:
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
-    """What others leave of columns, by least squares."""
+class Projected:
+    """Least-squares residuals of columns, with other columns as regressors."""
 
     columns: Rows
-    beside: Rows
+    regressors: Rows
     weights: Array
 
     @classmethod
-    def of(cls, columns: Rows, beside: Rows) -> "Rest":
-        """Project columns on others."""
-        combined = orthonormal(beside)
-        along = [(beside[rows] @ combined).T @ columns[rows] for rows in row_blocks(len(beside))]
-        return cls(columns, beside, combined @ np.sum(along, axis=0))
+    def of(cls, columns: Rows, regressors: Rows) -> "Projected":
+        """Compute the regression of columns on others."""
+        combined = orthonormal(regressors)
+        along = [(regressors[rows] @ combined).T @ columns[rows] for rows in row_blocks(len(regressors))]
+        return cls(columns, regressors, combined @ np.sum(along, axis=0))
 
     def __len__(self) -> int:
         return len(self.columns)
 
     def __getitem__(self, rows: slice, /) -> Array:
-        rest: Array = self.columns[rows] - self.beside[rows] @ self.weights
+        rest: Array = self.columns[rows] - self.regressors[rows] @ self.weights
         return rest
 
 
 def constant(count: int) -> Array:
-    """A column of ones that takes no memory."""
+    """Return a column of ones that uses no memory."""
     return np.broadcast_to(1.0, (count, 1))
 
 
-def rest_of(e: Array, beside: Rows) -> Array:
-    """What columns leave of one."""
-    rest = Rest.of(e[:, None], beside)
+def regression_residuals(e: Array, regressors: Rows) -> Array:
+    """Return the least-squares residuals of one column."""
+    rest = Projected.of(e[:, None], regressors)
     return np.concatenate([rest[rows][:, 0] for rows in row_blocks(e.size)])
 
 
 def orthonormal(columns: Rows, least: float | None = None) -> Array:
-    """Weights with which columns become orthonormal ones of the same span, shape (columns, rank).
+    """Return weights that transform columns to an orthonormal basis of their span, shape (columns, rank).
 
-    Directions with less than a least share of the largest singular value are rounding.
+    Directions with less than a share ``least`` of the largest singular value are ignored.
     """
     triangle = columns[:0]
     for rows in row_blocks(len(columns)):
         triangle = np.asarray(np.linalg.qr(np.vstack((triangle, columns[rows])), mode="r"))
     lengths = np.linalg.norm(triangle, axis=0)
-    # A column of zeros has no length to divide by: the rounding of its weights would grow beyond bounds.
+    # A column of zeros cannot be normalised.
     lengths[lengths == 0] = 1.0
     _, values, vectors = np.linalg.svd(triangle / lengths, full_matrices=False)
     kept = values > (len(columns) * np.finfo(float).eps if least is None else least) * values[0]
@@ -90,57 +90,56 @@ def orthonormal(columns: Rows, least: float | None = None) -> Array:
 
 #: Fewer residuals than this are not tested.
 FEWEST_TESTED = 20
-#: Directions of the lagged inputs with less than this share of the largest variance are repetitions of the others.
+#: Directions of the lagged inputs with less than this share of the largest variance are linearly dependent.
 NEGLIGIBLE_VARIANCE = 1e-8
-#: What projections leave of a column that they should take away altogether, as a share of its power.
+#: Rounding error of the projection of a linearly dependent column, as a share of its power.
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualTests:
-    """Correlations of the residuals with themselves and with the input, with what they mean."""
+    """Autocorrelation of the residuals, their cross-correlation with the input, and tests."""
 
     count: int
     #: Largest lag L [samples].
     lags: int
     #: Confidence level of both tests and of the bands [-].
     level: float
-    #: Of the residuals, at the lags 1 … L [-], shape (L,).
+    #: Autocorrelation of the residuals at the lags 1 … L [-], shape (L,).
     autocorrelation: Array = field(repr=False)
-    #: A white sequence stays within plus or minus this at each single lag, with probability ``level`` [-].
+    #: Pointwise half-width of the band of a white sequence, with probability ``level`` [-].
     autocorrelation_band: float
     #: Ljung and Box's portmanteau statistic [-].
     whiteness_statistic: float
     whiteness_degrees_of_freedom: int
-    #: Probability of a larger statistic if the residuals are white [-]; NaN where it cannot be computed.
+    #: p-value of whiteness [-]; NaN if not computable.
     whiteness_p_value: float
-    #: Between ``residual(t)`` and ``input(t - k)``, k = -L … L [-], shape (2 L + 1,).
+    #: Cross-correlation of ``residual(t)`` and ``input(t - k)``, k = -L … L [-], shape (2 L + 1,).
     cross_correlation: Array = field(repr=False)
-    #: Residuals of their colour that are independent of the input stay within plus or minus this at each single lag,
-    #: with probability ``level`` [-].
+    #: Pointwise half-width of the band of residuals of this colour that are independent of the input, with probability
+    #: ``level`` [-].
     cross_correlation_band: float
     #: Portmanteau statistic of all these lags [-].
     cross_statistic: float
     cross_degrees_of_freedom: int
-    #: Probability of a larger statistic if the residuals are independent of the input [-]; NaN where it cannot be
-    #: computed.
+    #: p-value of independence of the input [-]; NaN if not computable.
     cross_p_value: float
-    #: What drives the system, and the residuals are tested against: the input, or the reference of a loop.
+    #: Driving signal of the test: the input, or the reference of a loop.
     driver: str = "input"
 
     @property
     def white(self) -> bool:
-        """Whether they pass as white; no evidence is no rejection, and the sentence says what could not be tested."""
+        """Whether whiteness is not rejected, also if it could not be tested."""
         return not self.whiteness_p_value < 1 - self.level
 
     @property
     def uncorrelated(self) -> bool:
-        """Whether they pass as independent of the input."""
+        """Whether independence of the input is not rejected."""
         return not self.cross_p_value < 1 - self.level
 
     @property
     def sentence(self) -> str:
-        """What the tests mean."""
+        """Results of the tests in words."""
         if np.isnan(self.whiteness_p_value):
             return "The residuals are exactly zero: there is nothing to test."
         first = f"The residuals pass as white at the {100 * self.level:g} % level (p = {self.whiteness_p_value:.2g})."
@@ -176,10 +175,10 @@ def residual_tests(
     on whose diagonal P, the sum of the products of both autocorrelations, the band ``z sqrt(P/N)`` is built [2]_. The
     autocorrelation of e is that of an autoregressive model of the residuals. The statistic is ``c' cov(c)^+ c``, with
     the exact sums over this input, and its degrees of freedom are the rank of ``cov(c)``. Estimation removes from the
-    residuals a combination of psi; with ``sensitivities`` the lagged inputs are replaced by what is left of them
-    beside psi, on which that has no effect.
+    residuals a combination of psi; with ``sensitivities`` the lagged inputs are projected off psi, so that this has no
+    effect.
 
-    Samples are taken as equally spaced; with an irregular clock the lags count samples.
+    Lags count samples, also with an irregular clock.
     """
     count = e.size
     lags = _lags(count) if lags is None else lags
@@ -197,16 +196,16 @@ def _lags(count: int) -> int:
 
 
 def all_white(residuals: Sequence[Array], level: float = 0.95) -> bool:
-    """Whether the residuals of all experiments pass as white; too few to be tested pass.
+    """Return whether the residuals of all experiments pass as white; too few to be tested pass.
 
-    A false alarm is as likely as with one experiment.
+    The false-alarm probability is that of one experiment.
     """
     least = (1.0 - level) / len(residuals)
     return not any(e.size >= FEWEST_TESTED and whiteness(e, _lags(e.size))[2] < least for e in residuals)
 
 
 def whiteness(e: Array, lags: int) -> tuple[Array, float, float]:
-    """Autocorrelation at the lags from 1 on, Ljung and Box's statistic and its p-value; NaN where all is zero."""
+    """Return autocorrelation from lag 1 on, Ljung and Box's statistic and its p-value; NaN if all are zero."""
     count, power = e.size, float(e @ e)
     if not power > 0:
         return np.full(lags, np.nan), float("nan"), float("nan")
@@ -218,14 +217,14 @@ def whiteness(e: Array, lags: int) -> tuple[Array, float, float]:
 def _cross_correlation(
     e: Array, u: Array, lags: int, quantile: float, psi: Array | None
 ) -> tuple[Array, float, float, int, float]:
-    """Cross-correlation at -lags … lags, its band, the portmanteau statistic, its degrees of freedom and p-value."""
+    """Return cross-correlation at -lags … lags, band, portmanteau statistic, degrees of freedom and p-value."""
     e, u = e - e.mean(), u - u.mean()
     count = e.size
-    # A constant leaves rounding behind when its mean is taken off.
+    # Subtracting the mean of a constant leaves rounding errors.
     scale = float(np.sqrt((e @ e) * (u @ u)))
     if not scale > 0 or np.ptp(u) <= 1e-12 * np.abs(u).max(initial=0.0):
         return np.full(2 * lags + 1, np.nan), np.nan, np.nan, 0, np.nan
-    # Column k + lags is u(t - k): a look at the input between zeros, backwards.
+    # Column k + lags is u(t - k): a reversed view of the zero-padded input.
     shifted = np.lib.stride_tricks.sliding_window_view(np.pad(u, lags), 2 * lags + 1)[:, ::-1]
     cross = np.sum([shifted[rows].T @ e[rows] for rows in row_blocks(count)], axis=0) / scale
 
@@ -234,29 +233,29 @@ def _cross_correlation(
     spread = float(noise.covariance_of(u[:, None])[0, 0]) / (float(noise.first_autocovariances[0]) * float(u @ u))
     band = quantile * float(np.sqrt(max(spread, 0.0) / count))
 
-    # Beside the constant and psi, whatever was subtracted from the noise along them does not count.
+    # Projected off the constant and psi, along which estimation has changed the residuals.
     constants = constant(count)
-    found = dependence(e, shifted, noise, constants if psi is None else SideBySide((constants, psi)))
+    found = dependence(e, shifted, noise, constants if psi is None else Concatenated((constants, psi)))
     return cross, band, found.statistic, found.freedom, found.p_value
 
 
 class Dependence(NamedTuple):
-    """Whether residuals follow given columns."""
+    """Test of the dependence of residuals on given columns."""
 
     statistic: float
     freedom: int
-    #: Probability of a larger statistic if they do not; NaN without anything to follow.
+    #: p-value of independence; NaN without independent columns.
     p_value: float
 
 
-def dependence(e: Array, columns: Rows, noise: NoiseModel, beside: Rows) -> Dependence:
-    """Chi-square statistic ``c' cov(c)^+ c`` of the products c of the residuals with what others leave of columns."""
-    rest, blocks = Rest.of(columns, beside), list(row_blocks(e.size))
+def dependence(e: Array, columns: Rows, noise: NoiseModel, regressors: Rows) -> Dependence:
+    """Test residuals by the chi-square statistic ``c' cov(c)^+ c`` of their products c with projected columns."""
+    rest, blocks = Projected.of(columns, regressors), list(row_blocks(e.size))
     power = float(np.max(np.sum([np.sum(columns[rows] ** 2, axis=0) for rows in blocks], axis=0), initial=0.0))
     products = np.sum([rest[rows].T @ e[rows] for rows in blocks], axis=0)
-    covariance = noise.covariance_of(rest) * e.size / max(e.size - beside[:1].shape[1], 1)
+    covariance = noise.covariance_of(rest) * e.size / max(e.size - regressors[:1].shape[1], 1)
     values, vectors = np.linalg.eigh(covariance)
-    # What others leave of a repetition of theirs is rounding.
+    # The projection of a linearly dependent column is rounding error.
     least = NEGLIGIBLE_VARIANCE * max(float(values[-1]), ROUNDING * power * noise.innovation_variance)
     kept = values > least
     statistic = float(np.sum((vectors[:, kept].T @ products) ** 2 / values[kept]))
@@ -264,41 +263,41 @@ def dependence(e: Array, columns: Rows, noise: NoiseModel, beside: Rows) -> Depe
     return Dependence(statistic, freedom, chi_square_tail(freedom, statistic) if freedom else np.nan)
 
 
-#: Inputs looked at, in sampling intervals: before the instant at which the model uses them, and after the residual.
+#: Range of tested inputs, in sampling intervals: before the instant at which the model uses them, after the residual.
 PAST, FUTURE = 25, 10
-#: A delay that is too long leaves out inputs this many intervals later.
+#: Further later inputs tested, in case the delay is too long [sampling intervals].
 LATE = 3
-#: Time constants of a further pole, from the sampling interval to this fraction of the record.
+#: Number of time constants of a further pole, from the sampling interval to this fraction of the record.
 TRIED, LONGEST = 6, 0.2
-#: Earlier inputs and simulated outputs from which a controller's next move is told, and the delays of its answer.
-ORDER, ANSWERS = 4, 3
-#: Steps of the robust regression, and the residual in robust standard deviations from which on it counts no more.
+#: Earlier inputs and simulated outputs from which the next input is predicted, and lags of a controller's response.
+ORDER, CONTROLLER_LAGS = 4, 3
+#: Steps of the robust regression, and limit at which residuals are clipped [robust standard deviations].
 REWEIGHTED, CLIPPED = 8, 1.5
 
 
 @dataclass(frozen=True)
 class InputDependence:
-    """Probabilities of a dependence like this if there is none [-]."""
+    """p-values of tests for missing dynamics and for feedback [-]."""
 
-    #: Of the residuals on what one more pole, and a zero, would add to the output.
+    #: p-value that one more pole and zero do not improve the output.
     pole_p_value: float
-    #: Share of the variance of the residuals that these would explain [-].
+    #: Share of the variance of the residuals that they would explain [-].
     pole_share: float
-    #: Of the input on residuals before it, and the share of these that its moves foretell.
+    #: p-value that the input does not depend on past residuals, and their share explained by later inputs [-].
     feedback_p_value: float
     feedback_share: float
 
 
 def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, delay: float) -> InputDependence | None:
-    r"""Test residuals at instants t against earlier and later inputs; None in too short a record.
+    r"""Test residuals at instants t against earlier and later inputs; None if the record is too short.
 
-    Earlier and later count the samples, whose instants are those at which a controller acts.
+    Lags count samples, at which a controller acts.
 
-    The model is contained in that with one more pole and zero, ``B (s + z) / (A (s + p))`` with z = p; its derivative
-    there is the simulated output x behind ``1/(s + p)``, and a few p span what a pole could add.
+    The model is a special case of ``B (s + z) / (A (s + p))`` with z = p; the derivative there is the simulated output
+    x filtered by ``1/(s + p)``, and a few p approximate the effect of any pole.
 
-    Later inputs are freed of what earlier ones tell of them (Sims' test of causality): dynamics that the model misses
-    correlate the residuals with the future of an input that is correlated itself, but only by way of its past.
+    Later inputs are projected off earlier ones (Sims' test of causality): missing dynamics correlate the residuals with
+    future values of an autocorrelated input, but only through its past.
     """
     interval = float(np.median(np.diff(record.t)))
     past, future = min(PAST, t.size // 8), min(FUTURE, t.size // 16)
@@ -310,40 +309,41 @@ def input_dependence(e: Array, x: Array, psi: Array, t: Array, record: Record, d
     noise = fit_noise_model([e])
     if not noise.innovation_variance > 0:
         return None
-    beside = SideBySide((constant(e.size), psi))
-    pole = dependence(e, behind[inside], noise, beside)
-    share = 1.0 - _power(rest_of(e, SideBySide((beside, behind[inside])))) / _power(rest_of(e, beside))
-    del behind  # as large as all that follows
+    model = Concatenated((constant(e.size), psi))
+    pole = dependence(e, behind[inside], noise, model)
+    extended = Concatenated((model, behind[inside]))
+    share = 1.0 - _power(regression_residuals(e, extended)) / _power(regression_residuals(e, model))
+    del behind, extended  # large arrays
 
     def inputs(shift: float, steps: range) -> Array:
-        """A view of the input at a lag from each residual, without a copy for every column."""
+        """Return a view of the input at lags from each residual, without copies."""
         values = record.input.at(t - shift) - record.input.mean
         looks = np.lib.stride_tricks.sliding_window_view(values, len(steps))
         return looks[inside.start + min(steps) : inside.stop + min(steps), :: steps.step]
 
     earlier = inputs(delay, range(min(LATE, int(delay / interval)), -past, -1))
-    known = SideBySide((beside, earlier))
-    # Between its samples an input along straight lines has moved before the residual.
+    known = Concatenated((model, earlier))
+    # A linearly interpolated input changes before the sample of the residual.
     first = 0 if record.input.hold == "zoh" else 1
     later = dependence(e, inputs(0.0, range(first, first + future)), noise, known)
     found = [(later.p_value, (later.statistic - later.freedom) / e.size)] if later.freedom else []
     if not first:
-        z = _feedback_score(rest_of(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
-        found.append((2 * ANSWERS * normal_tail(z), z * z / e.size))
-    likely, told = min(found, default=(1.0, 0.0))
-    return InputDependence(pole.p_value, share, min(1.0, len(found) * likely), told)
+        z = _feedback_score(regression_residuals(e, known), x, inputs(0.0, range(0, -ORDER - 1, -1)))
+        found.append((2 * CONTROLLER_LAGS * normal_tail(z), z * z / e.size))
+    least, explained = min(found, default=(1.0, 0.0))
+    return InputDependence(pole.p_value, share, min(1.0, len(found) * least), explained)
 
 
 def _feedback_score(e: Array, x: Array, u: Array) -> float:
-    """How far the input moves with residuals of the last instants, in standard deviations of what chance gives.
+    """Return the standardised correlation of the input with the last residuals.
 
-    What the input and the simulated output were does not tell all moves: those of a reference that is held are rare
-    and large, and would drown the response to the noise. So they are clipped. Residuals that are white and independent
-    of the input are independent of any function of it.
+    The input is predicted from earlier inputs and simulated outputs. Prediction errors are clipped, because rare large
+    changes of a held reference would mask the response to the noise. Without feedback, innovations of the residuals are
+    independent of any function of the input.
     """
     blocks, inputs = list(row_blocks(e.size - ORDER)), u[ORDER:]
     outputs = np.lib.stride_tricks.sliding_window_view(x, ORDER)[1:]
-    before = SideBySide((constant(len(inputs)), inputs[:, 1:], outputs))
+    before = Concatenated((constant(len(inputs)), inputs[:, 1:], outputs))
     weights = orthonormal(before, 1e-10)
     now = rest = inputs[:, 0]
     weight = np.ones(now.size)
@@ -362,12 +362,12 @@ def _feedback_score(e: Array, x: Array, u: Array) -> float:
         weight = 1.0 / np.maximum(np.abs(rest) / scale, 1.0)
     moves = np.clip(rest / scale, -CLIPPED, CLIPPED)
     white = fit_noise_model([e]).innovations(e)
-    scores = [moves * white[ORDER - k : e.size - k] for k in range(ANSWERS)]
+    scores = [moves * white[ORDER - k : e.size - k] for k in range(CONTROLLER_LAGS)]
     return max(abs(float(score.sum())) / float(np.sqrt(score @ score)) for score in scores)
 
 
 def _behind_a_pole(x: Array, time_constants: Array) -> Array:
-    """Samples behind first-order filters with the given time constants in samples."""
+    """Return samples filtered by first-order low-pass filters with time constants in samples."""
     columns = np.empty((x.size, time_constants.size))
     for column, p in zip(columns.T, np.exp(-1.0 / time_constants), strict=True):
         behind = (1.0 - p) * x[:, None]

@@ -1,4 +1,4 @@
-"""What a response without a structure tells: signal-to-noise ratio, response time and delay, with 95 % intervals."""
+"""Signal-to-noise ratio, response time and delay from a nonparametric response, with 95 % intervals."""
 
 import math
 from collections.abc import Sequence
@@ -13,31 +13,31 @@ from ctid_cli.inference.response_model import Directions, ResponseModel
 
 #: Tails of the intervals [-].
 TAILS = (0.025, 0.975)
-#: Impulse responses that are drawn, and the seed: one record always gives one result.
+#: Number of drawn impulse responses, and their fixed seed, for reproducible results.
 DRAWS, SEED = 400, 20140801
-#: The response time ends where so much of the final value is reached: a time constant after the delay, of first order.
+#: Share of the final value that defines the response time: delay plus time constant of a first-order system.
 SHARE = 1 - math.exp(-1)
-#: The response between two samples is not seen: intervals of the response time are longer by this share of the sampling
-#: interval on each side. Without it they held the truth in 90 % of 200 simulated records, with it in 94 % of 400.
+#: Intervals of the response time are extended by this share of the sampling interval on each side, because the response
+#: between samples is unknown. Coverage in simulated records: 90 % of 200 without it, 94 % of 400 with it.
 BETWEEN = 0.25
-#: Standard deviations beyond which a response is taken as certain.
-SURE = 5.0
-#: A response has ended where the last quarter of its length changes it by less than this share.
-ENDED = 0.1
-#: Powers of ``1 - exp(-s/T)`` with which a response may begin, and delays that are compared.
+#: Number of standard deviations of a significant response.
+SIGNIFICANT = 5.0
+#: A response has settled if it changes by less than this share over the last quarter of its length.
+SETTLED = 0.1
+#: Powers of ``1 - exp(-s/T)`` at the onset of a response, and number of delays compared.
 STARTS, DELAYS = (0, 1, 2, 3), 12
-#: Weight of the likelihood of a delay. None of these beginnings is the true one: of 97 simulated records of one to four
-#: poles, intervals with weight 1 held the delay in 91 %, with 1/2 in 97 %.
+#: Weight of the log-likelihood of a delay, because these onsets are approximate: coverage in 97 simulated records of
+#: one to four poles was 91 % with weight 1 and 97 % with 1/2.
 WEIGHT = 0.5
-#: Share of the independent samples of the noise that count: its model is chosen from the same record. With all of them
-#: intervals held the ratio in 88 to 93 % of some hundred simulated records, with three quarters in 95 % of 400.
+#: Factor of the effective sample size of the noise, because its model is chosen from the same record: coverage in some
+#: hundred simulated records was 88 to 93 % with factor 1, and 95 % of 400 with 0.75.
 SPARE = 0.75
-#: Frequencies at which the spectrum of a noise is summed.
+#: Number of frequencies for the spectrum of a noise.
 FREQUENCIES = 1 << 14
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval; nan where the record does not tell it."""
+    """A value with its 95 % interval; NaN if the record does not determine it."""
 
     value: float = math.nan
     low: float = math.nan
@@ -48,9 +48,9 @@ UNKNOWN = Estimate()
 
 
 def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
-    """Return the variance of the response to the input over that of the noise [dB], beside columns of X.
+    """Return the variance of the response to the input over that of the noise [dB], given slow columns of X.
 
-    Both are taken about their means over the record.
+    Both are about their means over the record.
     """
     from scipy.special import chdtri
 
@@ -64,28 +64,28 @@ def signal_to_noise(model: ResponseModel, slow: Sequence[int]) -> Estimate:
         return UNKNOWN
     along = columns.T @ response
     error = 2 * math.sqrt(float(along @ covariance @ along)) / len(columns) / power
-    # The variance of coloured noise is as uncertain as that of fewer white samples.
+    # Effective sample size for the variance of coloured noise.
     fitted = float(np.sum(model.directions.squares > 1))
-    worth = max(2.0, len(columns) / squared_correlations(model.noise) - fitted)
-    worth = SPARE * 2 / (2 / worth + error**2)
+    effective = max(2.0, len(columns) / squared_correlations(model.noise) - fitted)
+    effective = SPARE * 2 / (2 / effective + error**2)
     ratio = power / variance_about_mean(model.noise, len(columns))
-    low, high = (ratio * chdtri(worth, tail) / worth for tail in reversed(TAILS))
+    low, high = (ratio * chdtri(effective, tail) / effective for tail in reversed(TAILS))
     return Estimate(*(10 * math.log10(each) for each in (ratio, low, high)))
 
 
 def variance_about_mean(noise: NoiseModel, count: int) -> float:
-    """Mean variance of ``count`` successive samples of a noise about their own mean.
+    """Return the expected variance of ``count`` successive samples of a noise about their mean.
 
-    Noise that is slow for a record wanders far beyond what the record shows of it.
+    For noise that is slow compared with the record it is much smaller than the stationary variance.
     """
     of_mean = float(noise.covariance_of(np.full((count, 1), 1 / count))[0, 0])
     variance = float(noise.first_autocovariances[0])
-    # Above zero in spite of rounding, where the samples hardly differ.
+    # Positive in spite of rounding if the samples hardly differ.
     return max(variance - of_mean, float(np.finfo(float).eps) * variance)
 
 
 def squared_correlations(noise: NoiseModel) -> float:
-    """Sum over all lags of the squared autocorrelation of a noise."""
+    """Return the sum over all lags of the squared autocorrelation of a noise."""
     power = 1 / np.abs(np.fft.fft(noise.coefficients, FREQUENCIES)) ** 2
     return float(np.mean(power**2) / np.mean(power) ** 2)
 
@@ -101,13 +101,13 @@ def step_responses(model: ResponseModel, slow: Sequence[int]) -> Array:
 
 
 def response_time(model: ResponseModel, steps: Array) -> Estimate:
-    """Return the time after a step in which 63 % of the final value is reached, delay included.
+    """Return the time after a step until 63 % of the final value, delay included.
 
-    The record does not tell it where the system integrates, or the response has not ended.
+    Unknown if the system integrates, or the response has not settled.
     """
     final = steps[:, -1]
-    moving = abs(steps[0, -1 - steps.shape[1] // 4] - final[0]) > ENDED * abs(final[0])
-    if model.integrates or moving or abs(final[0]) < SURE * final[1:].std():
+    moving = abs(steps[0, -1 - steps.shape[1] // 4] - final[0]) > SETTLED * abs(final[0])
+    if model.integrates or moving or abs(final[0]) < SIGNIFICANT * final[1:].std():
         return UNKNOWN
     rows, edges, shares = np.arange(len(steps)), model.layout.edges, steps / final[:, None]
     k = np.argmax(shares >= SHARE, axis=1)
@@ -118,15 +118,15 @@ def response_time(model: ResponseModel, steps: Array) -> Estimate:
 
 
 def delay(model: ResponseModel, slow: Sequence[int], steps: Array) -> Estimate:
-    """Return the time after which the output begins to respond, in steps of the intervals of the impulse response.
+    """Return the delay of the response, on the grid of the impulse response.
 
-    Its posterior, with responses that begin at once, or like a straight line, a parabola or a cubic.
+    From its posterior for responses with a constant, linear, quadratic or cubic onset.
     """
     edges, taps = model.layout.edges, model.layout.taps
-    sure = np.abs(steps[0]) > SURE * steps[1:].std(axis=0)
-    last = max(int(np.argmax(sure[1:])) + 1, min(DELAYS, taps // 3))
-    # Where it is sure only when it must have begun long before, the record does not tell when.
-    if not sure[1:].any() or last > taps // 2:
+    significant = np.abs(steps[0]) > SIGNIFICANT * steps[1:].std(axis=0)
+    last = max(int(np.argmax(significant[1:])) + 1, min(DELAYS, taps // 3))
+    # If the response becomes significant only late, its onset is not determined.
+    if not significant[1:].any() or last > taps // 2:
         return UNKNOWN
     tried = np.unique(np.linspace(0, last - 1, DELAYS).astype(int))
     values = np.array([_criteria(model, slow, int(first)) for first in tried])
@@ -134,15 +134,15 @@ def delay(model: ResponseModel, slow: Sequence[int], steps: Array) -> Estimate:
     below = np.cumsum(likelihood) / likelihood.sum()
     ends = np.append(tried[1:], last)
     low, high = edges[tried[np.argmax(below > TAILS[0])]], edges[ends[np.argmax(below >= TAILS[1])]]
-    # A response that fills a small part of an interval is not told from one that begins with the next.
+    # A response in the last part of an interval cannot be distinguished from one that begins with the next.
     low = max(low - 0.5 * edges[1], 0.0)
     return Estimate(float(edges[tried[np.argmax(likelihood)]]), float(low), float(high))
 
 
 def _criteria(model: ResponseModel, slow: Sequence[int], first: int) -> list[float]:
-    """BIC of responses that begin with an interval, one for each covariance and beginning."""
+    """Return the BIC of responses that begin with an interval, for each covariance and onset."""
     layout, gram = model.layout, model.gram.copy()
-    # What a system integrates it integrates from then on.
+    # The integral of the input also begins there.
     at = layout.taps + INTEGRAL
     gram[at] -= gram[:first].sum(axis=0)
     gram[:, at] -= gram[:, :first].sum(axis=1)

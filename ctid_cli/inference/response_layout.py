@@ -7,13 +7,13 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.signals.held import HeldSignal
 
-#: The impulse response ends after this many decay times, where its prior deviation is e^-4 of the first.
+#: Length of the impulse response [decay times]; its prior deviation is then e^-4 of the first.
 LENGTH = 8.0
-#: Times after which a free response has decayed by the factor e [decay times of the impulse response].
+#: Time constants of free responses [decay times of the impulse response].
 FREE = (0.7, 2.0, 6.0)
-#: The longest of them [duration of the record]: longer ones are not told from a straight line.
+#: The longest of them [duration of the record]: longer ones cannot be distinguished from a straight line.
 LONGEST_FREE = 1 / 6
-#: What is added to the diagonal of a covariance before it is factored, as a share of it.
+#: Relative increase of the diagonal of a covariance before its factorisation.
 JITTER = 1e-10
 
 #: Columns of X.
@@ -22,7 +22,7 @@ START = tuple(range(FIRST_FREE, FIRST_FREE + len(FREE)))
 
 
 class Signals(NamedTuple):
-    """Samples of an output, which need not be all of them, the input, and the sampling interval."""
+    """Samples of an output, possibly a subset, the input, and the sampling interval."""
 
     t: Array
     y: Array
@@ -40,7 +40,7 @@ class Pulse(NamedTuple):
 
     @classmethod
     def of(cls, signal: HeldSignal, before: float) -> "Pulse":
-        """Integrate exactly a signal that is held or joined by straight lines."""
+        """Integrate a held or piecewise linear signal exactly."""
         w, steps, slopes = signal.values - before, np.diff(signal.t), np.zeros(signal.t.size)
         if signal.hold != "zoh":
             slopes[:-1] = np.diff(w) / steps
@@ -48,14 +48,14 @@ class Pulse(NamedTuple):
         return cls(signal.t, w, slopes, np.append(0.0, np.cumsum(areas)))
 
     def at(self, times: Array) -> Array:
-        """Return the integral until given instants; zero before the record."""
+        """Return the integral up to given instants; zero before the record."""
         k = np.maximum(np.searchsorted(self.t, times, side="right") - 1, 0)
         since = np.maximum(times - self.t[k], 0.0)
         return np.asarray(self.sums[k] + since * (self.values[k] + 0.5 * self.slopes[k] * since))
 
 
 class Layout(NamedTuple):
-    """Columns for one decay time and one input before the record."""
+    """Columns for one decay time and one value of the input before the record."""
 
     before: float
     decay: float
@@ -83,7 +83,7 @@ class Layout(NamedTuple):
 
 
 def _edges(length: float, interval: float, taps: int) -> Array:
-    """Ends of the intervals of an impulse response: as short as the clock's at first, then even."""
+    """Return the ends of the intervals of an impulse response: sampling intervals at first, then equal longer ones."""
     if length <= taps * interval:
         return np.asarray(interval * np.arange(max(round(length / interval), 4) + 1.0))
     first = interval * np.arange(taps // 3 + 1.0)
@@ -91,7 +91,7 @@ def _edges(length: float, interval: float, taps: int) -> Array:
 
 
 def prior_factor(layout: Layout, smooth: bool) -> Array:
-    """Cholesky's factor of the prior covariance of an impulse response, of scale 1."""
+    """Return the Cholesky factor of the prior covariance of an impulse response, of scale 1."""
     theta = np.exp(-0.5 * (layout.edges[1:] + layout.edges[:-1]) / layout.decay)
     least = np.minimum(theta[:, None], theta)
     covariance = 0.5 * (3 * np.outer(theta, theta) * least - least**3) if smooth else least

@@ -1,4 +1,4 @@
-r"""Response of an output to its input without a structure: a Gaussian process beside slow terms and coloured noise.
+r"""Nonparametric response of an output to its input: a Gaussian process with slow terms and coloured noise.
 
 .. math:: y(t) = \int_0^S g(s)\, (u(t - s) - u_b)\, ds + X(t) \beta + v(t)
 
@@ -8,9 +8,9 @@ with one of two covariances [1]_, :math:`\theta = e^{-s/T}`, :math:`m = \min(\th
 - rough ("tuned and correlated"): :math:`\lambda m`;
 - smooth ("stable spline"): :math:`\lambda (3 \theta \theta' m - m^3) / 2`.
 
-X holds what is not the response: a constant, a straight line, free responses that decay; and the integral of u where
-the system integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the
-system integrates have the least BIC; v is autoregressive noise by REML, beside all of these.
+X contains the slow terms: a constant, a straight line, decaying free responses; and the integral of u if the system
+integrates. T, scale, covariance, the input before the record (its first value or zero) and whether the system
+integrates are chosen by BIC; v is autoregressive noise by REML, given all of these.
 
 References
 ----------
@@ -35,24 +35,23 @@ from ctid_cli.inference.response_layout import CONSTANT, INTEGRAL, LINE, START, 
 #: Number of intervals of the impulse response while decay and noise are searched, and afterwards; the first third of
 #: them are one sampling interval long.
 COARSE, FINE = 60, 120
-#: Decay times that are tried: the first [sampling intervals], the last [duration of the record], and the greatest ratio
-#: of neighbours.
+#: Decay times tried: the first [sampling intervals], the last [duration of the record], largest ratio of neighbours.
 FASTEST, SLOWEST, RATIO = 1.5, 1 / 4, 2.2
-#: Ratios of the greatest variance of the response to that of the noise, in one direction, which are tried as scales.
+#: Scales tried, as ratios of the greatest variance of the response in one direction to that of the noise.
 SCALES = np.geomspace(1e-3, 1e9, 37)
-#: Poles of the AR(1) noise with which the search begins.
+#: Poles of the AR(1) noise at the start of the search.
 NOISE_POLES = (0.0, 0.5, 0.8, 0.95)
-#: Rounding of products and factors, as a share of the diagonal.
+#: Relative rounding error of products and factors.
 ROUNDING = 1e-11
-#: An input with less power than this does not vary while the output is known.
+#: An input with less power than this is constant.
 LEAST = 1e-200
 
-#: Slow terms that are compared while the response is chosen.
+#: Sets of slow terms compared in the search.
 SLOW = ((), (CONSTANT,), (LINE,), (CONSTANT, LINE), (CONSTANT, *START), (CONSTANT, LINE, *START))
 
 
 class Prior(NamedTuple):
-    """What is assumed of the impulse response."""
+    """Prior of the impulse response."""
 
     #: Time after which its variance has decayed by the factor e [s].
     decay: float
@@ -62,7 +61,7 @@ class Prior(NamedTuple):
 
 
 class Weighted(NamedTuple):
-    """Products of the columns of X and of the output, which come last, weighted by the inverse of their covariance."""
+    """Products of the columns of X and of the output (last), weighted by the inverse of their covariance."""
 
     #: Scales of the prior, shape (scales,).
     scales: Array
@@ -72,7 +71,7 @@ class Weighted(NamedTuple):
     log_determinants: Array
 
     def fit(self, columns: Sequence[int]) -> tuple[Array, Array, float]:
-        """Return coefficients of columns of X, their covariance over the variance, and the square of the rest."""
+        """Return coefficients of columns of X, their covariance over the variance, and the residual sum of squares."""
         k, products = list(columns), self.products[0]
         sizes = np.sqrt(np.maximum(products.diagonal()[k], np.finfo(float).tiny))
         scaled = products[np.ix_(k, k)] / np.outer(sizes, sizes)
@@ -81,7 +80,7 @@ class Weighted(NamedTuple):
         return coefficients, inverse, float(products[-1, -1] - products[k, -1] @ coefficients)
 
     def criteria(self, columns: Sequence[int], count: int) -> Array:
-        """Return BIC with some columns of X at each scale, but for a constant and the noise."""
+        """Return BIC with columns of X at each scale, up to a constant and the noise term."""
         k = list(columns)
         right, left = self.products[:, k, -1], self.products[:, -1, -1]
         if k:
@@ -111,19 +110,19 @@ class Directions(NamedTuple):
         return cls(np.maximum(squares, 0.0), right, along, gram[taps:, taps:])
 
     def weighted(self, scales: Array) -> Weighted:
-        """Weight the products at each scale l: each direction loses the share l s^2 / (1 + l s^2) of its own."""
+        """Weight the products at each scale l: the share l s^2 / (1 + l s^2) of each direction is subtracted."""
         lost = scales[:, None] / (1 + scales[:, None] * self.squares)
         taken = np.einsum("lk,ki,kj->lij", lost, self.along, self.along, optimize=True)
         return Weighted(scales, self.products - taken, np.log1p(scales[:, None] * self.squares).sum(axis=1))
 
     def searched(self) -> Weighted:
-        """Weight the products at all scales that are tried."""
+        """Weight the products at all scales tried."""
         return self.weighted(SCALES / max(float(self.squares[-1]), LEAST))
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseModel:
-    """An impulse response with its uncertainty, what is beside it, and the noise."""
+    """An impulse response with its uncertainty, slow terms, and noise."""
 
     layout: Layout
     prior: Prior
@@ -132,7 +131,7 @@ class ResponseModel:
 
     @property
     def own(self) -> tuple[int, ...]:
-        """Columns of X that belong to the response."""
+        """Columns of X that are part of the response."""
         return (INTEGRAL,) if self.integrates else ()
 
     @cached_property
@@ -157,18 +156,18 @@ class ResponseModel:
         return self.directions.weighted(np.ones(1))
 
     def taps(self, columns: Sequence[int]) -> tuple[Array, Array]:
-        """Return the impulse response beside columns of X, and its covariance over the variance of the innovations."""
+        """Return the impulse response given columns of X, and its covariance over the variance of the innovations."""
         found, k = self.directions, list(columns)
         beta, uncertain, _ = self.weighted.fit(k)
         gain = self.factor @ found.right / (1 + found.squares)
         moved = gain @ found.along[:, k]
-        # An integrating system responds with a constant beside what decays.
+        # The impulse response of an integrating system has a constant part in addition to the decaying one.
         moved -= np.array(k) == INTEGRAL
         mean = gain @ found.along[:, -1] - moved @ beta
         return mean, gain @ (self.factor @ found.right).T + moved @ uncertain @ moved.T
 
     def parts(self, columns: Sequence[int]) -> tuple[Array, Array]:
-        """Return the response to the input, and the residuals beside it and columns of X."""
+        """Return the response to the input, and the residuals of response and columns of X."""
         taps, signals = self.layout.taps, self.layout.columns
         values = dict(zip(columns, self.weighted.fit(columns)[0], strict=True))
         response = signals[:, :taps] @ self.taps(columns)[0]
@@ -180,18 +179,18 @@ class ResponseModel:
 
 
 def ar1(pole: float) -> NoiseModel:
-    """AR(1) noise of innovation variance 1."""
+    """Return AR(1) noise of innovation variance 1."""
     return NoiseModel(np.array([1.0, -pole]), np.array([1.0, pole]) / (1 - pole**2), 1.0)
 
 
 def first_factor(noise: NoiseModel) -> Array:
-    """Cholesky's factor of the covariance of the first r samples of a noise over the variance of its innovations."""
+    """Return the Cholesky factor of the covariance of the first r samples of a noise over its innovation variance."""
     lags = np.abs(np.subtract.outer(np.arange(noise.order), np.arange(noise.order)))
     return np.asarray(np.linalg.cholesky(noise.first_autocovariances[lags] / noise.innovation_variance))
 
 
 def whitened(columns: Array, noise: NoiseModel) -> Array:
-    """Columns whose noise would be white with the variance of the innovations, the first rows included."""
+    """Return prewhitened columns, exact from the first row on."""
     white, r = columns.copy(), noise.order
     for k in range(1, r + 1):
         white[r:] += noise.coefficients[k] * columns[r - k : len(columns) - k]
@@ -201,7 +200,7 @@ def whitened(columns: Array, noise: NoiseModel) -> Array:
 
 
 def fit_response(signals: Signals) -> ResponseModel:
-    """Fit the response of an output to an input that varies."""
+    """Fit the response of an output to a varying input."""
     shortest = FASTEST * signals.interval
     longest = max(SLOWEST * float(np.ptp(signals.t)), 2 * shortest)
     decays = np.geomspace(shortest, longest, math.ceil(math.log(longest / shortest, RATIO)) + 1)
@@ -211,12 +210,12 @@ def fit_response(signals: Signals) -> ResponseModel:
     near = np.clip(model.prior.decay * RATIO ** np.array([-0.5, 0.0, 0.5]), shortest, longest)
     fine = [Layout.of(signals, model.layout.before, float(decay), FINE) for decay in near]
     for _ in range(2):
-        model = _likeliest(fine, [noise_beside(model)], (model.integrates,))
-    return ResponseModel(model.layout, model.prior, noise_beside(model), model.integrates)
+        model = _likeliest(fine, [residual_noise(model)], (model.integrates,))
+    return ResponseModel(model.layout, model.prior, residual_noise(model), model.integrates)
 
 
 def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrating: Sequence[bool]) -> ResponseModel:
-    """Return the model of the least BIC, whatever slow terms are beside the response."""
+    """Return the model of the least BIC over all sets of slow terms."""
     least, best = np.inf, None
     for layout, noise in itertools.product(layouts, noises):
         white = whitened(layout.columns, noise)
@@ -227,7 +226,7 @@ def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrat
             weighted = directions.searched()
             for slow, integrates in itertools.product(SLOW, integrating):
                 if integrates and LINE in slow:
-                    # A slow response to an input that is not zero on average may look like both of them.
+                    # A slow response to an input with nonzero mean may resemble both of them.
                     continue
                 values = determinant + weighted.criteria((*slow, INTEGRAL) if integrates else slow, count)
                 k = int(np.argmin(values))
@@ -238,8 +237,8 @@ def _likeliest(layouts: Iterable[Layout], noises: Sequence[NoiseModel], integrat
     return best
 
 
-def noise_beside(model: ResponseModel) -> NoiseModel:
-    """Noise by REML, beside X and the directions of the response that the data determine to more than one half."""
+def residual_noise(model: ResponseModel) -> NoiseModel:
+    """Return the REML noise, given X and the directions of the response that the data determine by more than half."""
     fixed = (CONSTANT, LINE, *START, *model.own)
     taps, columns, found = model.layout.taps, model.layout.columns, model.directions
     determined = columns[:, :taps] @ (model.factor @ found.right[:, found.squares > 1.0])

@@ -1,7 +1,7 @@
-r"""Loss functions that count large output errors less than their squares: Huber's, and Tukey's biweight.
+r"""Robust loss functions: Huber's, and Tukey's biweight.
 
-The estimate solves ``sum_t s_t psi(r_t) = 0`` with the sensitivities s. Its law for many samples is that of least
-squares whose errors are the *pseudo-errors* ``psi(r_t) / mean psi'``: covariances, tests and profiles take these.
+The estimate solves ``sum_t s_t psi(r_t) = 0`` with the sensitivities s. Its asymptotic distribution is that of least
+squares with the *pseudo-errors* ``psi(r_t) / mean psi'``: covariances, tests and profiles use these.
 
 References
 ----------
@@ -20,11 +20,11 @@ from ctid_cli.inference.fit import DeferredFields
 from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.signals.record import Record
 
-#: The losses that are not squares.
+#: Losses other than least squares.
 RobustKind = Literal["huber", "tukey"]
-#: Bend of Huber's loss and end of Tukey's, in standard deviations: 95 % efficient where the errors are normal.
+#: Tuning constants of Huber's and Tukey's loss, in standard deviations: 95 % efficiency for normal errors.
 BEND, END = 1.345, 4.685
-#: Below this weight an error counts as an outlier of Huber's loss: beyond 2.69 standard deviations.
+#: Below this weight an error counts as an outlier of Huber's loss (beyond 2.69 standard deviations).
 HALF = 0.5
 
 
@@ -33,18 +33,18 @@ class Loss:
     """A loss for errors of a known scale."""
 
     kind: RobustKind
-    #: Standard deviation of the errors that are no outliers [output unit].
+    #: Standard deviation of the errors without outliers [output unit].
     scale: float
 
     def weight(self, r: Array) -> Array:
-        """``psi(r)/r``: 1 for small errors."""
+        """Return ``psi(r)/r``, which is 1 for small errors."""
         z = np.abs(r) / self.scale
         if self.kind == "huber":
             return np.asarray(BEND / np.maximum(z, BEND))
         return np.maximum(1.0 - (z / END) ** 2, 0.0) ** 2
 
     def cost(self, r: Array) -> float:
-        """``2 sum rho(r)``, which is ``sum r^2`` where all errors are small [output unit^2]."""
+        """Return ``2 sum rho(r)``, which is ``sum r^2`` if all errors are small [output unit^2]."""
         z = np.abs(r) / self.scale
         if self.kind == "huber":
             losses = np.where(z <= BEND, z**2, 2.0 * BEND * z - BEND**2)
@@ -53,7 +53,7 @@ class Loss:
         return float(losses.sum()) * self.scale**2
 
     def slope(self, r: Array) -> Array:
-        """``psi'(r)``."""
+        """Return ``psi'(r)``."""
         z = np.abs(r) / self.scale
         if self.kind == "huber":
             return (z <= BEND).astype(float)
@@ -63,7 +63,7 @@ class Loss:
 
 @dataclass(frozen=True, eq=False)
 class Weighting(DeferredFields):
-    """How a loss counts the output errors of several records."""
+    """Weights of the output errors of several records."""
 
     deferred: ClassVar[tuple[str, ...]] = ("weights", "pseudo_errors")
 
@@ -75,20 +75,20 @@ class Weighting(DeferredFields):
 
     @property
     def kind(self) -> RobustKind:
-        """Which loss it is."""
+        """Kind of the loss."""
         return self.losses[0].kind
 
     @property
     def outliers(self) -> tuple[BoolArray, ...]:
-        """Which used samples of each record count for less than half under Huber's loss, for nothing under Tukey's."""
+        """Used samples of each record with a weight below one half for Huber's loss, of zero for Tukey's."""
         return tuple(w < HALF if self.kind == "huber" else w == 0.0 for w in self.weights)
 
     def outlier_times(self, records: Sequence[Record], used: Sequence[BoolArray]) -> list[Array]:
-        """Instants of the outliers of each record, of which some samples are used."""
+        """Return the instants of the outliers of each record."""
         return [record.t[use][out] for record, use, out in zip(records, used, self.outliers, strict=True)]
 
     def fit_percent(self, records: Sequence[Record], used: Sequence[BoolArray], residuals: Sequence[Array]) -> float:
-        """Fit over the used samples that are no outliers, means by record [%]."""
+        """Return the fit over the used samples without outliers, about the mean of each record [%]."""
         squares = spread = 0.0
         for record, use, out, r in zip(records, used, self.outliers, residuals, strict=True):
             y = record.y[use][~out]
@@ -98,15 +98,15 @@ class Weighting(DeferredFields):
 
 
 def scale_of(errors: Array, least: float) -> float:
-    """Standard deviation from the median absolute error; errors of nothing, before a system moves, do not count."""
+    """Return a robust standard deviation of the errors that exceed ``least``, which excludes a system still at rest."""
     moving = errors[np.abs(errors) > least]
     return max(robust_deviation(moving), least) if moving.size else least
 
 
 def weighted(losses: Sequence[Loss], errors: Sequence[Array], parameters: int) -> Weighting:
-    """Weights and pseudo-errors; samples without any weight are as if they were missing.
+    """Return weights and pseudo-errors; samples of zero weight are ignored.
 
-    With many parameters a few samples see a part of their own outliers, by Huber's factor K.
+    Pseudo-errors include Huber's correction factor K for the number of parameters.
     """
     pairs = list(zip(losses, errors, strict=True))
     weights = tuple(loss.weight(r) for loss, r in pairs)

@@ -6,8 +6,8 @@ With ``G = B/A exp(-tau p)``, ``theta = (a_1 … a_n, b_0 … b_m, tau)`` and mo
           \frac{\partial G}{\partial b_j} = \frac{p^{m-j}}{A} e^{-\tau p}, \quad
           \frac{\partial G}{\partial\tau} = -p\,G,
 
-and of a submodel ``B/(p^l A)`` of a sum, whose coefficients go by the powers of p that they multiply,
-``-p^k/A G`` and ``p^k/(p^l A) exp(-tau p)``.
+and for a submodel ``B/(p^l A)`` of a sum, whose coefficients are numbered by their power of p, ``-p^k/A G`` and
+``p^k/(p^l A) exp(-tau p)``.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Structure:
 
     @cached_property
     def regressor_rows(self) -> IndexArray:
-        """Standard rows of the regressor: as the sensitivities, the measured output in the model output's place."""
+        """Standard rows of the regressor: the sensitivities with the measured instead of the model output."""
         rows = self.sensitivity_rows.copy()
         rows[: self.poles] += self.poles
         return rows
@@ -114,25 +114,25 @@ class SumStructure:
 
     @property
     def denominators(self) -> IndexArray:
-        """Places of the coefficients of the denominators."""
+        """Indices of the coefficients of the denominators."""
         return np.array([k for k, name in enumerate(self.names) if "_a" in name], dtype=np.intp)
 
     @property
     def numerators(self) -> IndexArray:
-        """Places of the coefficients of each numerator, in descending powers."""
+        """Indices of the coefficients of each numerator, in descending powers."""
         last = np.cumsum([term.size for term in self.terms]).tolist()
         places = [np.arange(end - 1, end - term.zeros - 2, -1) for end, term in zip(last, self.terms, strict=True)]
         return np.concatenate(places).astype(np.intp)
 
     def theta_of(self, model: Model) -> Array:
-        """Parameters of a model of this structure."""
+        """Return the parameters of a model of this structure."""
         assert isinstance(model, AdditiveModel)
         return np.concatenate((model.theta, [model.delay] * self.delay))
 
     def fractions_of(self, theta: Array) -> tuple[list[tuple[Array, Array]], Array]:
         """Return B and the monic A of each fraction, and the derivatives of their coefficients by the parameters.
 
-        The lowest coefficients of A are zero where there are integrators.
+        The lowest coefficients of A are zero if there are integrators.
         """
         found, slopes, first, row = [], np.zeros((self.poles + self.zeros + 1, self.size - int(self.delay))), 0, 0
         for term in self.terms:
@@ -147,7 +147,7 @@ class SumStructure:
 
 
 def _monic(theta: Array, n: int) -> tuple[Array, Array]:
-    """Return ``a_1 ... a_n, b_0 ... b_m`` of the monic fraction of a submodel, and their derivatives by its own."""
+    """Return ``a_1 ... a_n, b_0 ... b_m`` of the monic fraction of a submodel, and derivatives by its parameters."""
     highest, size = (theta[n - 1] if n else 1.0), theta.size
     # The constant term of A is 1; the others are in the order of descending powers.
     order = [*range(n - 2, -1, -1), *[size] * (n > 0), *range(size - 1, n - 1, -1)]
@@ -159,7 +159,7 @@ def _monic(theta: Array, n: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A fraction ``B/(p^l A)``: all of a transfer function, or a submodel of a sum."""
+    """A fraction ``B/(p^l A)``: a whole transfer function, or a submodel of a sum."""
 
     #: B and A in descending powers; A is monic in a transfer function and has the constant term 1 in a submodel.
     numerator: Array
@@ -176,7 +176,7 @@ class Part:
 
     @property
     def derivative(self) -> Part:
-        """The part behind a differentiator."""
+        """The part in series with a differentiator."""
         return replace(self, numerator=np.append(self.numerator, 0.0), b_powers=tuple(k + 1 for k in self.b_powers))
 
     def fraction(self, delay: float) -> TransferFunction:
@@ -205,12 +205,12 @@ class Part:
         if direct:
             filtered = filtered + direct * driven[:, self.integrators :]
         by_a, by_b = _of_powers(filtered, x, a, self.a_powers), _of_powers(driven, u, a, self.b_powers)
-        # Between the breaks of a held input the derivative by the delay has nothing of what passes at once.
+        # Between the breaks of a held input the direct feedthrough does not affect the derivative by the delay.
         scales = np.repeat((-1.0 / highest, 1.0 / highest, -1.0), (len(self.a_powers), len(self.b_powers), 1))
         return np.asarray(np.hstack((by_a, by_b, rows[:, order + 2 * n + 2, None])) * scales)
 
     def pole_slopes(self) -> tuple[ComplexArray, ComplexArray]:
-        """Return the poles but for the integrators, and their derivatives ``-p^k/A'(p)`` by the coefficients of A."""
+        """Return the poles without integrators, and their derivatives ``-p^k/A'(p)`` by the coefficients of A."""
         poles = sorted_roots(self.denominator)
         with np.errstate(invalid="ignore"):
             by_constant = pole_jacobian(self.denominator / self.denominator[0], poles)[:, -1:] / self.denominator[0]
@@ -218,7 +218,7 @@ class Part:
 
 
 def _of_powers(lower: Array, signal: Array, a: Array, powers: tuple[int, ...]) -> Array:
-    """Columns ``p^k/(p^l A) s`` for given k, from those with k below the degree of the denominator and s itself."""
+    """Return the columns ``p^k/(p^l A) s`` for given k, from those with k below the degree of A and from s."""
     degree = lower.shape[1]
     if degree in powers:
         lower = np.column_stack((lower, signal - lower[:, degree - a.size + 1 :] @ a[:0:-1]))
@@ -226,9 +226,9 @@ def _of_powers(lower: Array, signal: Array, a: Array, powers: tuple[int, ...]) -
 
 
 def parts_of(model: Model, zeros: int | None = None) -> list[Part]:
-    """Return the submodels of a sum, whose coefficients go by rising powers, or the one fraction of another model.
+    """Return the submodels of a sum, with coefficients in rising powers, or the single fraction of another model.
 
-    A fraction may have a numerator with leading coefficients that are zero: then its number of zeros is given.
+    The number of zeros of a fraction is given if leading coefficients of its numerator are zero.
     """
     if isinstance(model, AdditiveModel):
         return [
@@ -249,13 +249,13 @@ def parts_of(model: Model, zeros: int | None = None) -> list[Part]:
 def sensitivities(
     model: Model, signal: HeldSignal, times: ArrayLike, zeros: int | None = None, *, estimate_delay: bool = False
 ) -> Array:
-    """Derivatives of a model's output at given times by its coefficients, and by its delay if that is estimated."""
+    """Return derivatives of a model's output at given times by its coefficients, and by an estimated delay."""
     found = _output_slopes(parts_of(model, zeros), model.delay, signal, times)
     return found if estimate_delay else found[:, :-1]
 
 
 def _output_slopes(parts: Sequence[Part], delay: float, signal: HeldSignal, times: ArrayLike) -> Array:
-    """Derivatives of the output from rest by the coefficients of all parts and, in the last column, by the delay."""
+    """Return derivatives of the output from rest by the coefficients of all parts and, last, by the delay."""
     instants = np.asarray(times, dtype=float)
     data = filter_data(Record(instants, np.zeros(instants.size), signal), start=-np.inf)
     found = [part.output_slopes(data, signal, delay) for part in parts]
@@ -264,17 +264,17 @@ def _output_slopes(parts: Sequence[Part], delay: float, signal: HeldSignal, time
 
 @dataclass(frozen=True, eq=False)
 class Parametric:
-    """A model, and which of its numbers are free."""
+    """A model with its free parameters."""
 
     model: Model
-    #: Of all free parameters of a fit, initial states and offsets among them, which no response of the model has.
+    #: Names of all free parameters of a fit, including initial states and offsets, which do not affect the model.
     names: tuple[str, ...]
-    #: Whether responses over time are those behind a differentiator.
+    #: Whether responses over time are differentiated.
     differentiated: bool = False
 
     @cached_property
     def zeros(self) -> int:
-        """Degree of the numerator as one transfer function, leading coefficients that are zero included."""
+        """Degree of the numerator as one transfer function, including leading coefficients that are zero."""
         own = [int(name[1:]) for name in self.names if re.fullmatch(r"b\d+", name)]
         return max([self.fraction.numerator.size - 1, *own])
 
@@ -285,14 +285,14 @@ class Parametric:
 
     @cached_property
     def every(self) -> tuple[str, ...]:
-        """Names of all numbers of the model, free or not."""
+        """Names of all parameters of the model, free or not."""
         if isinstance(self.model, AdditiveModel):
             return (*self.model.names, "delay")
         return Structure(self.model.order, self.zeros, delay=True).names
 
     @cached_property
     def free(self) -> tuple[IndexArray, IndexArray]:
-        """Places of the free numbers of the model: among the names of the fit, and among all of the model."""
+        """Indices of the free parameters of the model in the names of the fit, and in ``every``."""
         mine = [k for k, name in enumerate(self.names) if _COEFFICIENT.fullmatch(name)]
         places = {name: k for k, name in enumerate(self.every)}
         unknown = [self.names[k] for k in mine if self.names[k] not in places]
@@ -302,7 +302,7 @@ class Parametric:
 
     @cached_property
     def theta(self) -> Array:
-        """All numbers of the model, in the order of ``every``."""
+        """All parameters of the model, in the order of ``every``."""
         model = self.model
         if isinstance(model, AdditiveModel):
             return np.append(model.theta, model.delay)
@@ -310,7 +310,7 @@ class Parametric:
         return np.concatenate((model.denominator[1:], b, [model.delay]))
 
     def at(self, change: Array) -> Parametric:
-        """The model whose free numbers have changed so much; a delay does not fall below zero."""
+        """Return the model with its free parameters changed; a negative delay becomes zero."""
         theta = self.theta.copy()
         theta[self.free[1]] += change
         delay = max(float(theta[-1]), 0.0)
@@ -320,7 +320,7 @@ class Parametric:
         return replace(self, model=TransferFunction(theta[n:-1], np.concatenate(([1.0], theta[:n])), delay))
 
     def _among_all(self, every: NDArray[Number]) -> NDArray[Number]:
-        """Derivatives by all numbers of the model as derivatives by all parameters of the fit."""
+        """Return derivatives by all parameters of the model as derivatives by all parameters of the fit."""
         mine, places = self.free
         found = np.zeros((len(every), len(self.names)), dtype=every.dtype)
         found[:, mine] = every[:, places]
@@ -328,38 +328,37 @@ class Parametric:
 
     @cached_property
     def parts(self) -> list[Part]:
-        """Its fractions, behind the differentiator where there is one."""
+        """Fractions of the model, differentiated if requested."""
         parts = parts_of(self.model, None if isinstance(self.model, AdditiveModel) else self.zeros)
         return [part.derivative for part in parts] if self.differentiated else parts
 
     def frequency_slopes(self, frequencies: Array) -> ComplexArray:
-        """Derivatives of ``G(j w)``, shape (N, p)."""
+        """Return the derivatives of ``G(j w)``, shape (N, p)."""
         s = np.asarray(1j * frequencies, dtype=complex)
         columns = [column for part in self.parts for column in part.frequency_slopes(s, self.model.delay)]
         return self._among_all(np.column_stack((*columns, -s * self.model.frequency_response(frequencies))))
 
     def simulated(self, signal: HeldSignal, times: Array) -> Array:
-        """Output from rest."""
+        """Return the output from rest."""
         fractions = [part.fraction(self.model.delay) for part in self.parts]
         return np.asarray(np.sum([simulate(fraction, signal, times) for fraction in fractions], axis=0))
 
     def output_slopes(self, signal: HeldSignal, times: Array) -> Array:
-        """Derivatives of the output from rest, shape (N, p)."""
+        """Return the derivatives of the output from rest, shape (N, p)."""
         return self._among_all(_output_slopes(self.parts, self.model.delay, signal, times))
 
     @property
     def derivative(self) -> Parametric:
-        """The model behind a differentiator, whose step response is the impulse response of this one."""
+        """The model in series with a differentiator, whose step response is the impulse response of this model."""
         parts = self.model.submodels if isinstance(self.model, AdditiveModel) else (self.model,)
         if any(part.relative_degree < 1 for part in parts):
             raise DataError(
-                "a model with as many zeros as poles passes on an impulse itself, which is no number at any instant; "
-                "look at its step response"
+                "the impulse response of a model with as many zeros as poles contains an impulse; use its step response"
             )
         return replace(self, differentiated=True)
 
     def poles(self) -> tuple[ComplexArray, ComplexArray]:
-        """Poles, and their derivatives, shape (n, p); integrators of submodels stay where they are."""
+        """Return the poles and their derivatives, shape (n, p); integrators of submodels are fixed."""
         rows, found, first = [], [], 0
         for part in self.parts:
             poles, jacobian = part.pole_slopes()

@@ -1,4 +1,4 @@
-"""How an input moves, and faults of an output: outliers, limits, coarse steps, growth."""
+"""Features of an input, and faults of an output: outliers, saturation, quantisation, growth."""
 
 import math
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from ctid_cli.inference.intervals import robust_deviation
 from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.signals.record import Record
 
-#: An input with at most this many changes gives single responses in time and no averages over frequency.
+#: An input with at most this number of changes gives single step responses and no averages over frequency.
 FEW_CHANGES = 3
-#: An input that takes at most this many values moves between levels.
+#: An input with at most this number of values changes between levels.
 FEW_LEVELS = 20
 #: Spread of a measured level, and share of the samples that make one, both as a fraction of the whole.
 LEVEL_WIDTH = 0.1
@@ -22,10 +22,10 @@ LEVEL_SHARE = 0.02
 
 @dataclass(frozen=True)
 class InputMoves:
-    """What the input does over the time of a record."""
+    """Changes of the input during a record."""
 
     kind: Literal["constant", "steps", "levels", "continuous"]
-    #: The values it returns to [input unit], at most 20 of them; empty where there are more.
+    #: The values it returns to [input unit], at most 20; empty if there are more.
     levels: tuple[float, ...]
     #: Instants of the changes after the beginning of the record [s]; empty for a continuous input, shape (n,).
     changes: Array
@@ -35,25 +35,25 @@ class InputMoves:
 
 
 def input_moves(record: Record) -> InputMoves:
-    """How the input moves between the first and the last output sample.
+    """Return the changes of the input between the first and the last output sample.
 
-    A measured input counts as moving between levels when nine samples in ten lie in a few narrow heaps; its
-    changes are then those between heaps. An input known at the instants of the output only is taken to change there.
+    A measured input changes between levels if nine samples in ten are in a few narrow clusters; its changes are then
+    those between clusters. An input known at the instants of the output only is assumed to change there.
     """
     first, signal = record.t[0], record.input
     inside = (signal.t > first) & (signal.t <= record.t[-1])
-    # The value that the record begins with counts too.
+    # Including the value at the beginning of the record.
     t, u = np.append(first, signal.t[inside]), np.append(signal.at([first]), signal.values[inside])
     spread = float(np.ptp(u))
     if spread <= 1e-9 * float(np.abs(u).max()):
         return InputMoves("constant", (float(u[0]),), np.empty(0), np.nan)
     values, exact = np.unique(u, return_inverse=True)
     label = np.asarray(exact, dtype=np.int64)
-    heaps = _heaps(u, spread)
+    clusters = _clusters(u, spread)
     noisy = False
-    # Where the values flicker about their levels, the changes that count are those between levels.
-    if heaps is not None and _changes(heaps) < _changes(label) / 3:
-        label, noisy = heaps, True
+    # With noise about the levels, only changes between levels count.
+    if clusters is not None and _changes(clusters) < _changes(label) / 3:
+        label, noisy = clusters, True
         values = np.array([float(np.median(u[label == k])) for k in np.unique(label)])
     elif values.size > FEW_LEVELS and np.mean(u[1:] == u[:-1]) < 0.5:
         return InputMoves("continuous", (), np.empty(0), np.nan)
@@ -67,55 +67,55 @@ def _changes(label: IntArray) -> int:
     return int(np.count_nonzero(label[1:] != label[:-1]))
 
 
-def _heaps(u: Array, spread: float) -> IntArray | None:
-    """Number of the heap that each value lies in or came from; None where the values do not lie in narrow heaps."""
+def _clusters(u: Array, spread: float) -> IntArray | None:
+    """Return the present or last cluster of each value; None if the values do not form narrow clusters."""
     bins = np.minimum((50 * (u - u.min()) / spread).astype(np.int64), 49)
     full = np.flatnonzero(np.bincount(bins, minlength=50) >= LEVEL_SHARE * u.size)
     if not full.size:
         return None
-    # Coarsely quantised values leave bins empty between them: full bins less than three apart make one heap.
+    # Coarsely quantised values leave empty bins: full bins less than three apart form one cluster.
     number = 1 + np.cumsum(np.diff(full, prepend=full[0]) > 2)
-    heap_of_bin = np.zeros(50, dtype=np.int64)
+    cluster_of_bin = np.zeros(50, dtype=np.int64)
     for first, last, k in zip(full[:-1], full[1:], number[1:], strict=True):
-        heap_of_bin[first : last + 1] = np.where(last - first > 2, 0, k)
-    heap_of_bin[full] = number
-    for _ in range(3):  # the rare values at the skirts of a heap
-        beside = np.maximum(np.append(0, heap_of_bin[:-1]), np.append(heap_of_bin[1:], 0))
-        heap_of_bin = np.where(heap_of_bin == 0, beside, heap_of_bin)
-    heap = heap_of_bin[bins]
-    if heap.max() < 2 or np.mean(heap > 0) < 0.9 - LEVEL_WIDTH:
+        cluster_of_bin[first : last + 1] = np.where(last - first > 2, 0, k)
+    cluster_of_bin[full] = number
+    for _ in range(3):  # the rare values at the edges of a cluster
+        neighbour = np.maximum(np.append(0, cluster_of_bin[:-1]), np.append(cluster_of_bin[1:], 0))
+        cluster_of_bin = np.where(cluster_of_bin == 0, neighbour, cluster_of_bin)
+    cluster = cluster_of_bin[bins]
+    if cluster.max() < 2 or np.mean(cluster > 0) < 0.9 - LEVEL_WIDTH:
         return None
-    widths = [np.ptp(u[heap == k]) for k in range(1, int(heap.max()) + 1)]
+    widths = [np.ptp(u[cluster == k]) for k in range(1, int(cluster.max()) + 1)]
     if max(widths) > 2 * LEVEL_WIDTH * spread or len(widths) > FEW_LEVELS:
         return None
-    known = np.flatnonzero(heap > 0)
+    known = np.flatnonzero(cluster > 0)
     last = known[np.maximum(np.searchsorted(known, np.arange(u.size), side="right") - 1, 0)]
-    return np.asarray(heap[last], dtype=np.int64)
+    return np.asarray(cluster[last], dtype=np.int64)
 
 
-#: A sample this many robust standard deviations away from its neighbours is an outlier.
+#: An outlier deviates from its neighbours by this number of robust standard deviations.
 OUTLIER = 10.0
-#: Neighbours on each side that show how large residuals are about one of them.
-ABOUT = 20
-#: Share of values that come more than once in an output whose single samples at a limit tell as much as runs do.
-SELDOM_ALIKE = 0.02
-#: A part of the record in which an unstable plant grows by less than this is not told from a polynomial in time.
+#: Neighbours on each side for the local deviation of residuals.
+LOCAL = 20
+#: Largest share of repeated values for which single samples at a limit count as saturated, not only runs.
+FEW_REPEATED = 0.02
+#: Least growth of an unstable output in part of the record that can be distinguished from a polynomial in time.
 GROWTH = 4.0
 
 
 def outliers(y: Array) -> IntArray:
-    """Single samples, or pairs, far from the median of the five about them."""
+    """Return single samples, or pairs, far from the median of five neighbouring samples."""
     return far_off(y)[0]
 
 
 def far_off(y: Array) -> tuple[IntArray, Array]:
-    """Outliers, and how far they are from the median of their neighbours."""
+    """Return outliers, and their deviation from the median of their neighbours."""
     if y.size < 20:
         return np.empty(0, dtype=np.int64), np.empty(0)
     padded = np.pad(y, 2, mode="edge")
     rest = y - np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
     spread = robust_deviation(rest)
-    # The fast part of a response leaves its own medians behind, everywhere and not at one sample in ten.
+    # Fast responses deviate from their medians too, but at more than one sample in ten.
     usual = float(np.quantile(np.abs(rest), 0.9))
     step = quantum(y)
     limit = max(OUTLIER * spread, 6 * usual, 0.2 * float(y.std()), 0.0 if math.isnan(step) else 4 * step)
@@ -124,32 +124,32 @@ def far_off(y: Array) -> tuple[IntArray, Array]:
 
 
 def residual_outliers(e: Array) -> tuple[IntArray, Array]:
-    """Residuals that are far off, and that others do not foretell, as they do the peaks of a smooth sequence.
+    """Return outliers of residuals whose innovations are also large, unlike those of peaks of a smooth sequence.
 
-    Where all about are as large, as a nonlinear system leaves them in its large swings, none is a fault of the sensor.
+    If neighbouring innovations are as large, as for a nonlinear system at large amplitudes, none is a sensor fault.
     """
     found, off = far_off(e)
     usual = e.copy()
     usual[found] -= off
-    surprise = fit_noise_model([usual]).innovations(usual)
-    usual_about = np.array([_level_about(surprise, k) for k in found.tolist()])
-    sudden = np.abs(surprise[found] + off) > OUTLIER * np.fmax(robust_deviation(surprise), usual_about)
+    innovations = fit_noise_model([usual]).innovations(usual)
+    local = np.array([_local_deviation(innovations, k) for k in found.tolist()])
+    sudden = np.abs(innovations[found] + off) > OUTLIER * np.fmax(robust_deviation(innovations), local)
     return found[sudden], off[sudden]
 
 
-def _level_about(surprise: Array, k: int) -> float:
-    """Robust deviation before or after a sample, the larger of the two; NaN where there are too few."""
-    sides = (surprise[max(k - ABOUT, 0) : k], surprise[k + 1 : k + 1 + ABOUT])
-    return max((robust_deviation(side) for side in sides if side.size == ABOUT), default=math.nan)
+def _local_deviation(innovations: Array, k: int) -> float:
+    """Return the larger of the robust deviations before and after a sample; NaN if there are too few samples."""
+    sides = (innovations[max(k - LOCAL, 0) : k], innovations[k + 1 : k + 1 + LOCAL])
+    return max((robust_deviation(side) for side in sides if side.size == LOCAL), default=math.nan)
 
 
 def saturated(y: Array) -> float:
-    """Fraction of the samples that a limit seems to have cut off; the output may begin, or end, at rest at a limit."""
+    """Return the fraction of saturated samples; runs at the beginning or the end of the record may be rest."""
     values, counts = np.unique(y, return_counts=True)
     if values.size < 10:
         return 0.0
-    # Where no other value comes twice, single samples tell as much as runs do.
-    alone = float(np.mean(counts[1:-1] == 1)) > 1 - SELDOM_ALIKE
+    # If other values hardly repeat, single samples at a limit are significant.
+    alone = float(np.mean(counts[1:-1] == 1)) > 1 - FEW_REPEATED
     shortest, fewest = (1, 5) if alone else (5, 0.01 * y.size)
     total = 0
     for k, inner in ((0, 1), (-1, -2)):
@@ -163,13 +163,13 @@ def saturated(y: Array) -> float:
 
 
 def _runs(marked: BoolArray) -> tuple[IntArray, IntArray]:
-    """Where runs of marked samples begin, and where the samples after them are."""
+    """Return the first index of each run of marked samples, and the index after its end."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], marked.astype(int), [0]))))
     return edges[::2], edges[1::2]
 
 
 def growth_time(t: Array, y: Array, u: Array) -> float:
-    """Time in which an output that diverges exponentially grows by the factor e; nan for any other."""
+    """Return the time constant of an exponentially diverging output; NaN for any other."""
     if y.size < 64:
         return math.nan
     sizes = []
@@ -178,14 +178,14 @@ def growth_time(t: Array, y: Array, u: Array) -> float:
         sizes.append(np.log([float(np.mean(part**2)) or np.finfo(float).tiny for part in parts[3:]]) / 2)
     driven, grown = sizes
     steps = np.diff(grown)
-    # An exponential grows in the same ratio all the time; powers of time ever more slowly, and a late event at once.
+    # An exponential grows at a constant rate, powers of time ever more slowly, and a late event suddenly.
     even = steps[-2:].min() > 0.5 * steps[-2:].max() and steps[-2:].sum() > 0.8 * steps[:2].sum()
-    by_itself = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[-3]))
-    return float((t[-1] - t[0]) / 4 / (grown[-1] - grown[-3])) if even and by_itself else math.nan
+    unforced = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[-3]))
+    return float((t[-1] - t[0]) / 4 / (grown[-1] - grown[-3])) if even and unforced else math.nan
 
 
 def quantum(y: Array) -> float:
-    """Step of a coarsely quantised signal."""
+    """Return the step of a coarsely quantised signal; NaN for others."""
     values = np.unique(y)
     gaps = np.diff(values)
     gaps = gaps[gaps > 1e-6 * np.ptp(y)] if gaps.size else gaps
@@ -193,6 +193,6 @@ def quantum(y: Array) -> float:
         return math.nan
     step = float(np.median(gaps))
     multiples = gaps / step
-    # Quantised values are written with a rounding of their own.
+    # Quantised values may be rounded again in files.
     fits = np.abs(multiples - np.round(multiples)) < 0.15
     return step if np.mean(fits) > 0.9 and step > 0.01 * y.std() else math.nan

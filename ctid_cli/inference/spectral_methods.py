@@ -1,12 +1,12 @@
-r"""Estimates of a frequency response without a model: by local polynomials, from periods, and by averages.
+r"""Nonparametric estimates of a frequency response: local polynomials, periodic signals, and Welch's method.
 
-Of a signal on a regular clock of interval h the samples tell the sum of its spectrum over all frequencies that look
-alike. With ``w_s = 2 pi/h``, an input held between its samples has the spectrum ``H(w) U(w)`` at every one of them,
+The spectrum of samples of interval h is the sum of the spectrum over all aliased frequencies. With ``w_s = 2 pi/h``, an
+input held between its samples has the spectrum ``H(w) U(w)`` at each of them,
 
 .. math:: H_{zoh} = \frac{1 - e^{-jwh}}{jwh}, \quad H_{foh} = \Big(\frac{\sin(wh/2)}{wh/2}\Big)^2, \quad H_{bl} = 1,
 
 the last one below half of w_s only. The output over the input and H is ``G(jw) + sum_m G(j(w + m w_s)) H(w + m w_s) /
-H(w)``, m ≠ 0: the response and its images, which a hold leaves the smaller the faster the clock.
+H(w)``, m ≠ 0: the response and its images, which decrease with the sampling interval.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,39 +18,39 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray, IntArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.treatment import Hold
 
-#: Images on each side that are summed; those beyond add less than a hundredth of the first.
+#: Number of images on each side in the sum; the others add less than a hundredth of the first.
 IMAGES = 20
-#: Share of the estimated frequencies, the highest ones, whose gain the images go on from.
+#: Share of the highest estimated frequencies from whose gain the images are extrapolated.
 HIGHEST = 0.1
 
 
 class ResponseLines(NamedTuple):
-    """A response at some frequencies as one of the methods finds it; the input is that between the samples."""
+    """A response at some frequencies, not corrected for the hold of the input."""
 
     #: Frequencies [rad/s], rising, shape (K,).
     frequencies: Array
     #: Response [output unit/input unit], shape (K,).
     response: ComplexArray
-    #: Variance of the response, that of both parts together, shape (K,).
+    #: Variance of the complex response, shape (K,).
     variance: Array
-    #: Degrees of freedom of the complex residuals that the variance is from [-], shape (K,).
+    #: Degrees of freedom of the complex residuals of the variance [-], shape (K,).
     freedom: Array
-    #: Share of the output's power that follows the input linearly [-], shape (K,).
+    #: Share of the output's power that is linear in the input [-], shape (K,).
     coherence: Array
-    #: Variance that nonlinear distortions give the response of one realisation, where they are told, shape (K,).
+    #: Variance of the response of one realisation due to nonlinear distortions, if determined, shape (K,).
     distortion: Array | None
     notes: tuple[str, ...]
     #: Whether an interval can be given, shape (K,).
-    told: BoolArray
+    has_interval: BoolArray
 
 
 def images(hold: Hold, frequencies: Array, response: ComplexArray, variance: Array, interval: float) -> Array:
-    """What the images may add to a response [its unit], if its gain falls like 1/w or faster from where it was seen."""
+    """Return a bound of the images [unit of the response], for a gain that falls like 1/w beyond the estimate."""
     order = {"zoh": 1, "foh": 2}.get(hold, 0)
     if not order:
         return np.zeros(frequencies.size)
     last = max(1, round(HIGHEST * frequencies.size))
-    # Freed of the noise, as far as the noise allows.
+    # Less the power of the noise.
     power, noise = (float(np.mean(x[-last:] * frequencies[-last:] ** 2)) for x in (np.abs(response) ** 2, variance))
     beyond = np.sqrt(max(power - noise, noise / np.sqrt(last)))
     numbers = np.arange(1, IMAGES + 1)
@@ -61,27 +61,26 @@ def images(hold: Hold, frequencies: Array, response: ComplexArray, variance: Arr
 #: Degree of the polynomials, and parameters of both together.
 DEGREE = 2
 PARAMETERS = 2 * (DEGREE + 1)
-#: Half-widths that are tried [lines]; the least leaves three degrees of freedom.
+#: Half-widths tried [lines]; the least leaves three degrees of freedom.
 HALF_WIDTHS = (4, 6, 8, 11, 16, 22, 32, 45, 64, 90, 128)
-#: The greatest width whose residuals are no larger than those of the least one is divided by this. A bias as large as
-#: the standard error is not seen in residuals, and falls with the third power of the width or faster.
+#: Divisor of the greatest width whose residuals do not exceed those of the least one. A bias as large as the standard
+#: error is not visible in residuals, and decreases with the third power of the width or faster.
 NARROWER = 2.0
-#: A peak narrower than a window leaves large residuals and is flattened by more than its interval. There is none where
-#: the residuals of the least width exceed their usual power within a number of lines by this factor, and the gain is
-#: above this share of the greatest one in the window. At 500 samples, of the tops of resonances with a damping ratio
-#: of .03 to .1 at two to eight periods of the record, one in ten is drawn then; unguarded, 30 to 50 % were covered.
+#: A peak narrower than a window has large residuals and a bias beyond its interval. No interval is given if the
+#: residuals of the least width exceed their median power within a number of lines by this factor, and the gain exceeds
+#: this share of the greatest one in the window. With 500 samples, at peaks of resonances with a damping ratio of .03 to
+#: .1 at two to eight periods per record, one in ten has an interval then; without this rule, coverage was 30 to 50 %.
 PEAK_RESIDUALS, USUAL, PEAK_GAIN = 8.0, 32, 0.5
-#: A width that was asked for is too wide where its residuals exceed those of the least one by this number of standard
-#: deviations of their ratio.
+#: A given width is too wide if its residuals exceed those of the least one by this number of standard deviations.
 TOO_WIDE = 2.0
-#: Equations whose columns, scaled to one length, have a greater condition number say nothing of the response.
+#: Largest condition number of the normalised columns.
 SINGULAR = 1e6
-#: Lines on which the input has less than this share of its greatest amplitude do not excite.
+#: Lines with less than this share of the input's greatest amplitude are not excited.
 LEAST_AMPLITUDE = 1e-8
 
 
 class _LocalFit(NamedTuple):
-    """Local polynomials at some centres, one half-width."""
+    """Local polynomials of one half-width at some centres."""
 
     response: ComplexArray
     variance: Array
@@ -94,14 +93,14 @@ class _LocalFit(NamedTuple):
 def local_polynomial(
     u: ComplexArray, y: ComplexArray, base: float, points: int, half_width: int | None, time_unit: str
 ) -> ResponseLines:
-    """Response from spectra at the frequencies ``base, 2 base, …`` at up to ``points`` of them.
+    """Estimate the response from spectra at the frequencies ``base, 2 base, …`` at up to ``points`` of them.
 
-    Without a half-width each centre has half of the greatest one that fits the lines as well as the least one does.
+    By default the half-width at each centre is half of the greatest one that fits the lines as well as the least one.
 
-    Between the finite spectra of a record the system holds up to a transient T, which is as smooth as the response:
-    ``Y(k) = G(k) U(k) + T(k) + V(k)``. Around each line G and T are polynomials of degree 2 in the number of the line,
-    six complex parameters, found by least squares over ``2 n + 1`` lines. The residuals give the variance of V, and
-    with it that of G. Leakage is thus estimated, not windowed away.
+    The finite spectra of a record satisfy ``Y(k) = G(k) U(k) + T(k) + V(k)`` with a transient T that is as smooth as
+    the response. Around each line G and T are polynomials of degree 2 in the number of the line, with six complex
+    parameters, fitted by least squares over ``2 n + 1`` lines. The residuals determine the variance of V, and with it
+    that of G. Leakage is thus estimated instead of reduced by a window.
 
     R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapter 7.
     """
@@ -122,50 +121,50 @@ def local_polynomial(
         chosen = _choose(excess, np.array([fit.determined for fit in fits]), widths)
     pick = np.arange(centres.size)
     response, variance, noise, freedom, known = (np.array([fit[k] for fit in fits])[chosen, pick] for k in range(5))
-    told = _told(fits[0], centres) | (chosen > 1)
+    has_interval = _is_resolved(fits[0], centres) | (chosen > 1)
     if half_width:
-        told &= excess[chosen, pick] <= 1.0 + TOO_WIDE / np.sqrt(half_width)
+        has_interval &= excess[chosen, pick] <= 1.0 + TOO_WIDE / np.sqrt(half_width)
     power = np.convolve(np.abs(u) ** 2, np.ones(9), "same") / np.convolve(np.ones(lines), np.ones(9), "same")
     followed = np.abs(response) ** 2 * power[centres]
     known = known.astype(bool) & np.isfinite(variance)
     coherence = np.divide(followed, followed + noise, out=np.zeros(centres.size), where=followed + noise > 0)
     used = sorted({int(widths[k]) for k in chosen[known]})
     places = base * (centres[known] + 1.0)
-    notes = _words(used, base, half_width is None, places[~told[known]], time_unit)
+    notes = _notes(used, base, half_width is None, places[~has_interval[known]], time_unit)
     return ResponseLines(
-        places, response[known], variance[known], freedom[known], coherence[known], None, notes, told[known]
+        places, response[known], variance[known], freedom[known], coherence[known], None, notes, has_interval[known]
     )
 
 
-def _words(used: list[int], base: float, chosen: bool, untold: Array, time_unit: str) -> tuple[str, ...]:
+def _notes(used: list[int], base: float, chosen: bool, unresolved: Array, time_unit: str) -> tuple[str, ...]:
     if not used:
         return ()
     span = f"{2 * used[0] + 1}" if len(used) == 1 else f"{2 * used[0] + 1} to {2 * used[-1] + 1}"
-    how = "half of the most that fit as well as the fewest do" if chosen else "as given"
+    how = "half of the largest number that fits as well as the smallest" if chosen else "as given"
     text = (
         f"Each estimate is from {span} lines, {base:.4g} rad/{time_unit} apart, {how}; estimates closer than that "
         "share data."
     )
-    if not untold.size:
+    if not unresolved.size:
         return (text,)
     return (
         text,
-        f"No interval at {untold.size} of the frequencies, between {untold[0]:.3g} and {untold[-1]:.3g} "
-        f"rad/{time_unit}: the response turns there within the lines of one estimate, as on a narrow peak, and may be "
-        f"off by more than the noise shows. A longer record resolves it{'' if chosen else ', or a smaller width'}.",
+        f"No interval at {unresolved.size} of the frequencies, between {unresolved[0]:.3g} and {unresolved[-1]:.3g} "
+        f"rad/{time_unit}: the response varies within the lines of one estimate, as on a narrow peak, and its error "
+        f"may exceed the noise. A longer record resolves it{'' if chosen else ', or a smaller width'}.",
     )
 
 
 def _centres(lines: int, points: int) -> IntArray:
-    """Places of the lines at which the response is estimated: all, or about evenly spaced logarithmically."""
+    """Return the indices of the lines at which the response is estimated: all, or spaced logarithmically."""
     if lines <= points:
         return np.arange(lines)
     return np.unique(np.round(np.geomspace(1, lines, points)).astype(np.int64)) - 1
 
 
 def _fit(u: ComplexArray, y: ComplexArray, centres: IntArray, n: int) -> _LocalFit:
-    """Least squares around all centres; at the ends of the band the lines of a window lie on one side."""
-    # Below zero spectra are conjugate: a window may go on there. Line zero went with the means.
+    """Fit local polynomials around all centres; at the upper end of the band windows are one-sided."""
+    # Spectra at negative frequencies are conjugate: a window may extend there. Line zero was removed with the means.
     window = np.minimum(centres, u.size - 1 - n)[:, None] + np.arange(-n, n + 1)
     place = (window - centres[:, None]) / n
     present = window != -1
@@ -192,7 +191,7 @@ def _fit(u: ComplexArray, y: ComplexArray, centres: IntArray, n: int) -> _LocalF
 
 
 def _excess(fits: list[_LocalFit], widths: IntArray, centres: IntArray) -> Array:
-    """Power of the residuals of each width over that of the least one on the same lines, shape (widths, centres)."""
+    """Return the residual power of each width over that of the least one on the same lines, shape (widths, centres)."""
     least = fits[0]
     total = np.concatenate(([0.0], np.cumsum(np.where(least.determined, least.noise, 0.0))))
     number = np.concatenate(([0], np.cumsum(least.determined)))
@@ -201,13 +200,13 @@ def _excess(fits: list[_LocalFit], widths: IntArray, centres: IntArray) -> Array
         first, last = np.searchsorted(centres, centres - n), np.searchsorted(centres, centres + n, side="right")
         count = number[last] - number[first]
         usual = (total[last] - total[first]) / np.maximum(count, 1)
-        # Where the least width says nothing there is nothing to exceed.
+        # Zero if the least width is not determined.
         np.divide(fit.noise, usual, out=row, where=(count > 0) & fit.determined & (usual > 0))
     return excess
 
 
-def _told(least: _LocalFit, centres: IntArray) -> BoolArray:
-    """Whether the least width is narrow enough for what is seen in it."""
+def _is_resolved(least: _LocalFit, centres: IntArray) -> BoolArray:
+    """Return whether the least width is narrow enough for the response."""
     gain = np.abs(least.response)
     usual = _around(least.noise, centres, USUAL, np.median)
     greatest = _around(gain, centres, HALF_WIDTHS[0], np.max)
@@ -221,31 +220,30 @@ def _around(values: Array, centres: IntArray, reach: int, measure: Callable[[Arr
 
 
 def _choose(excess: Array, determined: BoolArray, widths: IntArray) -> IntArray:
-    """Number of the half-width of each centre."""
+    """Return the index of the half-width of each centre."""
     fitting = np.cumprod(excess[1:] <= 1.0, axis=0).sum(axis=0)
     target = np.maximum(widths[fitting] / NARROWER, widths[0])
     chosen = np.searchsorted(widths, 1.01 * target, side="right") - 1
-    # Where a narrow window says nothing, the narrowest one that does.
+    # If a narrow window is not determined, the narrowest one that is.
     first = np.where(determined.any(axis=0), np.argmax(determined, axis=0), 0)
     able = determined[chosen, np.arange(chosen.size)]
     return np.asarray(np.where(able, chosen, np.maximum(first, chosen)), dtype=np.int64)
 
 
-#: An input repeats itself where the mean square of its change over a period is below this share of twice its variance.
+#: An input is periodic if the mean square of its change over a period is below this share of twice its variance.
 REPEATED = 1e-3
-#: Lines on which the input has less than this share of its greatest power do not excite, nor those that stand out of
-#: the input's noise by less than this multiple of its variance.
+#: Lines are excited if the input exceeds this share of its greatest power and this multiple of its noise variance.
 LEAST_POWER, ABOVE_NOISE = 1e-6, 10.0
-#: Lines on each side of one of the input from which transient and noise are read.
+#: Lines on each side of an excited line from which transient and noise are estimated.
 BETWEEN = 4
-#: Unexcited lines on each side of an excited one from which the distortion on it is read.
+#: Unexcited lines on each side of an excited one from which its distortion is estimated.
 DETECTION = 3
-#: A kind of unexcited lines tells the distortions from this number on.
+#: Fewest unexcited lines of a kind for the distortion.
 FEWEST = 4
 
 
 class _Periods(NamedTuple):
-    """What the periods of one realisation tell on every line above zero."""
+    """Spectra and noise from the periods of one realisation, on every line above zero."""
 
     #: Spectra without the transient, shape (K,).
     inputs: ComplexArray
@@ -258,7 +256,7 @@ class _Periods(NamedTuple):
 
 
 def find_period(u: Array) -> int | None:
-    """Samples after which an input repeats itself to the end of the record, at least once in full."""
+    """Return the period of an input in samples, with at least two periods in the record; None if there is none."""
     n = u.size
     centred = u - u.mean()
     energy = float(centred @ centred)
@@ -268,35 +266,34 @@ def find_period(u: Array) -> int | None:
     shared = np.fft.irfft(np.abs(np.fft.rfft(centred, size)) ** 2, size)[: n // 2 + 1]
     squares = np.concatenate(([0.0], np.cumsum(centred**2)))
     lags = np.arange(n // 2 + 1)
-    # Over the samples that have one a lag later: the mean square of the change over twice the mean square.
+    # Mean square of the change over a lag, relative to twice the mean square of the same samples.
     around = squares[n - lags] + squares[n] - squares[lags]
     change = 1.0 - 2.0 * shared / np.maximum(around, 1e-300)
-    # A slow input is like itself a sample later, which is no period: first it must have moved away.
+    # Short lags of a slow input have small changes without being a period: skip to the first large change.
     away = np.flatnonzero(change > 0.5)
     if not away.size:
         return None
-    again = np.flatnonzero(change[away[0] :] < REPEATED)
-    if not again.size:
+    repeated = np.flatnonzero(change[away[0] :] < REPEATED)
+    if not repeated.size:
         return None
-    first = int(away[0] + again[0])
+    first = int(away[0] + repeated[0])
     stretch = change[first : min(first + max(2, first // 8), change.size)]
     return first + int(np.argmin(stretch))
 
 
 def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: float) -> ResponseLines:
-    r"""Response from inputs and outputs that repeat after ``period`` samples, each a realisation of its own.
+    r"""Estimate the response from periodic inputs and outputs, one pair for each realisation.
 
-    The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output hold noise
-    and the transient of a start that has not settled, which is smooth over frequency. A polynomial of degree 2 through
-    the nearest of these lines gives the transient on the line of the input, which is taken out, and its residuals the
-    variances and the covariance of the noise, noise on the input included. With the lines U and Y the response is Y/U,
-    of variance
+    The DFT of M whole periods has the input on every M-th line only. On the lines between, input and output contain
+    noise and the transient, which is smooth over frequency. A polynomial of degree 2 through the nearest of these lines
+    gives the transient on the line of the input, which is subtracted, and its residuals give the variances and the
+    covariance of the noise, including noise on the input. With the lines U and Y the response is Y/U, of variance
 
     .. math:: \sigma_G^2 = |G|^2 \Big(\frac{\sigma_Y^2}{|Y|^2} + \frac{\sigma_U^2}{|U|^2}
               - 2 \mathrm{Re} \frac{\sigma_{YU}^2}{Y U^*}\Big).
 
-    Nonlinear distortions repeat with the input, so that periods do not show them. They show on lines that the input
-    does not excite, and in the differences between realisations of the input.
+    Nonlinear distortions are periodic with the input, and therefore not visible in differences between periods. They
+    are visible on lines that the input does not excite, and in differences between realisations of the input.
 
     R. Pintelon and J. Schoukens, *System Identification: A Frequency Domain Approach*, 2nd ed., Wiley, 2012, chapters
     2-4.
@@ -304,7 +301,7 @@ def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: 
     found = [_periods(u, y, period) for u, y in signals]
     excited = np.flatnonzero(np.all([_excited(one) for one in found], axis=0))
     if not excited.size:
-        raise DataError(f"the input excites no line of a period of {period} samples that stands out of its noise")
+        raise DataError(f"the input excites no line of a period of {period} samples above its noise")
     each = [_response(one, excited) for one in found]
     responses = np.array([response for response, _ in each])
     noise = np.array([variance for _, variance in each])
@@ -316,8 +313,8 @@ def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: 
         distortion = np.maximum(scatter - noise.mean(axis=0), 0.0)
         variance, freedom = scatter / len(found), np.full(excited.size, len(found) - 1.0)
         notes = [
-            f"Mean over {len(found)} realisations; the variance is that between them, with noise and nonlinear "
-            "distortions; what exceeds the noise within each is the level of the distortions."
+            f"Mean over {len(found)} realisations; the variance between them includes noise and nonlinear distortions; "
+            "its excess over the noise within each is the level of the distortions."
         ]
     else:
         distortion, notes = _distortion(found[0], excited)
@@ -327,16 +324,16 @@ def from_periods(signals: Sequence[tuple[Array, Array]], period: int, interval: 
     frequencies = np.asarray(2 * np.pi / (period * interval) * (excited + 1), dtype=np.float64)
     head = (
         f"{found[0].number} periods of {period} samples, {excited.size} excited lines. Transient and noise are "
-        f"read from the {2 * BETWEEN} lines around each one on which the input has nothing.",
+        f"estimated from the {2 * BETWEEN} nearest lines without input around each one.",
     )
-    told = np.ones(excited.size, dtype=bool)
-    return ResponseLines(frequencies, response, variance, freedom, coherence, distortion, (*head, *notes), told)
+    has_interval = np.ones(excited.size, dtype=bool)
+    return ResponseLines(frequencies, response, variance, freedom, coherence, distortion, (*head, *notes), has_interval)
 
 
 def _periods(u: Array, y: Array, period: int) -> _Periods:
     count = u.size // period
     if count < 2:
-        raise DataError(f"{u.size} samples hold no two periods of {period}; give the period of the input, in samples")
+        raise DataError(f"{u.size} samples are less than two periods of {period}; give the input's period, in samples")
     size = count * period
     spectra = [np.fft.fft(x[x.size - size :]) / size for x in (u, y)]
     lines = count * np.arange(1, (period + 1) // 2)
@@ -345,7 +342,7 @@ def _periods(u: Array, y: Array, period: int) -> _Periods:
     places = np.concatenate((-apart[::-1], apart))
     powers = (places / places[-1])[:, None] ** np.arange(DEGREE + 1)
     inverse = np.linalg.pinv(powers)
-    # Beyond both ends the spectra of samples go on by themselves.
+    # The spectra of samples are periodic.
     between = [x[(lines[:, None] + places) % size] for x in spectra]
     inputs, outputs = (x[lines] - near @ inverse[0] for x, near in zip(spectra, between, strict=True))
     off_u, off_y = (near - near @ (powers @ inverse).T for near in between)
@@ -360,7 +357,7 @@ def _excited(one: _Periods) -> BoolArray:
 
 
 def _response(one: _Periods, lines: IntArray) -> tuple[ComplexArray, Array]:
-    """Response and its variance on some lines."""
+    """Return the response and its variance on some lines."""
     u, y = one.inputs[lines], one.outputs[lines]
     g = y / u
     noise_y, noise_u, both = one.output_noise[lines], one.input_noise[lines], one.both[lines]
@@ -369,50 +366,50 @@ def _response(one: _Periods, lines: IntArray) -> tuple[ComplexArray, Array]:
 
 
 def _distortion(one: _Periods, excited: IntArray) -> tuple[Array | None, list[str]]:
-    """Variance that distortions give the response, from unexcited lines between excited ones, and what is said.
+    """Return the variance of the response due to distortions, from unexcited lines between excited ones, and notes.
 
-    An input on odd harmonics only makes even distortions show on even ones, and odd distortions on odd ones.
+    With an input on odd harmonics only, even distortions are on even harmonics, and odd distortions on odd ones.
     """
     silent = np.setdiff1d(np.arange(excited[0], excited[-1] + 1), excited)
-    # Place k is harmonic k + 1.
+    # Index k is harmonic k + 1.
     kinds = {"odd": silent[silent % 2 == 0], "even": silent[silent % 2 == 1]}
     if (excited % 2 == 1).any():
         kinds = {"all": silent}
-    told = {kind: lines for kind, lines in kinds.items() if lines.size >= FEWEST}
-    cure = "leave some lines without input, at random, or record several realisations of it"
-    if not told:
-        return None, [f"Nonlinear distortions are not told from the response; to see them, {cure}."]
+    enough = {kind: lines for kind, lines in kinds.items() if lines.size >= FEWEST}
+    cure = "leave random lines of the input unexcited, or record several realisations of it"
+    if not enough:
+        return None, [f"Nonlinear distortions cannot be distinguished from the response; to detect them, {cure}."]
     power = np.abs(one.outputs) ** 2 - one.output_noise
     signal = float(np.mean(np.abs(one.outputs[excited]) ** 2))
     sizes = []
-    for kind, lines in told.items():
-        level, chance = float(np.mean(power[lines])), float(np.mean(one.output_noise[lines]))
-        seen = level > 4 * chance / np.sqrt(lines.size) and level > 1e-24 * signal
+    for kind, lines in enough.items():
+        level, noise = float(np.mean(power[lines])), float(np.mean(one.output_noise[lines]))
+        seen = level > 4 * noise / np.sqrt(lines.size) and level > 1e-24 * signal
         size = f"{10 * np.log10(level / signal):.3g} dB of the excited ones" if seen else "no more than noise"
         sizes.append(f"{kind}: {size}" if kind != "all" else size)
-    text = f"Nonlinear distortions, from {sum(map(len, told.values()))} lines that are not excited: {', '.join(sizes)}."
-    # Even distortions of an odd input shake no odd line.
-    source = told.get("odd", told.get("all"))
+    text = f"Nonlinear distortions, from {sum(map(len, enough.values()))} unexcited lines: {', '.join(sizes)}."
+    # Even distortions of an input on odd harmonics do not affect odd lines.
+    source = enough.get("odd", enough.get("all"))
     if source is None:
-        return None, [f"{text} Odd ones are not told from the response; to see them, {cure}."]
+        return None, [f"{text} Odd ones cannot be distinguished from the response; to detect them, {cure}."]
     weights = np.ones(2 * DETECTION + 1)
     nearby = np.convolve(power[source], weights, "full") / np.convolve(np.ones(source.size), weights, "full")
     level = np.interp(excited, source, np.maximum(nearby[DETECTION : DETECTION + source.size], 0.0))
     return np.asarray(level / np.abs(one.inputs[excited]) ** 2), [text]
 
 
-#: Segments that a record is cut into, each overlapping half of the next; twice that number less one.
+#: Record length over the default segment length; with half overlap there are twice this number of segments less one.
 PARTS = 8
-#: What two windows that overlap by one half have in common: the square of the correlation of neighbouring segments.
+#: Squared correlation of neighbouring segments under Hann windows with half overlap.
 SHARED = 1 / 36
 #: The shortest segment [samples].
 SHORTEST = 16
-#: Lines on which the input has less than this share of its greatest power do not excite.
+#: Lines with less than this share of the input's greatest power are not excited.
 LEAST_AVERAGE_POWER = 1e-12
 
 
 def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: str) -> ResponseLines:
-    """Response, coherence and variance from segments of a given or a chosen number of samples."""
+    """Estimate response, coherence and variance by Welch's method."""
     from scipy.signal import csd  # slow to import
 
     size = length or max(SHORTEST, u.size // PARTS)
@@ -426,18 +423,18 @@ def welch(u: Array, y: Array, interval: float, length: int | None, time_unit: st
     options = {"nperseg": size, "noverlap": size - half, "detrend": "constant"}
     uu, yy, yu = (csd(*pair, window="hann", **options)[1] for pair in ((u, u), (y, y), (u, y)))
     uu, yy = uu.real, yy.real
-    # The window joins the first line with the mean that was removed.
+    # The window mixes the first line with the removed mean.
     kept = (np.arange(uu.size) >= 2) & (uu > LEAST_AVERAGE_POWER * uu.max()) & (np.arange(uu.size) < size / 2)
     uu, yy, yu = uu[kept], yy[kept], yu[kept]
     coherence = np.minimum(np.abs(yu) ** 2 / np.maximum(uu * yy, np.finfo(float).tiny), 1.0)
     count = segments / (1.0 + 2.0 * SHARED * (segments - 1) / segments)
     variance = (1.0 - coherence) * yy / uu / (count - 1.0)
     note = (
-        f"Averages over {segments} segments of {size} samples under Hann windows, each overlapping the next by one "
-        f"half. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened "
-        "and leakage stays, which the scatter of the segments does not show; --method local-polynomial gives intervals."
+        f"Averages over {segments} segments of {size} samples under Hann windows with half "
+        f"overlap. No intervals: peaks narrower than {8 * np.pi / (size * interval):.3g} rad/{time_unit} are flattened "
+        "and leakage remains, neither visible in their scatter; --method local-polynomial gives intervals."
     )
     frequencies: Array = 2 * np.pi / (size * interval) * np.flatnonzero(kept).astype(np.float64)
     freedom = np.full(frequencies.size, count - 1.0)
-    told = np.zeros(frequencies.size, dtype=bool)
-    return ResponseLines(frequencies, yu / uu, variance, freedom, coherence, None, (note,), told)
+    has_interval = np.zeros(frequencies.size, dtype=bool)
+    return ResponseLines(frequencies, yu / uu, variance, freedom, coherence, None, (note,), has_interval)

@@ -1,4 +1,4 @@
-"""Standard errors and intervals of an estimate, by what its noise is taken for."""
+"""Standard errors and intervals of an estimate, for white or coloured noise."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +17,15 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record
 
-#: Seed of the noise: one record always gets one answer.
+#: Fixed seed of the noise, for reproducible results.
 SEED = 20140801
-#: Told how many draws of all are done.
+#: Called with the number of finished draws and their total.
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class BootstrapT:
-    """Errors of estimates from simulated noise, each with the covariance that its own residuals give it."""
+    """Errors of estimates from simulated noise, each with the covariance estimated from its residuals."""
 
     #: Shape (draws, p).
     errors: Array
@@ -33,7 +33,7 @@ class BootstrapT:
     covariances: Array
 
     def quantile(self, gradient: Array, level: float) -> float:
-        """Standard errors within which the estimate of a quantity stays with that probability, from its gradient."""
+        """Return the quantile of the studentised absolute error of a quantity, from its gradient."""
         variances = np.einsum("i,kij,j->k", gradient, self.covariances, gradient)
         defined = variances > 0
         if not defined.any():
@@ -45,7 +45,7 @@ class BootstrapT:
 def bootstrap_t(
     psi: Sequence[Array], noise: NoiseModel, draws: int, *, regular: bool, progress: Progress | None = None
 ) -> BootstrapT:
-    """Draw noise, and estimate from each draw the parameters, to first order, and their covariance with its own noise.
+    """Draw noise, and estimate from each draw the parameters, to first order, and their covariance.
 
     To first order ``theta + M^-1 sum psi v`` is the estimate and ``v - psi M^-1 sum psi v`` are the residuals.
     """
@@ -65,34 +65,34 @@ def bootstrap_t(
     return BootstrapT(errors, covariances)
 
 
-#: What standard errors take the noise for; ``auto`` is ``white`` unless the residuals are not, ``sandwich`` an earlier
-#: name of ``robust``.
+#: Assumption on the noise for standard errors; ``auto`` is ``white`` unless whiteness of the residuals is rejected,
+#: ``sandwich`` an earlier name of ``robust``.
 Covariance = Literal["auto", "white", "robust", "bootstrap", "sandwich"]
-#: The formula that was used; by ``biased`` there is no standard error (`BIASED`).
+#: The formula used; with ``biased`` there is no standard error (`BIASED`).
 Formula = Literal["white", "robust", "bootstrap", "biased"]
-#: Draws of a bootstrap that is asked for.
+#: Default number of bootstrap draws.
 DRAWS = 500
-#: Student's t of fewer degrees of freedom has no variance.
+#: Student's t with fewer degrees of freedom has no variance.
 LEAST_FREEDOM = 2.0
-#: With fewer degrees of freedom the noise is hardly known.
+#: Least degrees of freedom for a reliable noise model.
 ENOUGH_FREEDOM = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Covariance of the parameters, and how many standard errors their intervals reach."""
+    """Covariance of the parameters, and quantiles of their intervals."""
 
     kind: Formula
     #: Directions in which the parameters are free, shape (p, f), and the covariance along them, shape (f, f).
     tangent: Array
     free_covariance: Array
-    #: How many independent samples the record is worth [-].
+    #: Effective number of samples [-].
     effective_count: float
     bootstrap: BootstrapT | None = None
 
     @classmethod
     def known(cls, covariance: Array) -> "Uncertainty":
-        """Return the law of normal estimates with a known covariance, NaN of parameters that are held."""
+        """Return the distribution of normal estimates with a known covariance, NaN for fixed parameters."""
         free = np.flatnonzero(np.isfinite(np.diag(covariance)))
         if not free.size:
             return cls("white", np.eye(len(covariance)), covariance, np.inf)
@@ -100,7 +100,7 @@ class Uncertainty:
 
     @property
     def covariance(self) -> Array:
-        """Of all parameters, NaN for those that are held, shape (p, p)."""
+        """Covariance of all parameters, NaN for fixed ones, shape (p, p)."""
         covariance = self.tangent @ self.free_covariance @ self.tangent.T
         held = ~self.tangent.any(axis=1)
         covariance[held] = covariance[:, held] = np.nan
@@ -108,48 +108,48 @@ class Uncertainty:
 
     @property
     def spare(self) -> float:
-        """Independent samples beyond the number of parameters [-]."""
+        """Effective number of samples minus number of parameters [-]."""
         return self.effective_count - len(self.free_covariance)
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Of Student's t [-]."""
+        """Degrees of freedom of Student's t [-]."""
         return max(LEAST_FREEDOM, self.spare)
 
     @property
     def short(self) -> bool:
-        """Whether the record is too short for the colour of its noise."""
+        """Whether the record is too short for its noise model."""
         return self.kind in ("robust", "bootstrap") and self.spare < ENOUGH_FREEDOM
 
     def quantile(self, gradient: Array, level: float = 0.95) -> float:
-        """Standard errors to each side of a quantity with this gradient by the leading parameters."""
+        """Return the half-width in standard errors of a quantity with this gradient by the leading parameters."""
         return float(self.reach(gradient[None], level)[0])
 
     def quantiles(self, level: float = 0.95) -> Array:
-        """Standard errors to each side of every parameter, shape (p,)."""
+        """Return the half-widths in standard errors of every parameter, shape (p,)."""
         return self.reach(np.eye(len(self.tangent)), level)
 
     def reach(self, gradients: Array, level: float = 0.95) -> Array:
-        """Standard errors to each side of quantities with these gradients, shape (N,)."""
+        """Return the half-widths in standard errors of quantities with these gradients, shape (N,)."""
         if self.bootstrap is None:
             return np.full(len(gradients), student_quantile(self.degrees_of_freedom, level))
         own = gradients @ self.tangent[: gradients.shape[1]]
         return np.array([self.bootstrap.quantile(row, level) for row in own])
 
     def transformed(self, jacobian: Array) -> "Uncertainty":
-        """Uncertainty of parameters with these derivatives by the present ones, shape (q, p)."""
+        """Return the uncertainty of parameters with these derivatives by the present ones, shape (q, p)."""
         return replace(self, tangent=jacobian @ self.tangent)
 
     @property
     def in_ignored_loop(self) -> "Uncertainty":
-        """What is left where the fit ignores the loop of its record: nothing, unless the residuals are white."""
+        """Uncertainty if the fit ignores the loop of its record: undefined, unless the residuals are white."""
         if self.kind == "white" or not np.isfinite(self.free_covariance).all():
             return self
         return replace(self.undefined, kind="biased", bootstrap=None)
 
     @property
     def undefined(self) -> "Uncertainty":
-        """The same law without any standard error."""
+        """The uncertainty without standard errors."""
         return replace(self, free_covariance=np.full_like(self.free_covariance, np.nan))
 
 
@@ -163,9 +163,9 @@ def estimate_uncertainty(
     tangent: Array | None = None,
     progress: Progress | None = None,
 ) -> Uncertainty:
-    """Uncertainty of a least output-error estimate from its sensitivities and residuals, an array each per experiment.
+    """Return the uncertainty of an output-error estimate from sensitivities and residuals of each experiment.
 
-    With a tangent, shape (p, f), the parameters were free along its columns only, as at a bound.
+    With a tangent, shape (p, f), the parameters were free along its columns only, for example at a bound.
     """
     basis = np.eye(psi[0].shape[1]) if tangent is None else tangent
     free = psi if tangent is None else [block @ tangent for block in psi]
@@ -184,8 +184,8 @@ def estimate_uncertainty(
     return Uncertainty(kind, basis, found, effective, bootstrap)
 
 
-#: Intervals whose ends would move by more than this share of their half-width are unsafe. Measured medians, records of
-#: 600 samples after a step: .05 to .2 where intervals cover 97 %, .35 at 98 %, 1.2 at 90 %, 1e5 at 74 %.
+#: Largest shift of the ends of a reliable interval, in half-widths. Measured medians, records of 600 samples after a
+#: step: .05 to .2 for intervals that cover 97 %, .35 at 98 %, 1.2 at 90 %, 1e5 at 74 %.
 UNSAFE = 0.5
 
 
@@ -197,17 +197,17 @@ def shifts_of_ends(
     psi: Sequence[Array],
     noises: Sequence[SampledNoise] = (),
 ) -> Array:
-    r"""By how much either end of each parameter's interval would move, in half-widths; NaN of held ones, shape (p,).
+    r"""Return the largest shift of the interval ends of each parameter due to nonlinearity, in half-widths, shape (p,).
 
-    Infinite where a model at an end has no finite output.
+    NaN for fixed parameters; infinite if a model at an end has no finite output.
 
-    An interval reaches q standard errors to each side. At its end the most likely other parameters are ``theta + d``,
-    ``d = q C e_k / s_k``, and the output is ``x(theta + d)``. Of the part that the linearisation does not have,
-    ``x(theta + d) - x(theta) - Psi d``, the estimate would take
+    The half-width of an interval is q standard errors. At its end the most likely parameters are ``theta + d``,
+    ``d = q C e_k / s_k``, and the output is ``x(theta + d)``. The estimate would change by the projection of the
+    linearisation error ``x(theta + d) - x(theta) - Psi d``,
 
     .. math:: M^{-1} \sum_t \psi_t \left( x_t(\theta + d) - x_t(\theta) - \psi_t' d \right),
 
-    which moves the end of the interval of parameter k; in half-widths of it, a curvature in the sense of [1]_.
+    which shifts the end of the interval of parameter k; in half-widths it is a curvature in the sense of [1]_.
 
     References
     ----------
@@ -245,7 +245,7 @@ def shifts_of_ends(
 
 
 def _within(model: Parametric, step: Array) -> Array:
-    """The step, as far as the delay stays above zero."""
+    """Return the step, shortened to keep the delay at zero or above."""
     if "delay" not in model.names:
         return step
     last, delay = step[model.names.index("delay")], float(model.theta[-1])

@@ -1,4 +1,4 @@
-"""Units of a record, and those that follow for the parameters of a model."""
+"""Units of a record and of the parameters of its models."""
 
 import re
 from collections.abc import Mapping
@@ -10,21 +10,21 @@ from ctid_cli.signals.measurement import SEPARATOR, Measurement
 from ctid_cli.signals.sampled_signal import SECONDS
 from ctid_cli.signals.table import Role, split_header
 
-#: What stands for a unit of input or output that is not known.
+#: Placeholders of unknown units of input and output.
 INPUT, OUTPUT = "in", "out"
 UNKNOWN = {INPUT, OUTPUT}
 
 
 @dataclass(frozen=True)
 class Units:
-    """Units of a record, and those that follow for the parameters of a model."""
+    """Units of a record, from which those of model parameters follow."""
 
     time: str = "s"
     input: str = INPUT
     output: str = OUTPUT
 
     def require_same(self, where: str, others: Mapping[str, str | None], what: str = "the model is") -> None:
-        """Refuse signals in other units than a model has; a label that is missing contradicts nothing."""
+        """Raise an error if signals have other units than a model; missing labels are ignored."""
         for role, unit in others.items():
             own = getattr(self, role)
             if unit not in (None, own) and self.is_known(own) and self.is_known(str(unit)):
@@ -36,27 +36,27 @@ class Units:
         return f"{self.output}/{self.input}"
 
     def label(self, name: str, unit: str) -> str:
-        """Return a name with its unit in brackets, where the unit is known."""
+        """Return a name with its unit in brackets, if known."""
         return f"{name} [{unit}]" if self.is_known(unit) else name
 
     def column(self, measurement: Measurement, role: Role) -> str:
-        """Return the name of a column of a record with its unit; of several inputs each."""
+        """Return the name of a column of a record with its unit; for several inputs all of them."""
         names = measurement.inputs if role == "input" and measurement.inputs else (str(getattr(measurement, role)),)
         return SEPARATOR.join(
             self.label(split_header(name)[0], getattr(self.of_input(k), role)) for k, name in enumerate(names)
         )
 
     def of_input(self, k: int) -> "Units":
-        """Units of one of several inputs, whose labels stand one after the other."""
+        """Return the units of one of several inputs, whose labels are joined by a separator."""
         labels = self.input.split(SEPARATOR)
         return replace(self, input=labels[k]) if len(labels) > 1 else self
 
     def amount(self, text: str, unit: str) -> str:
-        """Return a number with its unit, where the unit is known."""
+        """Return a number with its unit, if known."""
         return f"{text} {unit}" if self.is_known(unit) else text
 
     def is_known(self, unit: str) -> bool:
-        """Whether a unit is made of those of the record, and not of what stands for unknown ones."""
+        """Return whether a unit contains no placeholder."""
         return UNKNOWN.isdisjoint(re.findall(r"\w+", unit))
 
     @property
@@ -66,11 +66,11 @@ class Units:
 
     @property
     def seconds(self) -> float | None:
-        """Seconds in the unit of time; None where the label is not known."""
+        """Seconds in the unit of time; None for an unknown label."""
         return SECONDS.get(self.time)
 
     def of(self, name: str, poles: int, zeros: int) -> str:
-        """Unit of a parameter."""
+        """Return the unit of a parameter."""
         if name == "delay":
             return self.time
         if name.startswith("offset"):
@@ -82,16 +82,16 @@ class Units:
         return self._times(unit, -power)
 
     def of_submodel(self, name: str, integrators: int = 0) -> str:
-        """Unit of a parameter of a submodel, whose denominator has the constant term 1."""
+        """Return the unit of a parameter of a submodel, whose denominator has the constant term 1."""
         coefficient = name.split("_")[1]
         power = int(coefficient[1:])
         return self._times("", power) if coefficient[0] == "a" else self._times(self.gain, power - integrators)
 
     def in_sum(self, name: str, model: AdditiveModel, monic: bool = False) -> str:
-        """Unit of a parameter of a sum, or of a coefficient of its free response.
+        """Return the unit of a parameter of a sum, or of a coefficient of its free response.
 
-        The free response is ``c_k p^k/(p^l A)`` on an impulse; with monic denominators they go
-        by falling powers.
+        The free response is the impulse response of ``c_k p^k/(p^l A)``; with monic denominators the coefficients are
+        in descending powers.
         """
         if name.startswith("g"):
             return self.of_submodel(name, model.submodels[int(name[1:].partition("_")[0]) - 1].integrators)
@@ -104,7 +104,7 @@ class Units:
         return self._times(self.output, powers[int(name[1:]) - 1])
 
     def _times(self, unit: str, power: int) -> str:
-        """A unit times a power of the time."""
+        """Return a unit times a power of the time."""
         if power == 0:
             return unit
         time = self.time if abs(power) == 1 else f"{self.time}^{abs(power)}"

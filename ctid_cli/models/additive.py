@@ -1,4 +1,4 @@
-"""Sums of submodels, each with a denominator of its own: the modes of a structure, or a rigid body and its modes."""
+"""Sums of submodels with separate denominators: the modes of a structure, or a rigid body and its modes."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Submodel(ContinuousModel):
         freeze(self, numerator=b / a[-1], denominator=a / a[-1], integrators=int(integrators))
 
     def term(self) -> Term:
-        """Structure of the submodel.
+        """Return the structure of the submodel.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class Submodel(ContinuousModel):
 
     @property
     def is_stable(self) -> bool:
-        """Whether every root of ``A_i`` lies strictly in the left half-plane; integrators are not looked at."""
+        """Whether every root of ``A_i`` lies strictly in the left half-plane; integrators are ignored."""
         return bool((sorted_roots(self.denominator).real < 0).all())
 
     @property
@@ -160,7 +160,7 @@ class Submodel(ContinuousModel):
         return float("inf") if self.integrators else float(self.numerator[-1])
 
     def transfer_function(self) -> TransferFunction:
-        """The submodel as a monic transfer function.
+        """Return the submodel as a monic transfer function.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class Submodel(ContinuousModel):
         return TransferFunction(self.numerator, np.concatenate((self.denominator, np.zeros(self.integrators))))
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``G_i(j w)``, integrators included."""
+        """Return ``G_i(j w)``, integrators included."""
         s = 1j * np.asarray(frequencies, dtype=float)
         gain = np.polyval(self.numerator, s) / (s**self.integrators * np.polyval(self.denominator, s))
         return np.asarray(gain, dtype=complex)
@@ -219,7 +219,7 @@ class AdditiveModel(ContinuousModel):
 
     @classmethod
     def from_theta(cls, theta: ArrayLike, terms: Sequence[Term], delay: float = 0.0) -> AdditiveModel:
-        """Model of a given structure from its parameters.
+        """Return the model of a given structure from its parameters.
 
         Parameters
         ----------
@@ -275,17 +275,17 @@ class AdditiveModel(ContinuousModel):
 
     @property
     def order_of_sorting(self) -> tuple[int, ...]:
-        """Places of the submodels in order of rising natural frequency; integrators come first, a pure gain last."""
+        """Indices of the submodels by rising natural frequency; integrators come first, a pure gain last."""
         frequencies = [submodel.natural_frequency for submodel in self.submodels]
         return tuple(np.argsort(frequencies, kind="stable").tolist())
 
     def sorted(self) -> AdditiveModel:
-        """The same sum with its submodels in order of rising natural frequency.
+        """Return the model with its submodels in order of rising natural frequency.
 
         Returns
         -------
         AdditiveModel
-            Submodel k is that at place ``order_of_sorting[k]`` of this model.
+            Submodel k is submodel ``order_of_sorting[k]`` of this model.
         """
         return AdditiveModel([self.submodels[k] for k in self.order_of_sorting], self.delay)
 
@@ -307,7 +307,7 @@ class AdditiveModel(ContinuousModel):
 
     @property
     def is_marginally_stable(self) -> bool:
-        """Whether every pole but the integrators lies strictly in the left half-plane."""
+        """Whether every pole except the integrators lies strictly in the left half-plane."""
         return all(submodel.is_stable for submodel in self.submodels)
 
     @property
@@ -316,14 +316,14 @@ class AdditiveModel(ContinuousModel):
         return float(sum(submodel.dc_gain for submodel in self.submodels))
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """The sum over all submodels, delay included."""
+        """Return the frequency response of the sum, delay included."""
         w = np.asarray(frequencies, dtype=float)
         total = np.sum([submodel.frequency_response(w) for submodel in self.submodels], axis=0)
         return np.asarray(total * np.exp(-1j * w * self.delay), dtype=complex)
 
 
 def names_of(terms: Iterable[Term]) -> tuple[str, ...]:
-    """Names of the parameters of a sum of terms."""
+    """Return the names of the parameters of a sum of terms."""
     names: list[str] = []
     for number, term in enumerate(terms, 1):
         names += [f"g{number}_a{k}" for k in range(1, term.poles + 1)]
@@ -332,37 +332,37 @@ def names_of(terms: Iterable[Term]) -> tuple[str, ...]:
 
 
 def terms_text(terms: Iterable[Term]) -> str:
-    """Return poles and zeros of terms, without integrators, as they are typed: ``2/0,2/1``."""
+    """Return poles and zeros of terms, without integrators, in command-line form: ``2/0,2/1``."""
     return ",".join(f"{term.poles}/{term.zeros}" for term in terms)
 
 
 def degrees_of(terms: Iterable[Term]) -> tuple[int, int]:
-    """Degrees of denominator, integrators included, and numerator of a sum of terms as one transfer function."""
+    """Return the degrees of denominator (integrators included) and numerator of a sum as one transfer function."""
     terms = tuple(terms)
     order = sum(term.order for term in terms)
     return order, max(order - term.order + term.zeros for term in terms)
 
 
 def same_pole(one: ArrayLike, other: ArrayLike) -> BoolArray:
-    """Whether two poles are too close to be told apart in double precision."""
+    """Return whether two poles are too close to be distinguished in double precision."""
     p, q = np.asarray(one, dtype=complex), np.asarray(other, dtype=complex)
     return np.asarray(np.abs(p - q) <= SAME_POLE * np.maximum(np.abs(p), np.abs(q)))
 
 
 def pole_text(pole: complex) -> str:
-    """Where a pole lies, for a message."""
+    """Return the location of a pole, for a message."""
     if pole == 0:
         return "at the origin"
     return f"at {pole.real:g}{f'{pole.imag:+g}j' if pole.imag else ''} rad/s"
 
 
 def _require_identifiable(submodels: tuple[Submodel, ...]) -> None:
-    """Refuse a sum whose terms could be exchanged for others without changing it."""
+    """Raise an error if different terms would give the same sum."""
     biproper = [f"g{i}" for i, submodel in enumerate(submodels, 1) if submodel.relative_degree == 0]
     if len(biproper) > 1:
         raise DataError(
-            f"{' and '.join(biproper)} have as many zeros as poles each; only one submodel may, or the direct "
-            "feedthrough could be split between them at will"
+            f"{' and '.join(biproper)} are biproper (as many zeros as poles); at most one submodel may be, because "
+            "the division of the direct feedthrough between them is not unique"
         )
     poles = [submodel.poles for submodel in submodels]
     for j, second in enumerate(poles):
@@ -370,4 +370,4 @@ def _require_identifiable(submodels: tuple[Submodel, ...]) -> None:
             shared = same_pole(first[:, None], second).any(axis=1)
             if shared.any():
                 place = pole_text(complex(first[np.argmax(shared)]))
-                raise DataError(f"g{i + 1} and g{j + 1} have the pole {place} in common; put it into one of them")
+                raise DataError(f"g{i + 1} and g{j + 1} have the pole {place} in common; put it in one of them")

@@ -1,4 +1,4 @@
-"""Controllers that close a loop around a continuous-time model: in discrete time, PID by its gains, and relays."""
+"""Controllers of a loop around a continuous-time model: discrete time, continuous time, PID and relay."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class DiscreteController:
 
     @classmethod
     def from_pid(cls, kp: float, ki: float, kd: float) -> DiscreteController:
-        """``kp + ki q/(q - 1) + kd (q - 1)/q``: proportional, integrating (backward Euler) and differencing action.
+        """Return ``kp + ki q/(q - 1) + kd (q - 1)/q``: proportional, integral (backward Euler) and difference action.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class DiscreteController:
         The sampling interval h is part of the gains: those of a continuous-time controller with integral time Ti and
         derivative time Td are ``ki = kp h/Ti`` and ``kd = kp Td/h``.
         """
-        # What it is at a sampling interval of 1 s.
+        # At a sampling interval of 1 s the gains of both forms are equal.
         return ContinuousPid(kp, ki=ki, kd=kd).discrete(1.0)
 
     @property
@@ -99,11 +99,11 @@ class DiscreteController:
 
     @property
     def direct(self) -> float:
-        """``C`` at infinite q: by how much the present sample moves the controller's output at once."""
+        """Direct feedthrough, ``C`` at infinite q: gain from the present sample to the controller's output."""
         return float(self.numerator[0]) if self.numerator.size == self.denominator.size else 0.0
 
     def state_space(self) -> tuple[Array, Array, Array, Array]:
-        """Companion realisation ``s_(k+1) = A s_k + B e_k``, ``C s_k + D e_k``.
+        """Return the companion realisation ``s_(k+1) = A s_k + B e_k``, ``C s_k + D e_k``.
 
         Returns
         -------
@@ -119,7 +119,7 @@ class DiscreteController:
         return companion(self.numerator, self.denominator)
 
     def frequency_response(self, frequencies: ArrayLike, interval: float) -> ComplexArray:
-        """``C(exp(j w h))``.
+        """Return ``C(exp(j w h))``.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class ContinuousController:
 
     Notes
     -----
-    A derivative needs a filter: ``kd s`` by itself has more zeros than poles.
+    A derivative needs a filter: ``kd s`` alone has more zeros than poles.
 
     Examples
     --------
@@ -182,23 +182,23 @@ class ContinuousController:
         freeze(self, numerator=b, denominator=a)
 
     def state_space(self) -> tuple[Array, Array, Array, Array]:
-        """Companion realisation ``s' = A s + B e``, ``C s + D e``, as of a `DiscreteController`."""
+        """Return the companion realisation ``s' = A s + B e``, ``C s + D e``."""
         return companion(self.numerator, self.denominator)
 
 
 @dataclass(frozen=True)
 class Relay:
-    """A controller with two values, which makes a loop oscillate by itself.
+    """A two-valued controller, which causes a limit cycle of the loop.
 
     Parameters
     ----------
     amplitude : float
         The relay's output is the bias plus or minus this [input unit].
     hysteresis : float, default 0.0
-        The relay switches when the error passes this, up or down [output unit]; above the noise it keeps it from
-        switching at every sample.
+        The relay switches when the error exceeds this in either direction [output unit]; a value above the noise
+        level avoids switching at every sample.
     bias : float, default 0.0
-        Middle of the two values [input unit].
+        Mean of the two values [input unit].
 
     Notes
     -----
@@ -240,18 +240,18 @@ class ContinuousPid:
     filter_time : float, default 0.0
         Time constant of the low-pass filter of the derivative [s]; often td/10.
     discretisation : {"backward_euler", "tustin"}, default "backward_euler"
-        What stands for s at a sampling interval h: ``(q - 1)/(h q)``, or ``2 (q - 1)/(h (q + 1))``.
+        Substitution for s at a sampling interval h: ``(q - 1)/(h q)``, or ``2 (q - 1)/(h (q + 1))``.
 
     Raises
     ------
     ValueError
-        If a gain is given twice, or the Tustin rule is to differentiate without a filter.
+        If a gain is given twice, or the Tustin rule is combined with a derivative without filter.
 
     Notes
     -----
     .. math:: C(s) = k_p + \frac{k_i}{s} + \frac{k_d s}{T_f s + 1}
 
-    With the Tustin rule a derivative without a filter would oscillate for ever, from sample to sample.
+    With the Tustin rule, a derivative without a filter would oscillate undamped from sample to sample.
 
     Examples
     --------
@@ -277,14 +277,14 @@ class ContinuousPid:
             if getattr(self, name) is not None:
                 (require_positive if name == "ti" else require_not_negative)(name, getattr(self, name), "s")
                 if getattr(self, other) is not None:
-                    raise OptionError(name, f"{name} gives the same as {other}; keep one of the two.")
+                    raise OptionError(name, f"{name} and {other} set the same gain; keep one of the two.")
         for name, gain in (("ti", self.integral_gain), ("td", self.derivative_gain)):
-            require_finite(name, gain, units["ki" if name == "ti" else "kd"], label=f"the gain that kp and {name} make")
+            require_finite(name, gain, units["ki" if name == "ti" else "kd"], label=f"the gain from kp and {name}")
         require_not_negative("filter_time", self.filter_time, "s")
         require_choice("discretisation", self.discretisation, get_args(Discretisation))
         if self.discretisation == "tustin" and self.derivative_gain and self.filter_time == 0.0:
             raise OptionError(
-                "filter_time", "filter_time must be above 0 s: by the Tustin rule a bare derivative rings."
+                "filter_time", "filter_time must be above 0 s: an unfiltered Tustin derivative oscillates."
             )
 
     @property
@@ -303,7 +303,7 @@ class ContinuousPid:
         return not (self.kp or self.integral_gain or self.derivative_gain)
 
     def discrete(self, interval: float) -> DiscreteController:
-        """The controller that acts at every sample, with the poles of those actions only that it has."""
+        """Return the discrete-time controller, with the poles of the actions whose gain is not zero."""
         # s = rise / fall.
         if self.discretisation == "tustin":
             rise, fall = np.array([2.0, -2.0]), interval * np.ones(2)

@@ -1,4 +1,4 @@
-"""How far an estimated model is from the system, relative to the system itself [-]; infinite for an unstable model."""
+"""Distances of an estimated model from the system, relative to the system [-]; infinite for an unstable model."""
 
 import math
 from collections.abc import Sequence
@@ -10,32 +10,32 @@ from numpy.typing import ArrayLike
 from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.models.transfer_function import TransferFunction, sorted_roots
 
-#: Frequencies at which the largest error is looked for, and how far they go beyond the slowest and the fastest pole.
+#: Number of grid frequencies for the largest error, and factor of the grid beyond the slowest and the fastest pole.
 POINTS, BEYOND = 400, 100.0
 
 
 def h2_distance(system: TransferFunction, model: TransferFunction) -> float:
-    r"""The error in the H2 norm, which is that of the impulse response too, delays included.
+    r"""Return the error in the H2 norm (the L2 norm of the impulse response error), delays included.
 
     .. math:: \|G - \hat G\|^2 = \|G\|^2 + \|\hat G\|^2 - 2 \int_0^\infty g(t) \hat g(t) \, dt
     """
     if not model.is_stable or model.relative_degree < 1:
         return math.inf
-    own = _square(system)
-    # To the eighth digit: the squares of smaller errors are lost in the rounding of the sum.
-    return math.sqrt(max(own + _product(model, model) - 2 * _product(system, model), 0.0) / own)
+    energy = _square(system)
+    # Accurate to 1e-8: the squares of smaller errors are lost in the rounding of the sum.
+    return math.sqrt(max(energy + _product(model, model) - 2 * _product(system, model), 0.0) / energy)
 
 
 @lru_cache(maxsize=16)
 def _square(system: TransferFunction) -> float:
-    """Square of the norm; the same for all estimates of a system."""
+    """Return the squared norm of the system, cached because all estimates of a system need it."""
     return _product(system, system)
 
 
 def _product(one: TransferFunction, other: TransferFunction) -> float:
-    r"""Integral of the product of two impulse responses.
+    r"""Return the integral of the product of two impulse responses.
 
-    It begins with the later one: ``c1 exp(A1 d) X c2'`` with ``A1 X + X A2' = -b1 b2'`` and the difference d of the
+    It starts at the larger delay: ``c1 exp(A1 d) X c2'`` with ``A1 X + X A2' = -b1 b2'`` and the difference d of the
     delays.
     """
     from scipy.linalg import companion, expm  # slow to import
@@ -45,18 +45,18 @@ def _product(one: TransferFunction, other: TransferFunction) -> float:
     n, m = one.order, other.order
     A1, A2 = companion(one.denominator), companion(other.denominator)
     c1, c2 = (np.pad(model.numerator, (model.relative_degree - 1, 0)) for model in (one, other))
-    # Both inputs enter the first state. Orders are small: the equation as one linear system takes less time than the
-    # decompositions of a solver.
+    # Both inputs enter the first state. Orders are small: solving one linear system takes less time than the
+    # decompositions of a Lyapunov solver.
     X = np.linalg.solve(np.kron(A1, np.eye(m)) + np.kron(np.eye(n), A2), -np.eye(n * m, 1)).reshape(n, m)
     return float(c1 @ expm(A1 * (other.delay - one.delay)) @ X @ c2)
 
 
 def hinf_distance(system: TransferFunction, model: TransferFunction) -> float:
-    """The largest error of the frequency response over the largest gain, on a dense grid of frequencies."""
+    """Return the largest error of the frequency response over the largest gain, on a dense grid of frequencies."""
     poles = model.poles
     if not (poles.real < 0).all():
         return math.inf
-    # Resonances are narrower than the grid.
+    # The grid is too coarse for resonances: add their frequencies.
     frequencies = np.concatenate([_grid(system), np.abs(poles.imag), np.abs(poles)])
     gain = system.frequency_response(frequencies)
     return float(np.abs(model.frequency_response(frequencies) - gain).max() / np.abs(gain).max())
@@ -64,22 +64,22 @@ def hinf_distance(system: TransferFunction, model: TransferFunction) -> float:
 
 @lru_cache(maxsize=16)
 def _grid(system: TransferFunction) -> Array:
-    """Frequencies from far below the slowest pole to far above the fastest, resonances among them."""
+    """Return frequencies from far below the slowest pole to far above the fastest, including the resonances."""
     poles, sizes = system.poles, np.abs(system.poles)
     grid = np.geomspace(sizes.min() / BEYOND, sizes.max() * BEYOND, POINTS)
     return np.concatenate([[0.0], grid, np.abs(poles.imag)])
 
 
 def response_distance(system: TransferFunction, model: TransferFunction, frequency: ArrayLike) -> float:
-    """The error of the frequency response at one frequency [rad/s] over the gain there."""
+    """Return the error of the frequency response at one frequency [rad/s] over the gain there."""
     gain = system.frequency_response(frequency)
     return float(np.abs(model.frequency_response(frequency) - gain) / np.abs(gain))
 
 
 def matched_poles(true: ComplexArray, denominator: Sequence[float] | None) -> ComplexArray:
-    """Poles of a model in the order of the true ones, so that all distances together are least.
+    """Return the poles of a model matched to the true ones with the least sum of distances.
 
-    NaN where there is no model, or it has another number of poles.
+    All are NaN without a model or with a different number of poles.
     """
     from scipy.optimize import linear_sum_assignment
 

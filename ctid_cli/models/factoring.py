@@ -1,10 +1,10 @@
-r"""From a sum of submodels to one fraction and back, with the derivatives that carry a covariance along.
+r"""Conversion of a sum of submodels to one fraction and back, with the Jacobians that transform a covariance.
 
-A fraction with the distinct poles ``p_k``, l of its poles at the origin, and the residues ``r_k`` is
+A fraction with distinct poles ``p_k``, l further poles at the origin, and residues ``r_k`` is
 
 .. math:: G(s) = d + \sum_{j<l} c_j s^{j-l} + \sum_k \frac{g_k}{1 + T_k s}, \qquad T_k = -1/p_k, \quad g_k = -r_k/p_k.
 
-A submodel collects some of these terms over their common denominator, whose constant term then is 1.
+A submodel is a group of these terms over their common denominator, whose constant term then is 1.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ Number = TypeVar("Number", np.float64, np.complex128)
 
 
 def unfactored(model: AdditiveModel) -> TransferFunction:
-    r"""The sum of all submodels over their common denominator."""
+    r"""Return the sum of all submodels over their common denominator."""
     numerator, denominator = _joined(model.submodels)
     return TransferFunction(numerator[::-1], denominator[::-1], model.delay)
 
 
 def unfactored_jacobian(model: AdditiveModel, zeros: int | None = None) -> Array:
-    r"""Derivatives of the coefficients of :func:`unfactored` with respect to the parameters of the sum.
+    r"""Return derivatives of the coefficients of :func:`unfactored` with respect to the parameters of the sum.
 
     With ``Q_i`` and ``R_i`` the denominator and numerator of the sum of all other submodels, the fraction
     ``(B_i Q_i + p^l A_i R_i) / (p^l A_i Q_i)`` is linear in the coefficients of ``A_i`` and ``B_i``; making it monic
@@ -59,18 +59,18 @@ def unfactored_jacobian(model: AdditiveModel, zeros: int | None = None) -> Array
 
 
 def factored(model: TransferFunction, terms: Sequence[Term] | None = None) -> AdditiveModel:
-    r"""Partial fractions of a transfer function, collected into submodels by rising natural frequency."""
+    r"""Return the partial fractions of a transfer function, grouped into submodels by rising natural frequency."""
     fractions = _partial_fractions(model)
     submodels = [_collected(fractions, group) for group in _groups(fractions, terms)]
     return AdditiveModel(submodels, model.delay).sorted()
 
 
 def factored_jacobian(model: TransferFunction, parts: AdditiveModel, coefficients: int | None = None) -> Array:
-    r"""Derivatives of the parameters of ``factored(model)`` by the coefficients ``a_1 … a_n, b_m … b_0`` of the model.
+    r"""Return derivatives of the parameters of ``factored(model)`` by the coefficients ``a_1 … a_n, b_m … b_0``.
 
-    Factoring undoes the sum of submodels whose numerators have full length, so they are the inverse of those of the
-    sum. This holds for numerators of any length: of a full one the last ``coefficients`` are those of the model, or as
-    many as are estimated. Poles at the origin stay there: their coefficients are not moved.
+    Factoring is the inverse of the sum of submodels with numerators of full length, so its Jacobian is the inverse of
+    that of the sum. Shorter numerators take the last columns of a full one: ``coefficients`` of them, by default the
+    number in the model. Poles at the origin stay there: the derivatives by their coefficients are zero.
     """
     n = model.order
     away = int(np.flatnonzero(model.denominator)[-1])
@@ -84,7 +84,7 @@ def factored_jacobian(model: TransferFunction, parts: AdditiveModel, coefficient
 
 
 def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
-    """Derivatives of the poles with respect to the denominator coefficients: ``dp/da_i = -p^(n-i) / A'(p)``."""
+    """Return derivatives of the poles by the denominator coefficients: ``dp/da_i = -p^(n-i) / A'(p)``."""
     a = np.asarray(denominator, dtype=float)
     p = np.asarray(poles, dtype=complex)
     n = a.size - 1
@@ -94,19 +94,19 @@ def pole_jacobian(denominator: ArrayLike, poles: ArrayLike) -> ComplexArray:
 
 
 def _slope_at_roots(p: ComplexArray) -> ComplexArray:
-    """``A'(p_k)`` of a monic polynomial: a product over the other roots is exact where the polynomial would cancel."""
+    """Return ``A'(p_k)`` of a monic polynomial as a product over the other roots, which avoids cancellation."""
     distances = p[:, None] - p[None, :]
     np.fill_diagonal(distances, 1.0)
     return np.asarray(np.prod(distances, axis=1))
 
 
 def _shifted(polynomial: NDArray[Number], places: int, length: int) -> NDArray[Number]:
-    """Coefficients in rising powers times ``p^places``, at a given length."""
+    """Return coefficients in rising powers times ``p^places``, padded to a given length."""
     return np.pad(polynomial, (places, length - places - polynomial.size))
 
 
 def _joined(submodels: Sequence[Submodel]) -> tuple[Array, Array]:
-    """Numerator and denominator of a sum in rising powers, both of length order + 1 and not scaled."""
+    """Return numerator and denominator of a sum in rising powers, both of length order + 1 and not scaled."""
     numerator, denominator = np.zeros(1), np.ones(1)
     for submodel in submodels:
         a = _shifted(submodel.denominator[::-1], submodel.integrators, submodel.order + 1)
@@ -118,9 +118,9 @@ def _joined(submodels: Sequence[Submodel]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _PartialFractions:
-    """The terms of the sum at the head of this file.
+    """Terms of the sum in the module docstring.
 
-    Complex pairs come first, at places k and ``pairs + k``, then real poles; both kinds from the slowest on.
+    Complex pairs come first, at indices k and ``pairs + k``, then real poles; both from the slowest to the fastest.
     """
 
     pairs: int
@@ -132,7 +132,7 @@ class _PartialFractions:
 
 @dataclass(frozen=True)
 class _Group:
-    """Terms that one submodel collects: places of its poles, integrators, and whether it takes the feedthrough."""
+    """Terms of one submodel: indices of its poles, integrators, and whether it has the feedthrough."""
 
     places: tuple[int, ...]
     integrators: int = 0
@@ -141,7 +141,7 @@ class _Group:
 
 def _partial_fractions(model: TransferFunction) -> _PartialFractions:
     if model.relative_degree < 0:
-        raise DataError("a model with more zeros than poles is no sum of submodels")
+        raise DataError("a model with more zeros than poles cannot be written as a sum of submodels")
     a, b = model.denominator, model.numerator
     away = np.trim_zeros(a, "b")
     origin = a.size - away.size
@@ -163,7 +163,7 @@ def _partial_fractions(model: TransferFunction) -> _PartialFractions:
 
 
 def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[_Group]:
-    """Which terms of the sum form a submodel."""
+    """Return the groups of terms that form the submodels."""
     pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
     couples, lone = [(k, pairs + k) for k in range(pairs)], range(2 * pairs, n)
     if terms is None:
@@ -181,33 +181,33 @@ def _groups(fractions: _PartialFractions, terms: Sequence[Term] | None) -> list[
 
 
 def _check_terms(fractions: _PartialFractions, terms: Sequence[Term], direct: int) -> None:
-    """Refuse terms that cannot take all of a sum; ``direct`` of them take the feedthrough."""
+    """Raise an error if the terms do not match the partial fractions; ``direct`` is the number of biproper terms."""
     pairs, n, integrators = fractions.pairs, fractions.poles.size, fractions.at_origin.size
     asked = sum(term.poles for term in terms), sorted(term.integrators for term in terms if term.integrators)
     if asked != (n, [integrators] * (integrators > 0)):
         raise DataError(
             f"the terms have {asked[0]} poles and {sum(asked[1])} integrators, the latter in {len(asked[1])} of them; "
-            f"the model has {n} poles and {integrators} at the origin, which one term must take together"
+            f"the model has {n} poles and {integrators} at the origin, which must be in one term"
         )
     possible = sum(term.poles // 2 for term in terms)
     if pairs > possible:
         raise DataError(
-            f"the model has {pairs} complex pairs of poles, the terms have room for {possible}; let more have two poles"
+            f"the model has {pairs} complex pairs of poles, but the terms allow {possible}; give more terms two poles"
         )
     if fractions.direct.size != direct:
         raise DataError(
-            "the model has as many zeros as poles, so exactly one term must too, to take its direct feedthrough; "
-            f"{direct} of the terms have"
+            "the model is biproper (as many zeros as poles), so exactly one term must be biproper; "
+            f"{direct} of the terms are"
         )
 
 
 def _collected(fractions: _PartialFractions, group: _Group) -> Submodel:
-    """The terms of one submodel over their common denominator."""
+    """Return the submodel of a group of terms over their common denominator."""
     places, shift = list(group.places), group.integrators
     T, g = -1.0 / fractions.poles[places], fractions.gains[places]
     size = T.size + shift + 1
-    # Constant terms first: the product of 1 + T_k s is that of s + T_k with its terms turned round. What multiplies the
-    # whole denominator: the powers of 1/s and the direct feedthrough.
+    # Constant terms first: the product of 1 + T_k s is that of s + T_k with its coefficients reversed. The powers of
+    # 1/s and the direct feedthrough multiply the whole denominator.
     a, b = np.asarray(polyfromroots(-T)[::-1], dtype=complex), np.zeros(size, dtype=complex)
     for k in range(T.size):
         others = np.asarray(polyfromroots(-np.delete(T, k))[::-1], dtype=complex)

@@ -1,4 +1,4 @@
-"""Models with several inputs: a transfer function for each, whose responses add up."""
+"""Models with several inputs: one transfer function for each input; the responses are added."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 @dataclass(frozen=True, eq=False)
 class MultiInputModel:
-    """The sum of the responses to several inputs."""
+    """Sum of the responses to several inputs."""
 
     #: The transfer function of each input, with its delay [s].
     parts: Mapping[str, TransferFunction]
-    #: Whether all have one denominator.
+    #: Whether all have a common denominator.
     common: bool
 
     @classmethod

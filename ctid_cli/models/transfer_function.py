@@ -16,7 +16,7 @@ class ContinuousModel(ABC):
 
     @abstractmethod
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``G(j w)``, delay included.
+        """Return ``G(j w)``, delay included.
 
         Parameters
         ----------
@@ -101,20 +101,20 @@ class TransferFunction(ContinuousModel):
         return float(self.numerator[-1] / self.denominator[-1]) if self.denominator[-1] else float("inf")
 
     def frequency_response(self, frequencies: ArrayLike) -> ComplexArray:
-        """``B(j w) / A(j w) exp(-j w delay)``."""
+        """Return ``B(j w) / A(j w) exp(-j w delay)``."""
         s = 1j * np.asarray(frequencies, dtype=float)
         gain = np.polyval(self.numerator, s) / np.polyval(self.denominator, s) * np.exp(-s * self.delay)
         return np.asarray(gain, dtype=complex)
 
 
 def sorted_roots(coefficients: Array) -> ComplexArray:
-    """Roots of a polynomial, largest magnitude first."""
+    """Return the roots of a polynomial, largest magnitude first."""
     roots = np.asarray(np.roots(coefficients), dtype=complex)
     return roots[np.lexsort((roots.imag, -np.abs(roots)))]
 
 
 def polynomials(numerator: ArrayLike, denominator: ArrayLike, owner: str, variable: str) -> tuple[Array, Array]:
-    """Coefficients of a fraction, refused where they form none."""
+    """Return the checked coefficients of a fraction."""
     b, a = (np.atleast_1d(np.array(part, dtype=float)) for part in (numerator, denominator))
     if a.ndim != 1 or b.ndim != 1 or not a.size or not b.size:
         raise DataError(f"numerator and denominator must be lists of coefficients in descending powers of {variable}")
@@ -126,13 +126,13 @@ def polynomials(numerator: ArrayLike, denominator: ArrayLike, owner: str, variab
 
 
 def monic(b: Array, a: Array) -> tuple[Array, Array]:
-    """A fraction over the leading coefficient of its denominator, without leading zeros of the numerator."""
+    """Return a fraction with monic denominator and without leading zeros of the numerator."""
     b = b[np.argmax(b != 0) :] if b.any() else b[:1]
     return b / a[0], a / a[0]
 
 
 def checked_delay(delay: float) -> float:
-    """A delay, refused where it is negative or not finite."""
+    """Return a delay, checked to be finite and not negative."""
     if not (np.isfinite(delay) and delay >= 0):
         raise DataError(f"a delay must be a finite number of seconds, zero or more; got {delay}")
     return float(delay)

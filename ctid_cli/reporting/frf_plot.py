@@ -66,7 +66,7 @@ def draw_points(
     gain.set_xscale("log")
     phase.set_xscale("log")
     seen = size > 0
-    w, drawn = found.frequencies, seen & found.told
+    w, drawn = found.frequencies, seen & found.has_interval
     gain.vlines(w[drawn], decibels(floor[drawn]), decibels(high[drawn]), color=BAND, linewidth=1.6, zorder=0)
     gain.plot(w[seen], decibels(size[seen]), ".", color=MIDDLE, markersize=3, label=label, zorder=1)
     known = found.phase_known()

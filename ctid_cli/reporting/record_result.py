@@ -69,18 +69,18 @@ class RecordCheckResult(Result):
         facts, time = self.facts, self.measurement.time_unit or "s"
         none, frequency, output = np.nan, f"rad/{time}", self.measurement.output_unit
         jitter = 0.0 if facts.regular else facts.interval_deviation
-        beside = facts.beside
+        parts = facts.parts
         terms = [
-            (name, term) for name, term in (("offset", beside.offset), ("drift over the record", beside.drift)) if term
+            (name, term) for name, term in (("offset", parts.offset), ("drift over the record", parts.drift)) if term
         ]
         rows = [
             ("sampling interval", facts.interval, jitter, facts.interval_min, facts.interval_max, time),
             ("Nyquist frequency", facts.nyquist, none, none, none, frequency),
             ("input", *_level(facts, "input"), self.measurement.input_unit),
             ("output", *_level(facts, "output"), output),
-            ("signal-to-noise ratio", *_row(beside.signal_to_noise), "dB"),
-            ("response time (63 %)", *_row(beside.response_time), time),
-            ("delay", *_row(beside.delay), time),
+            ("signal-to-noise ratio", *_row(parts.signal_to_noise), "dB"),
+            ("response time (63 %)", *_row(parts.response_time), time),
+            ("delay", *_row(parts.delay), time),
             *((name, term.value, none, term.low, term.high, output) for name, term in terms),
         ]
         frame = pd.DataFrame(rows, columns=["quantity", *NUMBERS, "unit"]).set_index("quantity")
@@ -89,16 +89,16 @@ class RecordCheckResult(Result):
     def content(self) -> dict[str, Any]:
         """Return facts and command for JSON."""
         content = asdict(self.facts)
-        beside = content.pop("beside")
+        parts = content.pop("parts")
         for name, keys in KEYS.items():
-            beside.update(zip(keys, beside.pop(name), strict=True))
+            parts.update(zip(keys, parts.pop(name), strict=True))
         columns = {
             role: {"column": getattr(self.measurement, role), "unit": getattr(self.measurement, f"{role}_unit")}
             for role in ROLES
         }
         head = {"file": content.pop("name"), "columns": columns, "notes": self.measurement.notes}
         found = {"findings": [finding._asdict() for finding in self.findings], "command": self.command}
-        return {**head, "worst": self.worst, **content, **beside, **found}
+        return {**head, "worst": self.worst, **content, **parts, **found}
 
 
 def _row(estimate: Estimate) -> tuple[float, float, float, float]:

@@ -1,1 +1,1 @@
-"""Data sets of an experiment, and what is measured of their estimates."""
+"""Data sets of an experiment, and measures of their estimates."""

@@ -1,4 +1,4 @@
-"""Custom components: the base classes that users derive theirs from, and what is accepted of what an estimator returns.
+"""Custom components: base classes for users, and checks of the values that custom estimators return.
 
 The classes of ctid are registered with the bases: ``isinstance(WhiteNoise(variance=1.0), Noise)`` is true.
 """
@@ -26,13 +26,13 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from ctid_cli.text import did_you_mean
 
-#: What a mapping may hold that a fit returns.
+#: Allowed keys of the mapping that a custom ``fit`` returns.
 KEYS = ("parameters", "standard_errors", "status", "message")
 _NAME = re.compile(r"[A-Za-z_]\w*(\[\w+\])?", re.ASCII)
 
 
 class ComponentError(DataError):
-    """A custom component did what it must not, or returned what it must not."""
+    """A custom component changed its arguments, failed, or returned an invalid value."""
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ class Estimator(ABC):
     3.0
     """
 
-    #: What it takes from a start: ``"delay"``, ``"parameters"``, or nothing.
+    #: Part of a start that it uses: ``"delay"``, ``"parameters"``, or None.
     start_from: ClassVar[common.StartFrom | None] = None
 
     @abstractmethod
@@ -159,9 +159,9 @@ class Estimator(ABC):
         Parameters
         ----------
         record : Record
-            What was measured; its arrays are read-only.
+            The measured record; its arrays are read-only.
         start : Start or None
-            Where to start; None unless `start_from` says what the estimator takes from it.
+            Initial values; None unless `start_from` is set.
 
         Returns
         -------
@@ -198,22 +198,22 @@ class Measure(ABC):
         Parameters
         ----------
         fit : Fit
-            The estimate as the estimator returned it. What is returned as a mapping has ``parameters`` and
-            ``standard_errors`` by name, and a ``model`` where these make one. An estimate of the frequencies of a
-            signal has ``track``, a `FrequencyTrack`.
+            The estimate as the estimator returned it. A returned mapping becomes a fit with ``parameters`` and
+            ``standard_errors`` by name, and a ``model`` if the parameters define one. An estimate of the frequencies
+            of a signal has ``track``, a `FrequencyTrack`.
         data : DataSet
-            What `simulate_dataset` returns: ``record`` and, of one of ctid's systems, ``true_model``.
+            Result of `simulate_dataset`: ``record`` and, for a system of ctid, ``true_model``.
 
         Returns
         -------
         float
-            The value [unit]; NaN where there is none.
+            The value [unit]; NaN if undefined.
 
         Raises
         ------
         Exception
-            Any exception leaves the estimate as it is, without a value of the measure; its text is stored in the
-            message of the estimate.
+            Any exception leaves the estimate unchanged, without a value of the measure; the text of the exception is
+            stored in the message of the estimate.
         """
 
 
@@ -224,7 +224,7 @@ Estimator.register(common.Estimator)
 
 
 def is_custom(component: Any) -> bool:
-    """Return whether a component is none of ctid's."""
+    """Return whether a component is not part of ctid."""
     return component is not None and not type(component).__module__.startswith("ctid_cli.")
 
 
@@ -234,7 +234,7 @@ def is_custom(component: Any) -> bool:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CustomFit(Fit):
-    """Named parameters that a custom estimator returned, and the model that they make, if they make one."""
+    """Named parameters that a custom estimator returned, and the model that they define, if any."""
 
     model: TransferFunction | None  # type: ignore[assignment]
     iterations: int | None  # type: ignore[assignment]
@@ -255,28 +255,28 @@ class CustomFit(Fit):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """An estimator with a record, of which nothing is computed before a start is known."""
+    """An estimator bound to a record; nothing is computed before the start is known."""
 
     fit: Callable[..., Any]
 
 
 @dataclass(frozen=True)
 class CustomEstimation:
-    """A custom estimator in the place of one of ctid's."""
+    """Adapter of a custom estimator to the interface of ctid's estimators."""
 
     options: Any
 
     @property
     def start_from(self) -> Any:
-        """What it takes from a start."""
+        """Part of a start that the estimator uses."""
         return getattr(self.options, "start_from", None)
 
     def prepare(self, record: Record) -> Prepared:
-        """Compute nothing before a start is known."""
+        """Return the estimator bound to the record."""
         return Prepared(partial(self._fit, record))
 
     def _fit(self, record: Record, start: Any = None) -> Fit:
-        """Estimate from a copy of the record, without what no measurement has."""
+        """Estimate from a copy of the record without the noise-free output."""
         inputs = {name: replace(signal) for name, signal in record.held.items()}
         given = replace(record, inputs=inputs, noise_free=None)
         found = called(self.options, "fit", given, start)
@@ -289,7 +289,7 @@ class CustomEstimation:
 
 
 def called(options: Any, method: str, *given: Any) -> Any:
-    """Return what a method of a copy of the options returns: no estimate depends on those before it."""
+    """Call a method on a copy of the options, so that no estimate depends on earlier ones."""
     try:
         return getattr(copy.deepcopy(options), method)(*given)
     except ValueError as error:
@@ -304,7 +304,7 @@ def _changes(options: Any, method: str) -> ComponentError:
 
 
 def value_of(measure: Measure, fit: Any, data: Any) -> float:
-    """Return the value of a measure, which is given copies: nothing that it changes is seen by what comes next."""
+    """Return the value of a measure, which gets copies so that its changes have no effect elsewhere."""
     what = f"{type(measure).__name__}.value"
     measure, fit, data = copy.deepcopy((measure, fit, data))
     value = measure.value(fit, data)
@@ -316,7 +316,7 @@ def value_of(measure: Measure, fit: Any, data: Any) -> float:
 
 
 def taken(found: Any, record: Record, what: str) -> Fit:
-    """Return a fit as it is stored, from what a custom estimator returned."""
+    """Return the fit to be stored, from the value that a custom estimator returned."""
     if isinstance(found, Fit):
         values = [*np.ravel(found.model.numerator), *np.ravel(found.model.denominator), found.model.delay]
         if not np.isfinite(values).all():
@@ -346,12 +346,12 @@ def taken(found: Any, record: Record, what: str) -> Fit:
         condition_number=float("nan"),
         named=named,
         named_errors={name: errors.get(name, float("nan")) for name in names},
-        message=str(found.get("message") or "The estimator says so."),
+        message=str(found.get("message") or "Status reported by the custom estimator."),
     )
 
 
 def _stated(found: Any, what: str) -> Status:
-    """Return the status of a mapping that has only keys which it may have."""
+    """Return the status of a mapping, and raise an error if it has unknown keys."""
     if not isinstance(found, Mapping):
         wanted = "a Fit or a mapping with parameters, standard_errors and status is expected"
         raise ComponentError(f"{what} returned {type(found).__name__}, and {wanted}")
@@ -383,7 +383,7 @@ def _numbers(found: Any, what: str, *, finite: bool) -> dict[str, float]:
 
 
 def _model(named: Mapping[str, float], what: str) -> TransferFunction | None:
-    """Return the transfer function that ``b0 …``, ``a1 …`` and ``delay`` make, in descending powers, if they do."""
+    """Return the transfer function with coefficients ``b0 …``, ``a1 …`` and ``delay``; None if there are none."""
     given = {letter: [name for name in named if re.fullmatch(rf"{letter}\d+", name)] for letter in "ba"}
     if not given["b"] or not given["a"]:
         return None
@@ -403,7 +403,7 @@ def _model(named: Mapping[str, float], what: str) -> TransferFunction | None:
 
 
 def _agreement(model: TransferFunction, record: Record) -> tuple[float, float]:
-    """Return mean squared output error [output unit^2] and fit [%] from rest; NaN where there is no simulation."""
+    """Return mean squared output error [output unit^2] and fit [%] from rest; NaN if the simulation fails."""
     from ctid_cli.filtering.simulate import simulate
 
     try:

@@ -1,4 +1,4 @@
-"""Data sets: the record that estimators are given, and what is known of where it comes from."""
+"""Data sets: the record that estimators are given, and its source."""
 
 import dataclasses
 import hashlib
@@ -32,28 +32,28 @@ from ctid_cli.signals.record import Enters, Loop, Record
 from ctid_cli.signals.sampling import Sampling
 from ctid_cli.simulation.components import ComponentError, Noise, System, is_custom
 
-#: First number of the data sets for trying models; above the most that an experiment may have.
+#: First replicate number of the fresh data sets for validation; above the largest allowed in an experiment.
 FRESH = 2**31
 
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """What closes a loop around a system."""
+    """Feedback around a system."""
 
-    #: A `DiscreteController`, or by its gains a `ContinuousPid`, or a `Relay`.
+    #: A `DiscreteController`, a `ContinuousPid` (by its gains) or a `Relay`.
     controller: Any
     reference: Excitation | None = None
     enters: Enters = "controller"
 
     def at(self, interval: float) -> Self:
-        """Return the loop with the controller that acts at a sampling interval."""
+        """Return the loop with its controller discretised at a sampling interval."""
         if not isinstance(self.controller, ContinuousPid):
             return self
         return dataclasses.replace(self, controller=self.controller.discrete(interval))
 
 
 class InSubmodels(NamedTuple):
-    """Parameters of submodels by name; None where an estimate has none."""
+    """Parameters of submodels by name; None if an estimate has none."""
 
     parameters: dict[str, float] | None = None
     standard_errors: Mapping[str, float] = MappingProxyType({})
@@ -62,12 +62,12 @@ class InSubmodels(NamedTuple):
 
 
 def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
-    """Return parameters by name, with errors and quantiles where the estimate has them in another form.
+    """Return parameters by name, with errors and quantiles for an estimated fraction.
 
     These are the submodels' parameters of one transfer function, and all of several inputs.
 
-    The covariance of a fraction's coefficients goes with the Jacobian of its partial fractions. A fraction has none in
-    the given terms if its poles are repeated, different in number, or more of them complex than the terms can take.
+    The covariance of a fraction's coefficients is transformed by the Jacobian of its partial fractions. A fraction has
+    no such parameters if its poles are repeated, or their number or the number of complex pairs does not fit the terms.
     """
     additive = getattr(fit, "additive", None)
     if additive is not None:
@@ -77,14 +77,14 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
     if terms is None or fit.model is None:
         return InSubmodels()
     try:
-        with np.errstate(all="ignore"):  # what overflows is refused
+        with np.errstate(all="ignore"):  # overflow raises DataError
             model = factored(fit.model, terms)
             jacobian = factored_jacobian(fit.model, model)
     except (DataError, np.linalg.LinAlgError):
         return InSubmodels()
     coefficients, names = list(fit.model.parameters), list(fit.parameter_names)
     errors, quantiles = np.full((2, len(model.names)), np.nan)
-    # A leading zero is no coefficient of the model, though it is a parameter: the powers would not match.
+    # A leading zero is a parameter but not a coefficient of the model: the powers would not match.
     if set(names) - {"delay"} == set(coefficients):
         places = [names.index(name) for name in coefficients]
         with np.errstate(invalid="ignore"):
@@ -100,23 +100,23 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """A record and what is known of its origin."""
+    """A record with its true model and validation record, where known."""
 
     record: Record
     true_model: TransferFunction | AdditiveModel | MultiInputModel | None = None
     validation: Record | None = None
-    #: Makes the record of a fresh data set, if one is asked for.
+    #: Function that returns the record of a fresh data set, if requested.
     fresh: Callable[[], Record] | None = None
 
     def result_of(self, fit: Any, start: Any, terms: Sequence[Term] | None) -> dict[str, Any]:
-        """Return what is stored of a fit to the record."""
+        """Return the stored quantities of a fit to the record."""
         parameters, errors, quantiles = additive_parameters(fit, terms)
         errors, quantiles = {**fit.standard_errors, **errors}, {**fit.quantiles, **quantiles}
         law = fit.law
         # Custom estimators may give parameters of any name, and no model.
         named, model = getattr(fit, "named", {}), fit.model
         fraction = None if isinstance(model, MultiInputModel) else model
-        # Of useful redundancy alone.
+        # Only fits by useful redundancy have a search.
         search = getattr(fit, "search", None)
         return {
             "status": fit.status.name,
@@ -156,16 +156,16 @@ class SimulatedSource:
     noise: Noise | None
     seed: int
     loop: LoopOptions | None = None
-    #: Whether models are tried on a data set besides the one that they are estimated from.
+    #: Whether models are also validated on a fresh data set.
     fresh: bool = False
 
     def dataset(self, replicate: int) -> DataSet:
-        """Make one realisation."""
+        """Return one realisation."""
         data = self._realised(replicate)
         return replace(data, fresh=lambda: self._realised(FRESH + replicate).record) if self.fresh else data
 
     def require_stable(self) -> None:
-        """Refuse a loop whose signals would grow without end; a relay bounds them, and oscillates on purpose."""
+        """Raise an error for an unstable loop; a loop with a relay is exempt because its input is bounded."""
         from ctid_cli.filtering.loop import loop_radius
 
         if self.loop is None or isinstance(self.loop.controller, Relay):
@@ -193,13 +193,9 @@ class SimulatedSource:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """What makes the data, by its place in a specification and in the order of its work."""
-        return {
-            "sampling": self.sampling,
-            **dict(self.generators.values()),
-            "system": self.system,
-            "noise": self.noise,
-        }
+        """Components that generate the data, by specification key and in order of evaluation."""
+        generators = dict(self.generators.values())
+        return {"sampling": self.sampling, **generators, "system": self.system, "noise": self.noise}
 
     def _realised(self, replicate: int) -> DataSet:
         with at("sampling"):
@@ -258,7 +254,7 @@ class SimulatedSource:
 
 @contextmanager
 def at(place: str) -> Iterator[None]:
-    """Note the place in a specification of what makes no data."""
+    """Add the specification key to a DataError raised inside."""
     try:
         yield
     except DataError as error:
@@ -267,7 +263,7 @@ def at(place: str) -> Iterator[None]:
 
 
 def made(component: Any, method: str, *given: Any) -> Any:
-    """Return what a component makes; arrays that it is given cannot be changed."""
+    """Call a method of a component with read-only arrays."""
     for array in given:
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
@@ -280,7 +276,7 @@ def made(component: Any, method: str, *given: Any) -> Any:
 
 
 def samples_of(component: Any, method: str, *given: Any, size: int | None = None, missing: bool = False) -> Array:
-    """Return the numbers that a component makes, one for each sample."""
+    """Return the checked numbers that a component generates, one for each sample."""
     found = made(component, method, *given)
     wanted = f"and an array of {'' if size is None else f'{size} '}finite numbers is expected"
     try:
@@ -296,13 +292,13 @@ def samples_of(component: Any, method: str, *given: Any, size: int | None = None
 
 
 def _called(component: Any, method: str) -> str:
-    """Return how a message names a method of a component."""
+    """Return the name of a method of a component for a message."""
     return f"{type(component).__name__}.{method}"
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSource:
-    """A measured record in place of a simulated one.
+    """Data set from a measured record.
 
     Parameters
     ----------
@@ -317,13 +313,13 @@ class MeasuredSource:
     output : str, default "y"
         Column of the output [output unit]; empty or NaN is a missing sample.
     hold : {"zoh", "foh", "band-limited"}, default "zoh"
-        How the input behaves between its samples.
+        Intersample behaviour of the input.
     offset : {"remove", "none"}, default "none"
-        What is done to the means of input and output over the samples for estimation.
+        Whether to subtract the means of input and output over the estimation samples.
     estimation_samples : int, optional
-        Estimate from this number of first samples and validate on the rest; null estimates from all.
+        Number of first samples for estimation; the others are for validation. Null uses all for estimation.
     reference : str, optional
-        Column of the reference, if the record was taken in a loop; loop has the controller.
+        Column of the reference, if the record was taken in closed loop; `loop` has the controller.
     loop : LoopOptions, optional
         The loop.
     """
@@ -359,9 +355,9 @@ class MeasuredSource:
         count = t.size if self.estimation_samples is None else self.estimation_samples
         used = f"the {count} samples used for estimation"
         if count > t.size:
-            raise DataError(f"{self.file}: {count} samples are asked for and the file has {t.size}")
+            raise DataError(f"{self.file}: estimation_samples is {count}, but the file has {t.size} samples")
         if not np.isfinite(y[:count]).any():
-            raise DataError(f"{self.file}: the output is no finite number in any of {used}")
+            raise DataError(f"{self.file}: the output is not a finite number in any of {used}")
         if np.ptp(u[:count]) == 0.0:
             constant = f"the input {self.input!r} is constant ({u[0]:g}) over {used}"
             raise DataError(f"{self.file}: {constant}; it excites nothing to identify")
@@ -370,14 +366,14 @@ class MeasuredSource:
             r = measured.reference_values[:count]
             if self.loop is not None:
                 mean = r.mean() if self.offset == "remove" else 0.0
-                # A record of a loop is refused where its clock is not regular.
+                # A record of a loop with an irregular clock raises an error elsewhere.
                 controller = self.loop.at(regular_interval(t[:count]) or 1.0).controller
                 loop = Loop(r - mean, controller, self.loop.enters, "foh" if self.hold == "foh" else "zoh")
         if self.offset == "remove":
-            # The remaining samples must not have a say in what the model is made of.
+            # Means over the estimation samples only: the validation samples must not affect the model.
             u = u - u[:count].mean()
             y = y - np.nanmean(y[:count])
-        # Without its folder: what an estimator says about the record is part of the results.
+        # Without its folder, because messages of estimators that contain the name are stored.
         name = Path(self.file).name
         signal = HeldSignal(t[:count], u[:count], self.hold)
         record = Record(t[:count], y[:count], signal, name=name, loop=loop, feedback=self.loop is not None)
@@ -418,7 +414,7 @@ def _simulated(
 
 
 def _fit_percent(model: Any, record: Record | None, output: str) -> float | None:
-    """Fit of a model to an output of a record [%], where there are all three."""
+    """Return the fit of a model to an output of a record [%]; None if any of the three is missing."""
     from ctid_cli.inference.criteria import fit_percent
 
     wanted: Array | None = getattr(record, output, None)
@@ -429,12 +425,12 @@ def _fit_percent(model: Any, record: Record | None, output: str) -> float | None
 
 
 def joined(folder: Path, file: str) -> str:
-    """Return the name of a file as seen from the working directory."""
+    """Return the path of a file relative to the working directory."""
     return Path(os.path.normpath(folder / file)).as_posix()
 
 
 def located(options: Any, folder: Path) -> Any:
-    """Return the options with the name of the file that they read, if any, as seen from the working directory."""
+    """Return the options with the path of their file, if any, relative to the working directory."""
     if is_custom(options) or not hasattr(options, "file"):
         return options
     return dataclasses.replace(options, file=joined(folder, options.file))
@@ -443,7 +439,7 @@ def located(options: Any, folder: Path) -> Any:
 def file_sha256(path: str) -> str:
     """Return the content hash of a file."""
     if not Path(path).exists():
-        raise DataError(f"{path}: there is no such file; names start at the folder of the specification")
+        raise DataError(f"{path}: there is no such file; paths are relative to the folder of the specification")
     require_file(path)
     try:
         with open(path, "rb") as file:
@@ -453,18 +449,18 @@ def file_sha256(path: str) -> str:
 
 
 def require_content(path: str, sha256: str) -> str:
-    """Return where a file can be read; refuse one that is not that which an experiment was planned with."""
+    """Return the path of a file, and raise an error if its content is not that of the planned experiment."""
     if sha256 in COPIES:
         return COPIES[sha256]
     found = file_sha256(path)
     if found != sha256:
-        planned = f"is not that which the experiment was planned with ({sha256[:12]}…)"
-        restore = "restore the file, or run the changed one as an experiment of its own"
+        planned = f"differs from that of the planned experiment ({sha256[:12]}…)"
+        restore = "restore the file, or run the changed one as a separate experiment"
         raise DataError(f"{path}: the content (SHA-256 {found[:12]}…) {planned}; {restore}")
     return path
 
 
 def _as_planned(options: Any) -> Any:
-    """Return options that read a file with the path at which the planned file can be read."""
+    """Return options that read a file with the path of the planned file."""
     sha256 = None if is_custom(options) else getattr(options, "sha256", None)
     return options if sha256 is None else replace(options, file=require_content(options.file, sha256))

@@ -1,4 +1,4 @@
-"""How accurate an estimator of a simulated experiment can be, by theory, by which formula, and in the long run."""
+"""Theoretical accuracy of an estimator in a simulated experiment: covariance, its formula, and asymptotic bias."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,39 +26,39 @@ from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import SimulatedSource
 
-#: From this number of samples on the limit for long records is taken.
+#: The asymptotic limit is used from this number of samples on.
 LONG = 5000
-#: Data sets whose covariances are averaged otherwise: their number, and the number of samples in all.
+#: Otherwise covariances are averaged over data sets: largest number of data sets, and of samples in all.
 MOST_SETS, SET_SAMPLES = 10, 20_000
 #: A known delay may differ from the true one by this fraction of it.
 SAME_DELAY = 1e-6
-#: A coefficient of partial fractions below this fraction of the others, or of its standard error, is zero in truth.
+#: A coefficient of partial fractions below this fraction of the others, or of its standard error, is rounding of zero.
 ROUNDING = 1e-9
 
 
 def expected_accuracy(
     source: SimulatedSource, estimator: Any, terms: tuple[Term, ...] | None = None
 ) -> ExpectedAccuracy:
-    """Accuracy of an estimator on the data sets of a source."""
+    """Return the accuracy of an estimator on the data sets of a source."""
     estimated = _unbiased(source, estimator)
     if source.noise is None:
         raise DataError("the data have no noise, so nothing but rounding limits the accuracy")
     if source.loop is not None and isinstance(source.loop.controller, Relay):
-        raise DataError("the relay feeds noise back into the input, and theory is given here for linear controllers")
+        raise DataError("the relay feeds noise back into the input; the theory here covers linear controllers only")
     if (estimated.model.poles.real > 0.0).any():
-        raise DataError("the system is unstable, and theory is given here for stable ones")
+        raise DataError("the system is unstable; the theory here covers stable systems only")
     why_not = _why_no_limit(source, estimated)
     accuracy = _of_records(source, estimated, why_not) if why_not else _of_long_records(source, estimated)
     if terms is None or not estimated.model.is_stable:
         return accuracy
     parameters = accuracy.parameters.factored(terms)
-    # Of a coefficient that is zero in truth the partial fractions leave rounding.
+    # Partial fractions give rounding errors for coefficients whose true value is zero.
     rounding = np.abs(parameters.values) < ROUNDING * parameters.standard_errors
     return replace(accuracy, parameters=replace(parameters, values=np.where(rounding, 0.0, parameters.values)))
 
 
 def why_biased(source: SimulatedSource, estimator: Any) -> str:
-    """Why an estimator does not settle at the truth; empty where theory knows no reason."""
+    """Return why an estimator is asymptotically biased; empty if theory gives no reason."""
     try:
         _unbiased(source, estimator)
     except BiasedError as error:
@@ -69,7 +69,7 @@ def why_biased(source: SimulatedSource, estimator: Any) -> str:
 
 
 def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
-    """The system as the estimator has it, or why it is biased."""
+    """Return the system in the estimator's parametrisation, and raise a BiasedError if the estimator is biased."""
     system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
     if isinstance(system, MultiInputModel):
         raise DataError("there is no theory here of several inputs; compare standard errors with the scatter instead")
@@ -78,7 +78,7 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
         or isinstance(estimator, CustomEstimation)
         or is_custom(noise)
     ):
-        raise DataError("there is no theory here of custom systems, noises and estimators")
+        raise DataError("the theory here does not cover custom systems, noises and estimators")
     estimated = _estimated(system, estimator)
     if loop is None or estimated.instruments != "open_loop" or not isinstance(loop.controller, DiscreteController):
         return estimated
@@ -88,49 +88,49 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
 
 
 def _estimated(system: AdditiveModel | TransferFunction, estimator: Any) -> EstimatedForm:
-    """The system as the estimator has it, or why it cannot hold the system."""
+    """Return the system in the estimator's parametrisation, and raise an error if its model set lacks the system."""
     if estimator.kind == "svf":
-        raise BiasedError("svf is least squares, the start of other estimators")
+        raise BiasedError("svf is a least-squares estimate, meant as the start of other estimators")
     bounds = getattr(estimator, "delay_bounds", None)
     low, high = bounds or (estimator.delay, estimator.delay)
     reach = 0.0 if bounds else SAME_DELAY * system.delay
     if not low - reach <= system.delay <= high + reach:
-        sought = f"sought from {low:g} to {high:g} s" if bounds else f"taken as {low:g} s"
-        raise BiasedError(f"the delay is {sought} and the true one is {system.delay:g} s")
+        sought = f"searched from {low:g} to {high:g} s" if bounds else f"fixed at {low:g} s"
+        raise BiasedError(f"the delay is {sought}, but the true one is {system.delay:g} s")
     delay_from = high if low < high else None
     instruments: Instruments = getattr(estimator, "instruments", "open_loop")
     if hasattr(estimator, "terms"):
         return EstimatedForm(_in_terms(system, estimator.terms), None, delay_from, instruments)
     if estimator.zeros >= estimator.poles:
-        raise DataError("the model has as many zeros as poles, and theory is given here for fewer zeros only")
+        raise DataError("the model has as many zeros as poles; the theory here covers strictly proper models only")
     fraction = unfactored(system) if isinstance(system, AdditiveModel) else system
     zeros = fraction.numerator.size - 1
     has = f"{estimator.poles} poles and {estimator.zeros} zeros, the system {fraction.order} and {zeros}"
     if estimator.poles < fraction.order or estimator.zeros < zeros:
-        raise BiasedError(f"the model has {has}: it cannot hold the system")
+        raise BiasedError(f"the model has {has}: it cannot represent the system")
     if estimator.poles > fraction.order:
-        raise DataError(f"the model has {has}: no data determine the poles in excess")
+        raise DataError(f"the model has {has}: no data determine the additional poles")
     weighed = getattr(estimator, "noise_model", "white") != "white"
     return EstimatedForm(fraction, estimator.zeros, delay_from, instruments, weighed)
 
 
 def _in_terms(system: AdditiveModel | TransferFunction, terms: tuple[Term, ...]) -> AdditiveModel:
-    """The system as a sum of submodels with the degrees of an estimator's terms, by rising natural frequency."""
+    """Return the system as a sum of submodels with the degrees of an estimator's terms, by natural frequency."""
     if isinstance(system, AdditiveModel):
         submodels = list(system.submodels)
     else:
         submodels = [_without_rounding(submodel) for submodel in factored(system, terms).submodels]
-    # In the order given if that is possible; else short numerators where they suffice.
+    # In the given order if possible; otherwise the terms with the shortest numerators first.
     for order in (terms, sorted(terms, key=lambda term: term.zeros)):
         found = _matched(submodels, order)
         if found is not None:
             return AdditiveModel(found, system.delay).sorted()
     numbers = f"the estimator's terms ({len(terms)}) do not match the submodels of the system ({len(submodels)})"
-    raise DataError(f"{numbers}: they cannot hold it, or no data determine what they have in excess")
+    raise DataError(f"{numbers}: they cannot represent it, or have additional parameters that no data determine")
 
 
 def _matched(submodels: list[Submodel], terms: Sequence[Term]) -> list[Submodel] | None:
-    """Submodels with numerators of the degrees of the terms, the first term that is left and fits for each."""
+    """Return the submodels with numerators of the degrees of the terms; each takes the first term that fits."""
     left = list(terms)
     found = []
     for submodel in submodels:
@@ -144,14 +144,14 @@ def _matched(submodels: list[Submodel], terms: Sequence[Term]) -> list[Submodel]
 
 
 def _without_rounding(submodel: Submodel) -> Submodel:
-    """A submodel of partial fractions without the leading coefficients that are zero in truth."""
+    """Return a submodel of partial fractions without leading coefficients that are rounding of zero."""
     sizes = np.abs(submodel.numerator) * submodel.natural_frequency ** np.arange(submodel.numerator.size)[::-1]
     numerator = np.trim_zeros(np.where(sizes > ROUNDING * sizes.max(), submodel.numerator, 0.0), "f")
     return Submodel(numerator, submodel.denominator, submodel.integrators)
 
 
 def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
-    """Why the limit for long records is not taken, in a clause; empty where it is."""
+    """Return why the asymptotic limit is not used, as a clause; empty if it is used."""
     sampling, (name, signal) = source.sampling, _driving(source)
     if estimated.delay_from is not None:
         return "the delay is estimated too"
@@ -164,12 +164,12 @@ def _why_no_limit(source: SimulatedSource, estimated: EstimatedForm) -> str:
     if sampling.samples < LONG:
         return f"there are fewer than {LONG} samples"
     if not estimated.model.is_stable and (source.loop is None or isinstance(estimated.model, TransferFunction)):
-        return "the system integrates, and what it knows grows with the record"
+        return "the system integrates, so that the information per sample grows with the record"
     return ""
 
 
 def _driving(source: SimulatedSource) -> tuple[str, Any]:
-    """The signal that drives the system, and what it is called."""
+    """Return the name of the driving signal and the signal."""
     return ("input", source.excitation) if source.loop is None else ("reference", source.loop.reference)
 
 

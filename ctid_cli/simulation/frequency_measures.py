@@ -1,15 +1,15 @@
-"""Data sets of signals, estimates of their frequencies, and what is measured of these against the true ones.
+"""Data sets of signals, estimates of their frequencies, and measures of these against the true frequencies.
 
-Names of the measures, each with the number of the tone behind it where it is one number per tone, by rising frequency:
+Names of the measures; those with one value per tone end in the number of the tone, by rising frequency:
 
 - ``omega_1``: last estimate [rad/s];
 - ``valid_from``: first instant of a valid estimate [s];
-- ``settling_time_1``: when the error came into the band to stay there to the end, or to the first step of a frequency
-  [s]; ``settling_after_step_1``: the same from the last step of a frequency to the end, counted from the step [s].
-  They have no value if that never happened. Flags do not matter; an estimate that begins at the truth has settled at 0;
+- ``settling_time_1``: instant from which the error stays in the band to the end, or to the first frequency step [s];
+  ``settling_after_step_1``: settling time after the last frequency step, counted from the step [s]. They have no value
+  if the error does not settle. Flags are ignored; an estimate that starts at the true value has settled at 0;
 - ``rms_1``, ``bias_1``: root mean square and mean of the error over the window [rad/s];
-- ``false_alarms``: alarms with no step of a frequency or an amplitude in the last two periods of the lowest frequency,
-  of estimators that raise any;
+- ``false_alarms``: number of alarms without a step of a frequency or an amplitude in the last two periods of the lowest
+  frequency, for estimators that raise alarms;
 - ``valid_share``: share of the record with a valid estimate [%].
 
 A track of one row is an estimate of the whole record: it has ``omega``, ``rms``, ``bias`` and ``valid_share`` only.
@@ -47,17 +47,17 @@ MEASURE_UNITS = {
 }
 #: An alarm within this number of periods of the lowest frequency after a step is attributed to the step.
 ALARM_PERIODS = 2.0
-#: Length of the window of rms and bias, before the end of the record, if none is given [s].
+#: Default length of the window of rms and bias, at the end of the record [s].
 USUAL_WINDOW = 10.0
-#: Samples of the record that an estimator is compiled with.
+#: Number of samples of the record used to compile an estimator.
 COMPILED_WITH = 16
 
 
 @dataclass(frozen=True)
 class Measuring:
-    """What is measured of every estimate."""
+    """Settings of the measures."""
 
-    #: Largest error of a settled frequency [rad/s]; without it no settling times are measured.
+    #: Largest error of a settled frequency [rad/s]; None omits the settling times.
     band: float | None = None
     #: First and last instant of the window of rms and bias [s]; the last 10 s if not given.
     window: tuple[float, float] | None = None
@@ -69,16 +69,16 @@ def true_frequencies(signal: SumOfSinusoids, disturbance: Disturbance | None, to
     if tones == true.shape[1] + 1 and isinstance(disturbance, SineDisturbance):
         true = np.sort(np.column_stack((true, np.full(true.shape[0], disturbance.frequency))), axis=1)
     if tones != true.shape[1]:
-        raise ValueError(f"tones must be {true.shape[1]}, as many as the signal has, not {tones}.")
+        raise ValueError(f"tones must be {true.shape[1]}, the number in the signal, not {tones}.")
     return true
 
 
 def measure_track(
     track: FrequencyTrack, times: Array, true: Array, signal: SumOfSinusoids, measuring: Measuring, *, alarms: bool
 ) -> dict[str, float | None]:
-    """Measure estimates against the frequencies at the instants of the samples; alarms are counted where asked for."""
+    """Return the measures of estimates against the true frequencies at the samples; alarms are optional."""
     found = _numbered("omega", track.frequencies[-1])
-    # The one row of a whole record holds at all its instants.
+    # The single row of a whole-record estimate applies to all instants.
     errors = track.frequencies - true
     if track.t.size > 1:
         found["valid_from"] = float(times[np.argmax(track.valid)]) if track.valid.any() else None
@@ -126,9 +126,9 @@ def _numbered(name: str, values: Array) -> dict[str, float | None]:
 
 
 def _settling_times(inside: BoolArray, times: Array, signal: SumOfSinusoids) -> dict[str, float | None]:
-    """Return when each error came into the band to stay, from the start and after the last step of a frequency."""
+    """Return the settling time of each error, from the start and after the last frequency step."""
     steps = [float(step) for step in signal.frequency_steps]
-    # The first sample of a piece may come before the instant of the step by a rounding error.
+    # The first sample of a segment may precede the instant of the step by a rounding error.
     places = [0, *(int(np.searchsorted(times, step * (1.0 - 1e-9))) for step in steps), times.size]
     found: dict[str, float | None] = {}
     for k in range(inside.shape[1]):
@@ -141,7 +141,7 @@ def _settling_times(inside: BoolArray, times: Array, signal: SumOfSinusoids) -> 
 
 def _settling(inside: BoolArray, t: Array, first: int, last: int, since: float) -> float | None:
     place = first + int(np.flatnonzero(~inside[first:last]).max(initial=-1)) + 1
-    # A difference of instants, without the last digits of either.
+    # Rounded, to remove the rounding errors of both instants.
     return None if place == last else max(0.0, round(float(t[place] - since), 9))
 
 
@@ -165,9 +165,9 @@ def _false_alarms(track: FrequencyTrack, signal: SumOfSinusoids) -> int:
 
 @dataclass(frozen=True, eq=False)
 class SignalRecord:
-    """What estimators of frequencies are given."""
+    """Record for frequency estimators."""
 
-    #: Disturbed signal [signal unit], shape (N,); cannot be changed.
+    #: Disturbed signal [signal unit], shape (N,); read-only.
     samples: Array
     #: Sampling interval [s].
     interval: float
@@ -180,7 +180,7 @@ class SignalRecord:
 
 @dataclass(frozen=True, eq=False)
 class SignalDataSet:
-    """A record, and what is known of its origin."""
+    """A record with its source."""
 
     record: SignalRecord
     source: SignalSource
@@ -188,7 +188,7 @@ class SignalDataSet:
     true_model: ClassVar[None] = None
 
     def result_of(self, fit: FrequencyFit, start: Any, terms: Any) -> dict[str, Any]:
-        """Return what is stored of a fit to the record."""
+        """Return the stored quantities of a fit to the record."""
         signal, times, options = self.source.signal, self.record.times, fit.options
         true = true_frequencies(signal, self.source.disturbance, options.tones, times)
         reasons = " ".join(fit.track.reasons(-1))
@@ -208,7 +208,7 @@ class SignalSource:
     measuring: Measuring
 
     def dataset(self, replicate: int) -> SignalDataSet:
-        """Make one realisation."""
+        """Return one realisation."""
         times = self.sampling.times(stream(self.seed, "sampling", replicate))
         signal = self.signal.generate(times)
         samples = disturb(signal, times, self.disturbance, stream(self.seed, "noise", replicate))
@@ -218,13 +218,13 @@ class SignalSource:
 
 @dataclass(frozen=True)
 class FrequencyEstimation:
-    """An estimator of frequencies in the place of an estimator of models."""
+    """Adapter of a frequency estimator to the interface of model estimators."""
 
     options: FrequencyEstimator
     start_from: ClassVar[None] = None
 
     def prepare(self, record: SignalRecord) -> Prepared:
-        """Compute nothing before the fit."""
+        """Return the estimator bound to the record."""
         return Prepared(partial(self._fit, record))
 
     def _fit(self, record: SignalRecord, start: None = None) -> FrequencyFit:
@@ -233,15 +233,15 @@ class FrequencyEstimation:
         return FrequencyFit(self.options, track)
 
     def compile(self, interval: float) -> None:
-        """Compile the kernels of the estimator; those of custom ones are compiled where they are tried."""
+        """Compile the kernels of an estimator of ctid; custom ones are compiled at their trial run."""
         if not is_custom(self.options):
-            # A record so short may be too short for it.
+            # The record may be too short for the estimator.
             with suppress(ValueError, DataError):
                 self.options.track(np.zeros(COMPILED_WITH), interval)
 
 
 def _require_track(track: Any, options: FrequencyEstimator, record: SignalRecord, what: str) -> None:
-    """Refuse what an estimator returned if it is no track of the record."""
+    """Raise an error if the returned value is not a track of the record."""
     if not isinstance(track, FrequencyTrack):
         expected = "a ctid_cli.FrequencyTrack(t, frequencies, flags) is expected"
         raise ComponentError(f"{what} returned {type(track).__name__}, and {expected}")
@@ -252,11 +252,11 @@ def _require_track(track: Any, options: FrequencyEstimator, record: SignalRecord
         if found != shape:
             raise ComponentError(f"{what} returned {name} of shape {found}, and {shape} is expected")
     if np.asarray(track.flags).dtype.kind not in "iu":
-        raise ComponentError(f"{what} returned flags that are no whole numbers; combine those of ctid_cli.Flag")
+        raise ComponentError(f"{what} returned flags that are not integers; combine those of ctid_cli.Flag")
     if not np.allclose(track.t, times, rtol=1e-9, atol=1e-9 * record.interval):
-        raise ComponentError(f"{what} returned t that are not the instants of the samples, interval * np.arange(N)")
+        raise ComponentError(f"{what} returned t that differ from the sampling instants, interval * np.arange(N)")
     if not np.isfinite(track.frequencies[track.valid]).all():
-        raise ComponentError(f"{what} returned a row without flags whose frequencies are not finite; give it a flag")
+        raise ComponentError(f"{what} returned an unflagged row with frequencies that are not finite; set a flag")
 
 
 @dataclass(frozen=True, eq=False)

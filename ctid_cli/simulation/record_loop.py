@@ -1,4 +1,4 @@
-"""A measured record with the loop that it was taken in."""
+"""Attachment of a feedback loop to a measured record."""
 
 from dataclasses import replace
 
@@ -12,12 +12,12 @@ from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.table import split_header
 from ctid_cli.simulation.dataset import LoopOptions
 
-#: Share of the moves of the input [-] that the controller may leave unexplained: what rounding in a file does.
+#: Largest allowed relative RMS error of the input computed by the controller [-]; rounding in files causes such errors.
 UNEXPLAINED = 0.05
 
 
 def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
-    """Return the measurement with its reference and controller; a DataError says why they are not those of it."""
+    """Return the measurement with its reference and controller; raise a DataError if the input contradicts them."""
     record, r = measured.record, measured.reference_values
     assert r is not None
     _check_units(measured, loop)
@@ -25,22 +25,22 @@ def in_loop(measured: Measurement, loop: LoopOptions) -> Measurement:
     if isinstance(controller, ContinuousController):
         if record.input.hold == "band-limited":
             raise DataError(f"{record.name}: the reference between its samples must be held: --hold zoh or foh")
-        # Between its samples the input is not known, and it is not needed.
+        # The input between its samples is unknown and not needed.
         own = Loop(r, controller, loop.enters, record.input.hold)
         return replace(measured, record=replace(record, loop=own))
     if isinstance(controller, Relay):
-        why = "closed-loop instruments need a linear controller, no relay"
+        why = "closed-loop instruments need a linear controller, not a relay"
     elif record.input.hold != "zoh":
         why = "a discrete controller holds its input (--hold zoh)"
     elif record.interval is None:
-        why = "the controller acts at every sample of a regular clock, and that of this record is irregular"
+        why = "a discrete controller needs a regular clock, and the clock of this record is irregular"
     elif not (left := unexplained(record, r, controller, loop.enters)) <= UNEXPLAINED:
         share = f"{100 * min(left, 1.0):.3g} %"
         made = "C(q) (r - y)" if loop.enters == "controller" else "r - C(q) y"
         why = (
-            f"the input is not what the controller makes, u = {made}: {share} of its moves differ; a "
-            "controller with two degrees of freedom or in continuous time, another sampling interval, sign or "
-            "reference, or limits of the actuator do that, and estimates with it would be wrong"
+            f"the input does not follow from the controller, u = {made}: the error is {share} of its changes; possible "
+            "causes are a controller with two degrees of freedom or in continuous time, another sampling interval, "
+            "sign or reference, or actuator limits; estimates with this controller would be wrong"
         )
     if why:
         cure = "correct --loop or --reference, or give --loop unknown, which needs no controller"
@@ -57,7 +57,7 @@ def in_unknown_loop(measured: Measurement) -> Measurement:
     assert r is not None
     if record.interval is None:
         raise DataError(
-            f"{record.name}: the reference as an instrument needs a regular clock, and that of this record is "
+            f"{record.name}: the reference as an instrument needs a regular clock, and the clock of this record is "
             "irregular; give a controller in continuous time (--loop FILE), or leave --reference out"
         )
     return replace(measured, record=replace(record, loop=Loop(r, None)))
@@ -70,7 +70,7 @@ def unexplained(record: Record, r: Array, controller: DiscreteController, enters
     at_controller = enters == "controller"
     u, driven = record.input.values, (r if at_controller else 0.0) - record.y
     own = u if at_controller else u - r
-    # From the first instant on at which all samples of the polynomials are there.
+    # From the first instant at which all delayed samples exist.
     moves, made = np.convolve(own, a, "valid"), np.convolve(driven, b, "valid")
     left = moves - made
     present = np.isfinite(left)
@@ -79,11 +79,11 @@ def unexplained(record: Record, r: Array, controller: DiscreteController, enters
 
 
 def _check_units(measured: Measurement, loop: LoopOptions) -> None:
-    """Refuse a reference in another unit than the signal that it is compared with."""
+    """Raise an error if the unit of the reference differs from that of the signal that it is added to."""
     assert measured.reference is not None
     unit = split_header(measured.reference)[1]
     what = "output" if loop.enters == "controller" else "input"
     other = measured.output_unit if loop.enters == "controller" else measured.input_unit
     if unit is not None and other is not None and unit != other:
-        column = f"the reference {measured.reference!r} is in {unit}, and the {what} that it enters with in {other}"
-        raise DataError(f"{measured.record.name}: {column}; name another column, or say where it enters (loop.enters)")
+        column = f"the reference {measured.reference!r} is in {unit}, but the {what} is in {other}"
+        raise DataError(f"{measured.record.name}: {column}; choose another column or loop.enters")

@@ -1,4 +1,4 @@
-"""Where estimates start: what a start is called, and what it is on a data set."""
+"""Starts of estimates: their labels, and their values on a data set."""
 
 from dataclasses import dataclass, field
 from typing import Literal, cast
@@ -15,9 +15,9 @@ class StartPoint:
     """A start: an initial delay, initial parameters, or none."""
 
     label: str
-    #: What of an estimate it is a start of.
+    #: Part of the estimate that it initialises.
     of: Literal["delay", "parameters"] | None = None
-    #: Initial delay [s], or the word random; None leaves it to the estimator.
+    #: Initial delay [s], or "random"; None leaves it to the estimator.
     initial_delay: float | str | None = None
     #: Range of a random delay [s].
     bounds: tuple[float, float] | None = None
@@ -30,8 +30,8 @@ class StartPoint:
     ) -> Start | None:
         """Return the start on one data set.
 
-        Every random start stretches the same numbers of the replicate's stream over its own range, so that no start
-        depends on which others there are.
+        Every random start scales the same numbers of the replicate's stream to its range, so that no start depends on
+        the other starts of the experiment.
         """
         if seed is None and (self.bounds is not None or self.spread is not None):
             raise ValueError("a random start needs the seed of the experiment")
@@ -48,7 +48,7 @@ class StartPoint:
         return Start(delay=cast(float | None, self.initial_delay), model=self.model)
 
 
-#: The start of estimators that need none, and of every estimator where the specification names none.
+#: Start of estimators that need none, and default start of all estimators.
 NO_START = StartPoint("none")
 
 

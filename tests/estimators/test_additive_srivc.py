@@ -375,7 +375,7 @@ def test_start_of_another_structure_is_refused(start, message):
 
 
 def test_terms_that_share_a_pole_are_no_start():
-    with pytest.raises(DataError, match=r"g1 and g2 have .* in common; put it into one"):
+    with pytest.raises(DataError, match=r"g1 and g2 have .* in common; put it in one"):
         modes([0.25, 0.25, 3.0, 0.25, 0.25, 1.0])
 
 

@@ -41,5 +41,5 @@ def test_the_limit_cycle_is_that_of_a_first_order_system_with_delay():
 
 
 def test_a_model_that_acts_at_once_is_refused():
-    with pytest.raises(DataError, match="a relay needs a model that does not act at once"):
+    with pytest.raises(DataError, match="a relay needs a model without direct feedthrough"):
         simulate_loop(TransferFunction([1.0, 2.0], [1.0, 1.0]), Relay(1.0), np.zeros(9), np.zeros(9), 0.1)

@@ -126,7 +126,7 @@ def test_impossible_windows_and_delays_are_refused():
     record = noisy_record(n=100)
     with pytest.raises(DataError, match=r"a record: fewer than two samples are left 4\.95 s after the first input"):
         record_spectra(record, 4.95, 6.0, 4.95)
-    with pytest.raises(DataError, match=r"a record: the 2\.95 s from 2 s on hold no full period of 2 rad/s"):
+    with pytest.raises(DataError, match=r"a record: the 2\.95 s from 2 s on contain no full period of 2 rad/s"):
         record_spectra(record, 2.0, 2.0, 2.0)
     spectra = record_spectra(record, 2.0, 6.0, 2.0)
     for delay in (-1e-3, 2.001, np.nan):

@@ -170,7 +170,7 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
     gain = AdditiveModel([Submodel([2.0], [1.0])])
     accuracy = limiting_accuracy(gain, INTERVAL, DiscreteController([0.25], [1.0]), **CLOSED)
     assert accuracy.covariance.item() == pytest.approx(0.01 * (1.5 / 0.25) ** 2)
-    with pytest.raises(DataError, match="react at once, so that the input is correlated with the noise"):
+    with pytest.raises(DataError, match="direct feedthrough, so that the input is correlated with the noise"):
         require_uncorrelated_input(gain, INTERVAL, DiscreteController([0.25], [1.0]), WHITE)
     with pytest.raises(DataError, match="no solution"):
         limiting_accuracy(gain, INTERVAL, DiscreteController([-0.5], [1.0]), **CLOSED)
@@ -195,14 +195,14 @@ def test_refusals_say_why():
     with pytest.raises(DataError, match=r"loop, is not stable.*magnitude 1\."):
         limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(5 * PID.numerator, PID.denominator), **CLOSED)
     limiting_accuracy(TWO_MODES, INTERVAL, DiscreteController(2 * PID.numerator, PID.denominator), **CLOSED)
-    with pytest.raises(DataError, match="forgets too slowly"):
+    with pytest.raises(DataError, match="too slow for the limit of long records"):
         limiting_accuracy(TransferFunction([1.0], [1.0, 1e-4]), INTERVAL, **OPEN)
     with pytest.raises(DataError, match=r"coloured, so that .* \(closed_loop instruments are not\)"):
         require_uncorrelated_input(TWO_MODES, INTERVAL, PID, COLOURED)
     silent = AdditiveModel([Submodel([0.0], [0.25, 0.25, 1.0])])
     cancelling = TransferFunction([1.0, 1.0], [1.0, 3.0, 2.0])
     for model in (silent, cancelling):
-        with pytest.raises(DataError, match="some have no effect of their own"):
+        with pytest.raises(DataError, match="some have no separate effect"):
             limiting_accuracy(model, INTERVAL, **OPEN)
 
 

@@ -175,40 +175,40 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
             covariance([0.1, 0.1, 0.1], [(1, 2, -0.9995)]),
             *([1, 2, 3], NAMES, 4000.0, None),
             (
-                "b0 and delay can hardly be told apart by these data (correlation -0.99950)",
+                "These data can hardly distinguish b0 and delay (correlation -0.99950)",
                 "hardly shows when the response begins",
             ),
         ),
         (
             covariance([0.1] * 5, [(2, 4, 0.9995)]),
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
-            ("can hardly be told apart", "hardly shows when the response begins"),
+            ("can hardly distinguish", "hardly shows when the response begins"),
         ),
         # Pairs that share a parameter are one sentence.
         (
             covariance([0.1] * 5, [(0, 1, 0.9997), (1, 2, 0.9997), (0, 2, 0.9996)]),
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
             (
-                f"{FIVE[0]}, {FIVE[1]} and {FIVE[2]} can hardly be told apart by these data (correlations above "
+                f"These data can hardly distinguish {FIVE[0]}, {FIVE[1]} and {FIVE[2]} (correlations above "
                 "0.999): only combinations",
             ),
         ),
         (
             np.cov(TOGETHER.T),
             *([5, 5, 5], ("a1", "a2", "b0"), 1e5, None),
-            ("a1, a2 and b0 can hardly be told apart by these data (multiple correlations",),
+            ("These data can hardly distinguish a1, a2 and b0 (multiple correlations",),
         ),
         (
             UNDEFINED,
             *([1, 2, 3], NAMES, np.inf, DIRECTION),
-            ("do not determine b0 and delay one by one (singular equations); no standard errors can be given",),
+            ("do not determine b0 and delay separately (singular equations); no standard errors can be given",),
         ),
-        (UNDEFINED, [1, 2, 3], NAMES, np.inf, None, ("all the parameters together",)),
-        (UNDEFINED, [1, 2, 3], NAMES, np.inf, np.diag([1, 1, 0]), ("delay has no effect that these data show",)),
+        (UNDEFINED, [1, 2, 3], NAMES, np.inf, None, ("do not determine the parameters separately",)),
+        (UNDEFINED, [1, 2, 3], NAMES, np.inf, np.diag([1, 1, 0]), ("delay has no detectable effect in these data",)),
         (
             covariance([0.1, 0.1, 0.1], [(1, 2, 1 - 1e-9)]),
             *([1, 2, 3], NAMES, 2e9, None),
-            ("b0 and delay one by one (condition number 2.0e+09); their standard errors are not reliable",),
+            ("b0 and delay separately (condition number 2.0e+09); their standard errors are not reliable",),
         ),
     ],
 )

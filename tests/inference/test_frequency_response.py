@@ -122,7 +122,7 @@ def test_intervals_of_short_records_cover(periods):
         found = estimate_frequency_response(record)
         assert found.method == ("periodic" if periods > 1 else "local-polynomial")
         true = sampled_response(model, found.frequencies)
-        band = found.told & (np.abs(true) > 0.1 * np.abs(true).max())
+        band = found.has_interval & (np.abs(true) > 0.1 * np.abs(true).max())
         hits.extend((np.abs(found.response - true) <= found.radius())[band])
     assert np.mean(hits) > 0.9
 
@@ -134,7 +134,7 @@ def test_no_interval_on_a_peak_between_the_lines():
     low, high = found.gain_band()
     assert np.isnan([low[top], high[top], found.radius()[top], found.phase_band()[top]]).all()
     assert any("narrow peak" in note for note in found.notes)
-    assert found.told.mean() > 0.9
+    assert found.has_interval.mean() > 0.9
 
 
 def test_the_phase_is_followed_where_it_is_known():
@@ -177,7 +177,7 @@ def test_welch_averages():
     low = found.frequencies < 5
     assert np.median((np.abs(found.response - true) / np.abs(true))[low]) < 0.05
     assert found.coherence[found.frequencies < 3].min() > 0.95
-    assert not found.told.any()
+    assert not found.has_interval.any()
     assert any("No intervals" in note for note in found.notes)
 
 
@@ -198,12 +198,12 @@ def flat_or_short(n, u=None):
     ("record", "options", "words"),
     [
         (random_record(0), {"method": "welch", "segment": 1900}, "segments of 1900 samples are too long"),
-        (random_record(0), {"method": "periodic"}, "the input does not repeat itself"),
-        (random_record(0), {"period": 1500}, "hold no two periods of 1500"),
+        (random_record(0), {"method": "periodic"}, "the input is not periodic"),
+        (random_record(0), {"period": 1500}, "less than two periods of 1500"),
         (random_record(0), {"half_width": 2}, "half_width"),
         (flat_or_short(200, 1.0), {}, "the input is constant"),
         (flat_or_short(10), {}, "at least"),
-        ([random_record(0), random_record(1)], {}, "do not all repeat"),
+        ([random_record(0), random_record(1)], {}, "do not all have the same period"),
         (Record.from_arrays(T200**1.01, np.sin(T200**2), np.cos(T200)), {"method": "welch"}, "the clock is irregular"),
     ],
 )

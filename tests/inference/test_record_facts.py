@@ -48,9 +48,9 @@ def faulty(fault):
 
 def stated(facts):
     """Faults that are stated."""
-    beside = facts.beside
-    found = {name for name in ("offset", "drift", "start") if getattr(beside, name).detected}
-    others = {"outliers": beside.outliers, "feedback": beside.feedback_p_value <= LEVEL, "saturation": facts.saturated}
+    parts = facts.parts
+    found = {name for name in ("offset", "drift", "start") if getattr(parts, name).detected}
+    others = {"outliers": parts.outliers, "feedback": parts.feedback_p_value <= LEVEL, "saturation": facts.saturated}
     return found | {name for name, value in others.items() if value}
 
 
@@ -65,10 +65,10 @@ def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irr
     for seed in (1, 2):
         facts = record_facts(clean(seed, colour=colour, irregular=irregular))
         assert stated(facts) == set()
-        beside = facts.beside
-        assert beside.delay.low <= 1.3 <= beside.delay.high
-        assert beside.response_time.low - 0.1 <= 2.3 <= beside.response_time.high + 0.1
-        assert beside.signal_to_noise.low - 1 <= 18.2 <= beside.signal_to_noise.high + 1
+        parts = facts.parts
+        assert parts.delay.low <= 1.3 <= parts.delay.high
+        assert parts.response_time.low - 0.1 <= 2.3 <= parts.response_time.high + 0.1
+        assert parts.signal_to_noise.low - 1 <= 18.2 <= parts.signal_to_noise.high + 1
 
 
 def test_false_alarms_are_as_rare_as_the_level_says():
@@ -78,7 +78,10 @@ def test_false_alarms_are_as_rare_as_the_level_says():
 
 
 def test_sizes_are_those_of_the_faults():
-    offset, drift = record_facts(faulty("offset")).beside.offset, record_facts(faulty("drift")).beside.drift
+    offset, drift = (
+        record_facts(faulty("offset")).parts.offset,
+        record_facts(faulty("drift")).parts.drift,
+    )
     assert offset.low <= 0.3 <= offset.high
     assert drift.low <= 1.0 <= drift.high
     assert offset.high - offset.low < 0.15
@@ -89,16 +92,16 @@ def test_units_do_not_matter(scale):
     record = clean()
     facts = record_facts(record)
     scaled = record_facts(Record.from_arrays(record.t * scale, record.input.values, record.y / scale))
-    assert scaled.beside.signal_to_noise == pytest.approx(facts.beside.signal_to_noise, rel=1e-4)
-    assert scaled.beside.delay.high == pytest.approx(facts.beside.delay.high * scale)
+    assert scaled.parts.signal_to_noise == pytest.approx(facts.parts.signal_to_noise, rel=1e-4)
+    assert scaled.parts.delay.high == pytest.approx(facts.parts.delay.high * scale)
     assert stated(scaled) == set()
 
 
 def test_an_output_far_from_zero_is_as_good():
     record = clean()
     facts = record_facts(replace(record, y=record.y + 1e6))
-    assert facts.beside.offset.value == pytest.approx(1e6)
-    assert facts.beside.signal_to_noise == pytest.approx(record_facts(record).beside.signal_to_noise, abs=0.5)
+    assert facts.parts.offset.value == pytest.approx(1e6)
+    assert facts.parts.signal_to_noise == pytest.approx(record_facts(record).parts.signal_to_noise, abs=0.5)
 
 
 def test_no_response_is_no_estimate():
@@ -106,15 +109,15 @@ def test_no_response_is_no_estimate():
     noise = lfilter([1], [1, -0.9], np.random.default_rng(6).standard_normal(record.n_samples))
     facts = record_facts(replace(record, y=noise))
     assert facts.answer_p_value > 0.05
-    assert np.isnan(facts.beside.signal_to_noise.value)
+    assert np.isnan(facts.parts.signal_to_noise.value)
 
 
 def test_a_system_that_integrates_has_no_response_time():
     record = clean(colour=0.0)
     y = simulate(TransferFunction([1], [1, 0], delay=0.5), record.input, record.t)
     facts = record_facts(replace(record, y=y + 0.1 * np.random.default_rng(1).standard_normal(y.size)))
-    assert np.isnan(facts.beside.response_time.value)
-    assert facts.beside.delay.low <= 0.5 <= facts.beside.delay.high
+    assert np.isnan(facts.parts.response_time.value)
+    assert facts.parts.delay.low <= 0.5 <= facts.parts.delay.high
     assert stated(facts) == set()
 
 
@@ -123,7 +126,7 @@ def test_short_records_and_missing_samples(n):
     record = clean(hold=1)
     y = np.where(np.arange(n) % 7 == 3, np.nan, record.y[:n])
     facts = record_facts(Record.from_arrays(record.t[:n], record.input.values[:n], y))
-    assert (facts.beside.offset is None) == (np.isfinite(y).sum() < 50)
+    assert (facts.parts.offset is None) == (np.isfinite(y).sum() < 50)
 
 
 @pytest.mark.parametrize("tones", [1, 2, 4])

@@ -8,14 +8,14 @@ from scipy.stats import binom, chi2
 
 from ctid_cli.inference.noise_model import ROWS, NoiseModel
 from ctid_cli.inference.residual_tests import (
-    Rest,
-    SideBySide,
+    Concatenated,
+    Projected,
     constant,
     dependence,
     input_dependence,
     orthonormal,
+    regression_residuals,
     residual_tests,
-    rest_of,
 )
 from ctid_cli.signals.record import Record
 from tests.inference.autoregression import autocovariance
@@ -127,14 +127,14 @@ def test_the_rest_is_that_of_least_squares(count):
     slow = np.cumsum(RNG.standard_normal(count))
     beside = np.column_stack((slow, 1e6 * slow + RNG.standard_normal(count), slow))
     columns = RNG.standard_normal((count, 3))
-    parts = SideBySide((constant(count), beside))
+    parts = Concatenated((constant(count), beside))
     expected = least_squares_rest(columns, parts[:])
     # Rounding turns a span by eps times the condition number, here of the three columns that differ.
     sizes = np.linalg.svd(parts[:] / np.linalg.norm(parts[:], axis=0), compute_uv=False)
     slack = np.finfo(float).eps * sizes[0] / sizes[2] * np.linalg.norm(columns, axis=0).max()
     assert slack < 1e-5
-    np.testing.assert_allclose(Rest.of(columns, parts)[:], expected, rtol=0, atol=slack)
-    np.testing.assert_allclose(rest_of(columns[:, 1], parts), expected[:, 1], rtol=0, atol=slack)
+    np.testing.assert_allclose(Projected.of(columns, parts)[:], expected, rtol=0, atol=slack)
+    np.testing.assert_allclose(regression_residuals(columns[:, 1], parts), expected[:, 1], rtol=0, atol=slack)
     assert orthonormal(parts).shape == (4, 3)
 
 

@@ -162,7 +162,7 @@ def test_impossible_structures_are_refused(numbers, message):
             "g1 and g2 have the pole at -5 rad/s in common",
         ),
         ([RIGID, Submodel([1.0], [1.0, 1.0], 1)], 0.0, "the pole at the origin in common"),
-        ([REAL, SLOW, Submodel([1.0], [1.0])], 0.0, "g1 and g3 have as many zeros as poles each; only one"),
+        ([REAL, SLOW, Submodel([1.0], [1.0])], 0.0, r"g1 and g3 are biproper \(as many zeros as poles\); at most one"),
     ],
 )
 def test_sums_that_do_not_determine_their_terms_are_refused(submodels, delay, message):

@@ -183,9 +183,9 @@ def test_factored_jacobian_is_that_of_central_differences(name):
         (TransferFunction([1.0, 0.0, 0.0], [1.0, 2.0]), None, "more zeros than poles"),
         (unfactored(TWO_MODES), [Term(2, 0)], "the terms have 2 poles and 0 integrators"),
         (unfactored(TWO_MODES), [Term(2, 0), Term(2, 0, 1)], "1 integrators, the latter in 1 of them; the model has 4"),
-        (unfactored(MODELS["two integrators"]), [Term(0, 0, 1), Term(1, 0, 1), Term(2, 0)], "take together"),
-        (unfactored(TWO_MODES), [Term(2, 0), Term(1, 0), Term(1, 0)], "2 complex pairs of poles, .* room for 1"),
-        (unfactored(MODELS["biproper mode"]), [Term(2, 1), Term(2, 1)], "direct feedthrough; 0 of the terms have"),
+        (unfactored(MODELS["two integrators"]), [Term(0, 0, 1), Term(1, 0, 1), Term(2, 0)], "must be in one term"),
+        (unfactored(TWO_MODES), [Term(2, 0), Term(1, 0), Term(1, 0)], "2 complex pairs of poles, .* allow 1"),
+        (unfactored(MODELS["biproper mode"]), [Term(2, 1), Term(2, 1)], "must be biproper; 0 of the terms are"),
     ],
 )
 def test_what_is_no_such_sum_is_refused(fraction, terms, message):

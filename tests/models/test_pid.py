@@ -25,8 +25,8 @@ def test_the_rule_puts_its_map_in_the_place_of_s(rule, options):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"kp": 1.0, "ti": 2.0, "ki": 0.5}, "ti gives the same as ki; keep one"),
-        ({"kp": 1.0, "td": 2.0, "kd": 0.5}, "td gives the same as kd"),
+        ({"kp": 1.0, "ti": 2.0, "ki": 0.5}, "ti and ki set the same gain; keep one"),
+        ({"kp": 1.0, "td": 2.0, "kd": 0.5}, "td and kd set the same gain"),
         ({"kp": 1.0, "ti": 0.0}, r"ti must be a positive number \[s\]"),
         ({"ki": np.inf}, r"ki must be a finite number \[input unit/\(output unit s\)\]"),
         ({"kd": 1.0, "discretisation": "tustin"}, "filter_time must be above 0 s"),

@@ -102,7 +102,7 @@ def test_what_cannot_be_measured_is_refused_in_a_sentence(results, make_results,
         measure_rows(results, ["bias", "rsme"])
     for name, sentence in {
         "rmse:dely": "no parameter of the system; did you mean 'delay'",
-        "cpu:delay": "about the estimate as a whole; ask for cpu",
+        "cpu:delay": "must not have a parameter; use cpu",
         "response": "needs a frequency",
         "response:-1": "needs a frequency",
         "fresh_fit": r"add 'measures: \[fresh_fit\]' to the specification",

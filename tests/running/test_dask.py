@@ -80,7 +80,7 @@ def test_data_files_come_by_content(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     file.write_bytes(content)
     assert require_content(str(file), digest) == str(file)
     file.write_bytes(b"something else")
-    with pytest.raises(DataError, match="is not that which"):
+    with pytest.raises(DataError, match="differs from that of the planned"):
         require_content(str(file), digest)
     monkeypatch.setitem(COPIES, digest, "the copy")
     # Also in the process that computes a suspect alone.

@@ -141,7 +141,7 @@ monte_carlo: {runs: 1, seed: 1}
         cells.append(cell)
     assert cells[0].hash == cells[1].hash
     (tmp_path / "reference.csv").write_text("t,u\n0,1\n2,-2\n")
-    with pytest.raises(DataError, match="not that which the experiment was planned with"):
+    with pytest.raises(DataError, match="differs from that of the planned experiment"):
         cells[0].dataset(0)
     assert build_plan(load_spec(tmp_path / "spec.yaml")).data_cells[0].hash != cells[0].hash
 

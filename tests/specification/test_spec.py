@@ -153,7 +153,7 @@ def test_a_file_of_instants(tmp_path):
     with (tmp_path / "stamps.csv").open("a") as file:
         file.write("500\n")
     assert build_plan(load(tmp_path, text)).data_cells[0].hash != cell.hash
-    with pytest.raises(DataError, match="is not that which the experiment was planned with"):
+    with pytest.raises(DataError, match="differs from that of the planned experiment"):
         cell.dataset(0)
     listed = f"{{kind: irregular, times: {stamps.tolist()}}}"
     text = changed(text, ("{kind: irregular, file: stamps.csv}", listed))
