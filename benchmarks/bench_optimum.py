@@ -1,6 +1,7 @@
 """Is the estimate the optimum? Random systems against an optimiser that shares no line with ctid, in the same box.
 
     python benchmarks/bench_optimum.py [--systems 100] [--seed 1] [--starts 3] [--likes] [--records FOLDER]
+    python benchmarks/bench_optimum.py --two-inputs 300 --starts 200
 
 For each system the least output error of ``DelayProfile(nested=True)`` is compared with what ``scipy.optimize`` reaches
 from the true poles, from random ones, and from ctid's own estimate: variable projection on columns of modal responses,
@@ -10,6 +11,9 @@ above the peer by more than a millionth, and a summary at the end.
 ``--likes`` adds two kinds of systems at the border of the admissible models, a lightly damped mode in a periodic record
 and an integrating drive at rest: there the cost is compared with that in a set without such bounds too. ``--records``
 adds measured records, CSV files with columns t, u and y that YAML files beside them name, with four structures each.
+
+``--two-inputs`` has systems with two inputs, each of order 1 or 2 with a delay of 0 to 20 samples, PRBS, 15 dB, both
+delays searched. Their peer are descents of ctid's own from random poles and delays in the same box, and from the truth.
 """
 
 import argparse
@@ -25,7 +29,8 @@ import yaml
 from numba import njit
 from scipy.optimize import least_squares
 
-from ctid_cli import DataError, DelayProfile, HeldSignal, Record, TransferFunction
+from ctid_cli import DataError, DelayProfile, HeldSignal, InputModel, Prbs, Record, TransferFunction, simulate
+from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.signals.measurement import read_measurement
 
 TOLERANCE = 1e-6
@@ -327,6 +332,38 @@ def tabulated(name, record, options, rng, count, truth=None):
     return reached[least] < -TOLERANCE
 
 
+def two_inputs(rng):
+    """A record with two inputs, and their true models."""
+    orders, h, samples = rng.integers(1, 3, 2), 0.1, 600
+    t, models, inputs = h * np.arange(samples), [], {}
+    for k, n in enumerate(orders):
+        w = np.exp(rng.uniform(np.log(0.3), np.log(5.0), n))
+        zeta = rng.uniform(0.1, 1.0)
+        a = [1.0, w[0]] if n == 1 else [1.0, 2 * zeta * w[0], w[0] ** 2]
+        models.append(
+            TransferFunction([rng.choice([-1, 1]) * rng.uniform(0.5, 2.0) * a[-1]], a, rng.uniform(0, 20 * h))
+        )
+        signal = Prbs(10 + k, h * int(rng.integers(2, 8))).generate(t, rng)
+        inputs[f"u{k + 1}"] = HeldSignal(t, signal.at(t))
+    x = sum(simulate(model, signal, t) for model, signal in zip(models, inputs.values(), strict=True))
+    return Record(t, x + x.std() * 10 ** (-15 / 20) * rng.standard_normal(samples), inputs), models
+
+
+def two_inputs_compared(number, rng, count):
+    """CPU time of a fit with two inputs, and how far the least descent and that from the truth are from it."""
+    record, models = two_inputs(rng)
+    own = tuple(InputModel(name, poles=m.order) for name, m in zip(record.held, models, strict=True))
+    prepared = DelayProfile(max(m.order for m in models), 0, (0.0, 2.0), inputs=own).prepare(record)
+    spent, fit = cpu(prepared.fit)
+    problem, bounds = prepared.laid_out.problem, prepared.laid_out.treatment.delay_bounds
+    starts = [(np.concatenate([m.poles for m in models]), [m.delay for m in models])]
+    for _ in range(count):
+        poles = [random_poles(rng, m.order, fit.box.spread[0], fit.box.fastest, fit.box.spread[1]) for m in models]
+        starts.append((np.concatenate(poles), rng.uniform(0.0, 2.0, 2).tolist()))
+    ends = [local_minimum(problem, poles, delays, bounds, box=fit.box).squared_error for poles, delays in starts]
+    return spent, min(ends) / (fit.cost * fit.count) - 1.0, ends[0] / min(ends) - 1.0
+
+
 def table(asked):
     """Print the records at the border of the set and the measured ones; return how many are above the peer."""
     print(
@@ -359,12 +396,24 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--starts", type=int, default=3, help="random starts of the peer")
     parser.add_argument("--verbose", action="store_true", help="a line for each system")
+    parser.add_argument("--two-inputs", type=int, default=0, help="systems with two inputs, in place of the others")
     parser.add_argument("--likes", action="store_true", help="systems at the border of the admissible models")
     parser.add_argument("--records", metavar="FOLDER", help="measured records")
     asked = parser.parse_args()
     warnings.simplefilter("error")
     if asked.likes or asked.records:
         table(asked)
+    above = 0
+    for number in range(asked.first, asked.first + asked.two_inputs):
+        spent, least, truth = two_inputs_compared(number, np.random.default_rng([asked.seed, number]), asked.starts)
+        above += least < -TOLERANCE
+        print(
+            f"two inputs {number}: {spent:.1f} CPU s, best descent {least:+.1e}, truth above it {truth:+.1e}",
+            flush=True,
+        )
+    if asked.two_inputs:
+        print(f"{asked.two_inputs} systems with two inputs: above the best descent in {above}")
+        return
     if not asked.systems:
         return
     statuses, above, truth_missed, seconds = Counter(), 0, 0, 0.0

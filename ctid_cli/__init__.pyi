@@ -38,7 +38,7 @@ from .estimators.additive_srivc import AdditiveSrivc as AdditiveSrivc
 from .estimators.loop_output_error import LoopOutputError as LoopOutputError
 from .estimators.measured_submodels import MeasuredSubmodels as MeasuredSubmodels
 from .estimators.frequency_domain import FrequencyDomain as FrequencyDomain
-from .estimation.common import Fixed as Fixed
+from .estimation.common import Bound as Bound, Fixed as Fixed
 from .estimators.identification import Identification as Identification
 from .identification.choice import Choice as Choice, Given as Given
 from .identification.choose import choose as choose

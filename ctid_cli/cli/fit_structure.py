@@ -17,7 +17,7 @@ from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefor
 
 if TYPE_CHECKING:
     from ctid_cli.estimation.additive_problem import Instruments
-    from ctid_cli.estimation.common import Fixed
+    from ctid_cli.estimation.common import Bound, Fixed
     from ctid_cli.estimators.additive_output_error import AdditiveOutputError
     from ctid_cli.estimators.delay_profile import InputModel
     from ctid_cli.estimators.loop_output_error import LoopOutputError
@@ -158,6 +158,10 @@ class ModelOptions(StructureOptions):
     model: FormOption = "fraction"
     terms: Annotated[str | None, flag("--terms", "Poles/zeros of each submodel; else chosen.", "P/Z,P/Z,...")] = None
     fix: Annotated[list[str] | None, flag("--fix", "Hold a parameter; repeatable.", "NAME=VALUE")] = None
+    bound: Annotated[
+        list[str] | None,
+        flag("--bound", "Bounds of a coefficient, delay, gain, time_constant or damping.", "NAME=LOW:HIGH"),
+    ] = None
 
     @property
     def fixed(self) -> tuple[Fixed, ...] | None:
@@ -174,6 +178,22 @@ class ModelOptions(StructureOptions):
             except ValueError:
                 example = "for example a1=2"
                 raise UsageError(f"--fix must be NAME=VALUE with a finite number, {example}; got {text!r}") from None
+        return tuple(found) or None
+
+    @property
+    def parameter_bounds(self) -> tuple[Bound, ...] | None:
+        """Bounds of parameters."""
+        from ctid_cli.estimation.common import Bound
+
+        found = []
+        for text in self.bound or ():
+            name, _, ends = (part.strip() for part in text.partition("="))
+            both = span(ends, float) if ":" in ends else None
+            if both is None or not name:
+                example = "for example a1=0.5:2"
+                raise UsageError(f"--bound must be NAME=LOW:HIGH with two numbers, {example}; got {text!r}")
+            with as_usage_errors():
+                found.append(Bound(name, *both))
         return tuple(found) or None
 
     @property
@@ -364,26 +384,38 @@ def _degrees(model: ModelOptions) -> str:
     return "--poles" if model.model == "fraction" else "--terms"
 
 
-def _given(asked: Asked) -> Given:
-    """Return what is given of the choice, and of each of several inputs; its delay may be known by ``--fix`` too."""
-    model, treatment = asked.model, asked.treatment
-    delays = tuple(f"{name}_delay=" for name in asked.inputs)
+def with_delays(model: ModelOptions, inputs: Sequence[str]) -> ModelOptions:
+    """Return the options with what ``--fix`` and ``--bound`` say of delays among those of ``--delay``."""
+    delays = tuple(f"{name}_delay=" for name in inputs)
     known = [text for text in model.fix or () if delays and text.startswith(delays)]
-    model = replace(
+    ranges = [text for text in model.bound or () if text.startswith(("delay=", *delays))]
+    if model.delays and any(text.startswith("delay=") for text in ranges):
+        raise UsageError("--bound delay=LOW:HIGH is --delay LOW:HIGH; give one of them")
+    known_delays = [text.removeprefix("delay=").replace("_delay=", "=", 1) for text in (*known, *ranges)]
+    return replace(
         model,
         fix=[text for text in model.fix or () if text not in known] or None,
-        delays=[*(model.delays or ()), *(text.replace("_delay=", "=", 1) for text in known)] or None,
+        bound=[text for text in model.bound or () if text not in ranges] or None,
+        delays=[*(model.delays or ()), *known_delays] or None,
     )
+
+
+def _given(asked: Asked) -> Given:
+    """Return what is given of the choice, and of each of several inputs; its delay may be known by ``--fix`` too."""
+    treatment = asked.treatment
+    model = with_delays(asked.model, asked.inputs)
+    bounds = model.parameter_bounds
     inputs = inputs_of(model, asked.inputs)
     own_poles = [one.poles for one in inputs or () if one.poles is not None]
     own_zeros = any(one.zeros is not None for one in inputs or ())
     poles = model.poles if model.poles is not None else max(own_poles, default=None)
-    for option, needed in {"--fix": bool(model.fix), "the zeros of single inputs": own_zeros}.items():
+    needing = {"--fix": bool(model.fix), "--bound": bool(bounds), "the zeros of single inputs": own_zeros}
+    for option, needed in needing.items():
         if needed and poles is None:
             raise UsageError(f"{_degrees(model)} is missing: with {option} it must be given")
     # The names of known parameters are those of a number of zeros.
-    zeros = 0 if model.zeros is None and (model.fix or own_poles or own_zeros) else model.zeros
-    given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed)
+    zeros = 0 if model.zeros is None and (model.fix or bounds or own_poles or own_zeros) else model.zeros
+    given = replace(given_of(model, treatment, asked.hold), poles=poles, zeros=zeros, fixed=model.fixed, bounds=bounds)
     if model.model == "additive":
         given = replace(given, modes=MODES)
     return replace(given, loss=treatment.loss, noise_model=treatment.noise, inputs=inputs)
@@ -470,6 +502,8 @@ def _refuse_other_form(asked: Asked) -> None:
         for name, value in (("--poles", model.poles), ("--zeros", model.zeros)):
             if value is not None:
                 raise UsageError(f"{name} is for one transfer function; --terms has the degrees of a sum, drop {name}")
+        if model.bound:
+            raise UsageError("--bound is for one transfer function, not for a sum of submodels; drop --bound")
     elif model.terms is not None:
         raise UsageError("--terms is for a sum of submodels; add --model additive, or give --poles and --zeros")
     instead = "--initial-state" if asked.single else "--offset"
@@ -495,6 +529,7 @@ def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     one_fraction = model.model == "fraction" and not (asked.iterated and model.integrators)
     names = "its names are those of submodels: add --model additive --terms POLES/ZEROS"
     yield bool(model.fix) and one_fraction, "--fix", names
+    yield bool(model.bound), "--bound", "drop --bound, or fit to the input with --direct"
     if asked.simulated:
         yield state == "periodic", "--initial-state periodic", "use rest or estimate"
         yield offset == "drift", "--offset drift", "use estimate, remove or none"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctid_cli.cli._options import RecordOptions
-from ctid_cli.cli.fit_structure import Asked, LoopOptions, as_usage_errors, check_integrators
+from ctid_cli.cli.fit_structure import Asked, LoopOptions, as_usage_errors, check_integrators, with_delays
 from ctid_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -58,9 +58,10 @@ def frequency_fit(
             "column standard_error"
         )
     data = replace(data, weight=weight or "none")
+    delays = with_delays(model, ())
     with as_usage_errors():
-        given: Any = {"integrators": model.integrators or 0, "fixed": model.fixed}
-        options = FrequencyDomain(model.poles, model.zeros or 0, model.bounds or (0.0, 0.0), **given)
+        given: Any = {"integrators": model.integrators or 0, "fixed": model.fixed, "bounds": delays.parameter_bounds}
+        options = FrequencyDomain(model.poles, model.zeros or 0, delays.bounds or (0.0, 0.0), **given)
         return FrequencyFitResult.of(identify_frequency_response(data, options))
 
 

@@ -57,6 +57,39 @@ class Fixed:
         require_finite("value", self.value, "unit of the parameter", label=f"the value of {self.name}")
 
 
+@dataclass(frozen=True)
+class Bound:
+    """Bounds of a parameter.
+
+    Parameters
+    ----------
+    name : str
+        A coefficient by its name in the table of parameters, for example a1 or u1_b0; delay; or gain of a model with
+        one or two poles, time_constant with one, damping with two; of several inputs u1_gain.
+    low, high : float
+        Least and greatest value, in the unit of the tables.
+
+    Raises
+    ------
+    ValueError
+        If these are no two finite numbers of which the first is below the second.
+    """
+
+    name: str
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not -np.inf < self.low < self.high < np.inf:
+            numbers = f"two numbers, the smaller first: got {self.low:g} and {self.high:g}"
+            raise OptionError("bounds", f"the bounds of {self.name} must be {numbers}")
+
+    @property
+    def scale(self) -> float:
+        """The greater magnitude of both."""
+        return max(abs(self.low), abs(self.high))
+
+
 def places_of(fixed: Iterable[Fixed] | None, names: Sequence[str]) -> dict[int, float]:
     """Values of known parameters by their places among the names; unknown names and repetitions are refused."""
     found: dict[int, float] = {}
@@ -129,6 +162,8 @@ class Estimator(Generic[LaidOut, AnyFit]):
         A DataError says why nothing can be estimated.
         """
         records = [record] if isinstance(record, Record) else list(record)
+        for one in records if not hasattr(self, "inputs") else ():
+            one.input  # noqa: B018 - refuses several
         in_loop = any(one.in_loop for one in records) and getattr(self, "instruments", "open_loop") == "open_loop"
         return Prepared(self, self._lay_out(record), in_loop)
 

@@ -26,6 +26,9 @@ SHORT_WORK: dict[str, Any] = {
     "beta": 2.0,
     "max_iterations": 1,
     "max_rounds": 1,
+    # Of several inputs the record below has one.
+    "inputs": None,
+    "fixed": None,
 }
 
 

@@ -1,5 +1,6 @@
 """Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,12 +10,13 @@ import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray
 from ctid_cli.errors import DataError, OptionError, UsageError
-from ctid_cli.estimation.common import Estimator, Fixed, Start, checked_bounds, places_of, quality
+from ctid_cli.estimation.common import Bound, Estimator, Fixed, Start, checked_bounds, places_of, quality
 from ctid_cli.estimation.measured_records import AppliedModel, MeasuredRecords, Treatment, sensitivities
 from ctid_cli.estimation.noise_search import joint_optimum
 from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.box import Box
 from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients
+from ctid_cli.estimation.parameter_bounds import BoundedSearch, Quantity, quantities_of
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.estimation.profile_search import Profile, search_delay
 from ctid_cli.estimation.robust_fit import RobustFit, robust_fit, robust_local
@@ -25,7 +27,7 @@ from ctid_cli.inference.model_responses import Estimated
 from ctid_cli.inference.noise_estimate import NoiseEstimate, hausman, noise_covariance, orders_of
 from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
-from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
+from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of, is_delay
 from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
@@ -36,6 +38,13 @@ class Starts(NamedTuple):
 
     tried: int
     agree: int
+
+
+class Met(NamedTuple):
+    """A parameter at an end of its given bounds."""
+
+    name: str
+    end: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,6 +97,8 @@ class MeasuredFit(DeferredFields, Fit):
         Names of the parameters that were fixed.
     noise : NoiseEstimate or None
         The noise model that was estimated with the plant; None of an output-error fit.
+    bounds_met : tuple of Met
+        Parameters that the estimate has at an end of their given bounds, and these ends.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -109,6 +120,7 @@ class MeasuredFit(DeferredFields, Fit):
     regular: bool = True
     known: tuple[str, ...] = ()
     noise: NoiseEstimate | None = None
+    bounds_met: tuple[Met, ...] = ()
 
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
@@ -212,11 +224,19 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`.
     in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`MeasuredFit`; of the levels of the inputs those of all inputs of one record after the other.
-    poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
+    poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
         As in :class:`MeasuredFit`.
     """
 
     model: MultiInputModel  # type: ignore[assignment]  # what asks for one transfer function asks for that of an input
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients and delays by name, delays that are known too."""
+        known = {f"{name}_delay": part.delay for name, part in self.model.parts.items()}
+        return {n: v for n, v in self.parameters.items() if re.fullmatch(r"(.+_)?[ab]\d+", n)} | {
+            n: self.parameters.get(n, v) for n, v in known.items()
+        }
 
     def of_input(self, name: str) -> InputFit:
         """Return the transfer function of an input, with its responses.
@@ -245,6 +265,17 @@ class MultiInputFit(MeasuredFit):
         """Refuse what asks for one transfer function."""
         inputs = ", ".join(self.model.parts)
         raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
+
+
+def _within(bounds: tuple[float, float] | None, delays: tuple[float, float]) -> tuple[float, float]:
+    """Return the range of a delay within bounds, if there are any."""
+    if bounds is None:
+        return delays
+    low, high = max(bounds[0], delays[0]), min(bounds[1], delays[1])
+    if low > high:
+        given = f"{bounds[0]:g} to {bounds[1]:g} s and delay_bounds {delays[0]:g} to {delays[1]:g} s"
+        raise OptionError("bounds", f"no delay is within its bounds, {given}; give one of them")
+    return low, high
 
 
 class FittedSamples(NamedTuple):
@@ -401,6 +432,10 @@ class DelayProfile(RecordsEstimator):
         What differs between the inputs of records that have several. They share the denominator unless these have poles
         of their own, and poles, zeros, range of the delay and integrators unless these say otherwise. Parameters are
         named ``u1_b0``, ``u1_delay`` and, of own denominators, ``u1_a1``, for an input u1.
+    bounds : tuple of Bound, optional
+        Bounds of coefficients, and of the gain, time constant or damping of a small model. Where the least cost is
+        outside, the estimate is the least with the parameter at the bound: its status says so, and the parameter has no
+        standard error.
 
     Raises
     ------
@@ -446,12 +481,20 @@ class DelayProfile(RecordsEstimator):
     input_before: InputBefore = None
     noise_model: str = "white"
     inputs: tuple[InputModel, ...] | None = None
+    bounds: tuple[Bound, ...] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_treatment(self)
-        low, high = bounds = checked_bounds(self.delay_bounds, known_allowed=True)
+        own = {one.name: (one.low, one.high) for one in self.bounds or () if is_delay(one.name)}
+        low, high = bounds = _within(own.get("delay"), checked_bounds(self.delay_bounds, known_allowed=True))
         object.__setattr__(self, "delay_bounds", bounds)
+        if self.inputs and own:
+            bounded = [
+                replace(one, delay_bounds=_within(own.get(f"{one.name}_delay"), one.delay_bounds or bounds))
+                for one in self.inputs
+            ]
+            object.__setattr__(self, "inputs", tuple(bounded))
         names = [one.name for one in self.inputs or ()]
         if len(set(names)) < len(names):
             raise OptionError("inputs", f"each input must be given once; got {', '.join(names)}")
@@ -463,12 +506,28 @@ class DelayProfile(RecordsEstimator):
         # Names are made of degrees that make sense only; of several inputs once these are known.
         if self.fixed and not self.inputs and not any("_" in one.name for one in self.fixed):
             self._known(("",))
+        if self.bounds and (self.loss != "squares" or self.noise_model != "white"):
+            raise OptionError("bounds", "parameters are bounded with loss squares and white noise only; drop one")
+        if self.bounds and not self.inputs and not any("_" in one.name.removeprefix("time_") for one in self.bounds):
+            self._quantities(("",))
+
+    def _quantities(self, names: tuple[str, ...]) -> list[Quantity]:
+        """Return what is bounded, for inputs of some names."""
+        bounds = [one for one in self.bounds or () if not is_delay(one.name)]
+        found = quantities_of(bounds, self._degrees(names, free=False))
+        integrating = self.integrators or any(one.integrators for one in self.inputs or ())
+        for one in found:
+            if one.kind != "coefficient" and integrating:
+                raise OptionError("bounds", f"{one.bound.name} has no bounds with integrators; bound the coefficients")
+            if any(fixed.name in one.names for fixed in self.fixed or ()):
+                raise OptionError("bounds", f"{one.bound.name} is bounded, and of its coefficients one is fixed")
+        return found
 
     def _alone(self, one: InputModel) -> "DelayProfile":
         """Return the estimator of one of several inputs by itself."""
         own = {name: value for name, value in vars(one).items() if name != "name" and value is not None}
         try:
-            return replace(self, inputs=None, fixed=None, **own)
+            return replace(self, inputs=None, fixed=None, bounds=None, **own)
         except OptionError as error:
             raise OptionError(error.field, f"input {one.name}: {error}") from None
 
@@ -482,14 +541,28 @@ class DelayProfile(RecordsEstimator):
 
     def _each(self, names: Sequence[str]) -> list["DelayProfile"]:
         """Return the estimator of each input by itself."""
-        own = {one.name: one for one in self.inputs or ()}
-        unknown = [name for name in own if name not in names]
+        unknown = [one.name for one in self.inputs or () if one.name not in names]
         if unknown:
             raise OptionError(
                 "inputs",
                 f"there is no input {unknown[0]!r}; the record has {', '.join(names) if any(names) else 'one'}",
             )
-        return [self._alone(own[name]) if name in own else replace(self, inputs=None, fixed=None) for name in names]
+        return [self.of_input(name) for name in names]
+
+    def of_input(self, name: str) -> "DelayProfile":
+        """Return the estimator of one of several inputs by itself.
+
+        Parameters
+        ----------
+        name : str
+            Name of the input.
+
+        Returns
+        -------
+        DelayProfile
+            Its options, without parameters that are fixed or bounded.
+        """
+        return self._alone(next((one for one in self.inputs or () if one.name == name), InputModel(name)))
 
     def _known(self, names: tuple[str, ...]) -> dict[int, float]:
         """Return the values of the fixed parameters by their places, for inputs of some names."""
@@ -544,6 +617,8 @@ class DelayProfile(RecordsEstimator):
         )
 
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
+        if self.bounds:
+            return self._within_bounds(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
         if measured.degrees.several:
             # Several inputs are searched by themselves first.
             fit = self._least(measured, [], nested=True)
@@ -555,6 +630,21 @@ class DelayProfile(RecordsEstimator):
                 fit = self._least(measured, starts, profile, nested=self.nested)
                 return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         raise DataError(Status.SINGULAR.value)
+
+    def _within_bounds(self, measured: MeasuredRecords) -> MeasuredFit:
+        """Return the least output error within the bounds of parameters, without a covariance."""
+        names = measured.degrees.inputs
+        known, degrees = self._known(names) if self.fixed else {}, self._degrees(names, free=False)
+        search = BoundedSearch(measured, self._quantities(names), degrees, known)
+        found, ends = search.within(measured.best([], nested=True))
+        fit = fitted(measured, found, None, None)
+        if not ends:
+            return fit
+        layout = measured.layout_of(fit.model)
+        tangent = search.tangent(layout, fit.theta, ends, fit.tangent)
+        met = tuple(Met(one.bound.name, end) for one, end in ends.items())
+        status = Status.AT_BOUND if found.ending.optimal else fit.status
+        return replace(fit, tangent=tangent, status=status, bounds_met=met)
 
     def _refine(self, records: Sequence[Record], *near: Begin) -> MeasuredFit:
         """Return the least output error in the basins of denominators, without their integrators, and delays.

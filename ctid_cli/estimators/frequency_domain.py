@@ -42,7 +42,7 @@ class FrequencyDomainFit(MeasuredFit):
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` has the real parts of all lines, then
         the imaginary ones.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     data : FrequencyData
         The frequency response.
@@ -162,7 +162,7 @@ class FrequencyDomain(DelayProfile):
 
     Parameters
     ----------
-    poles, zeros, fixed, integrators
+    poles, zeros, fixed, integrators, bounds
         As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
     delay_bounds : tuple of float, default (0.0, 0.0)
         Least and greatest delay [s]; two equal numbers are a known delay.
@@ -215,11 +215,17 @@ class FrequencyDomain(DelayProfile):
     def _estimate(self, measured: MeasuredRecords, start: Start | None) -> MeasuredFit:
         if not isinstance(measured, MeasuredLines):
             raise DataError("this fit takes a frequency response (FrequencyData); DelayProfile takes records in time")
+        if self.bounds:
+            return with_data(self._within_bounds(measured), measured)
         return fit_of(measured, measured.best([], True))
 
 
 def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
     """Return the fit that an optimum is, with its standard errors."""
-    found = fitted(measured, optimum, None, None)
+    return with_data(fitted(measured, optimum, None, None), measured)
+
+
+def with_data(found: MeasuredFit, measured: MeasuredLines) -> FrequencyDomainFit:
+    """Return a fit with its frequency response and standard errors."""
     values = {each.name: getattr(found, each.name) for each in fields(found)}
     return FrequencyDomainFit(**values, data=measured.source)._with_uncertainty("auto", DRAWS)

@@ -520,7 +520,7 @@ def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Un
     if isinstance(fit, MultiInputFit):
         return _derived_of_inputs(fit, covariance, uncertainty)
     size = fit.model.denominator.size + sum(name.startswith("b") for name in fit.parameter_names) - 1
-    held = fit.tangent[:size] if fit.held_poles else None
+    held = fit.tangent[:size] if fit.held_poles or fit.bounds_met else None
     return derived_parameters(fit.model, covariance[:size, :size], uncertainty.quantile, held)
 
 
@@ -536,7 +536,7 @@ def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncer
             whole[own[: gradient.size]] = gradient
             return uncertainty.quantile(whole)
 
-        held = fit.tangent[own] if fit.held_poles else None
+        held = fit.tangent[own] if fit.held_poles or fit.bounds_met else None
         values = derived_parameters(model, covariance[np.ix_(own, own)], quantile, held)
         shared = [] if not fit.model.common else [item for item in values if item.name != "static_gain"]
         found += shared if k == 0 else []

@@ -52,7 +52,7 @@ class LoopFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].

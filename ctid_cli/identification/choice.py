@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from ctid_cli.errors import OptionError
-from ctid_cli.estimation.common import Fixed
+from ctid_cli.estimation.common import Bound, Fixed
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, InputModel
 from ctid_cli.identification.candidates import MOST_POLES, Span
@@ -38,6 +38,8 @@ class Given:
         What output errors count in the fit; the choice is made with their squares.
     fixed : tuple of Fixed, optional
         Known parameters of the fit.
+    bounds : tuple of Bound, optional
+        Bounds of parameters of the fit.
     noise_model : str, default "white"
         Noise that is estimated with the plant: ``arma:P,Q``, or ``auto``; the choice is made without it.
     inputs : tuple of InputModel, optional
@@ -60,6 +62,7 @@ class Given:
     noise_model: str = "white"
     inputs: tuple[InputModel, ...] | None = None
     modes: tuple[int, int] | None = None
+    bounds: tuple[Bound, ...] | None = None
 
     @property
     def typed(self) -> bool:
@@ -121,6 +124,7 @@ class Given:
             input_before=self.input_before,
             noise_model=self.noise_model,
             inputs=self.inputs,
+            bounds=self.bounds,
         )
 
 

@@ -132,7 +132,7 @@ class _Choosing:
         best = ranking.best
         options = replace(options, loss=self.given.loss, noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
-            options = replace(options, fixed=self.given.fixed, nested=True)
+            options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds, nested=True)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
         fitted = tuple(with_hold(record, setting.hold) for record in self.many)

@@ -225,8 +225,11 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
 
 def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
     """How the search ended, where it did not end well."""
-    if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not fit.held_poles:
+    if fit.status not in (Status.CONVERGED, Status.DELAY_AT_BOUND) and not (fit.held_poles or fit.bounds_met):
         yield fit.status.value.removesuffix(".")
+    if fit.bounds_met:
+        at = listed(f"{name} = {end:g}" for name, end in fit.bounds_met)
+        yield f"At the given bound: {at}; beyond it the cost is lower, and other standard errors take this as known"
     if fit.held_poles:
         held = listed(f"{pole:.4g}" if pole.imag else f"{pole.real:.4g}" for pole in fit.held_poles)
         met = () if fit.box is None else fit.box.limits_met(fit.held_poles)

@@ -14,7 +14,7 @@ from ctid_cli.models.transfer_function import TransferFunction
 
 NAN = float("nan")
 GAIN_UNIT = "output unit/input unit"
-HELD = "A pole is fixed at a bound of the admissible models, because the record does not determine it."
+HELD = "It is at a bound: a given one, or one of the admissible models, because the record does not determine it."
 #: A quantity counts as fixed if it changes by less than this fraction for a relative change of 1 of a free pole [-].
 UNMOVED = 1e-6
 #: Standard errors to each side of a quantity with a given gradient by the leading parameters.

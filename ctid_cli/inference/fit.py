@@ -37,7 +37,7 @@ class Status(Enum):
     )
     AT_BOUND = (
         "The least cost is at the bound of the admissible models: a pole has its largest or smallest allowed "
-        "speed, or its smallest allowed damping."
+        "speed, or its smallest allowed damping; or a parameter is at a given bound."
     )
     RIDGE = (
         "The cost is minimal and nearly constant along a line up to the bound of the admissible models: the data "

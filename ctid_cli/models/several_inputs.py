@@ -1,6 +1,6 @@
 """Models with several inputs: one transfer function for each input; the responses are added."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,22 @@ class MultiInputModel:
     parts: Mapping[str, TransferFunction]
     #: Whether all have a common denominator.
     common: bool
+
+    @classmethod
+    def of(cls, parts: Mapping[str, TransferFunction]) -> "MultiInputModel":
+        """Return the model of some transfer functions, which share a denominator where all are equal."""
+        first, *others = parts.values()
+        return cls(parts, all(np.array_equal(first.denominator, other.denominator) for other in others))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Coefficients and delays by name: ``u1_a1``, or ``a1`` of a common denominator, ``u1_b0``, ``u1_delay``."""
+        found = {
+            name if self.common and name.startswith("a") else f"{own}_{name}": value
+            for own, part in self.parts.items()
+            for name, value in part.parameters.items()
+        }
+        return found | {f"{own}_delay": part.delay for own, part in self.parts.items()}
 
     @property
     def order(self) -> int:
@@ -38,6 +54,25 @@ AnyModel = TransferFunction | MultiInputModel
 def fractions_of(model: AnyModel) -> tuple[TransferFunction, ...]:
     """Return the transfer functions of all inputs."""
     return tuple(model.parts.values()) if isinstance(model, MultiInputModel) else (model,)
+
+
+def parts_of(
+    model: AnyModel | AdditiveModel, inputs: Iterable[str]
+) -> Mapping[str, TransferFunction] | dict[str, TransferFunction | AdditiveModel]:
+    """Return the model of each input by its name."""
+    return model.parts if isinstance(model, MultiInputModel) else dict.fromkeys(inputs, model)
+
+
+def parameters_of(model: AnyModel | AdditiveModel) -> dict[str, float]:
+    """Return coefficients and delays by name."""
+    if isinstance(model, MultiInputModel):
+        return model.parameters
+    return {**model.parameters, "delay": model.delay}
+
+
+def is_delay(name: str) -> bool:
+    """Return whether a parameter of this name is a delay, that of one of several inputs among them."""
+    return name == "delay" or name.endswith("_delay")
 
 
 def delays_of(model: AnyModel | AdditiveModel) -> list[float]:

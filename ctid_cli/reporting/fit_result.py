@@ -251,7 +251,9 @@ class FitResult(PagedResult):
         fit, units = self.fitted.fit, self.units
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
-        if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):
+        for name, end in fit.bounds_met:
+            yield "at bound", f"{name} = {end:g}, as given"
+        if fit.box is not None and (fit.held_poles or fit.status is Status.RIDGE):
             yield "admissible", fit.box.sentence(units.time)
             for name, limit, value in fit.box.limits_met(fit.held_poles):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"

@@ -31,6 +31,7 @@ from ctid_cli.errors import UsageError
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.monte_carlo import MEASURES, Measure, Measured, Sample, quantile, requested, total
 from ctid_cli.inference.units import Units
+from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.reporting.results import Results, lookup
 from ctid_cli.running.theory import least_variances
 from ctid_cli.simulation.frequency_measures import MEASURE_UNITS, base_name
@@ -39,6 +40,7 @@ from ctid_cli.storage.estimates import CLOCKS
 from ctid_cli.storage.groups import places_of
 from ctid_cli.storage.manifest import is_of_signal, true_values
 from ctid_cli.storage.model_errors import distances, pole_errors, system_of
+from ctid_cli.storage.truth import coefficients_of
 from ctid_cli.text import did_you_mean, listed
 
 if TYPE_CHECKING:
@@ -318,7 +320,12 @@ def parameter_unit(name: str, names: Sequence[str]) -> str:
     """Return the unit of one of the parameters of a system; ``-`` of those that are not known here."""
     if name.startswith("pole_"):
         return "rad/s"
-    if re.fullmatch(r"[ab]\d+|delay", name):
-        poles, coefficients = (sum(other[0] == letter and other != "delay" for other in names) for letter in "ab")
-        return Units().of(name, poles, coefficients - 1)
+    if is_delay(name):
+        return Units().of("delay", 0, 0)
+    several = any(is_delay(other) and other != "delay" for other in names)
+    own, separator, bare = name.rpartition("_") if several else ("", "", name)
+    if re.fullmatch(r"[ab]\d+", bare):
+        # A common denominator has no prefix.
+        poles = coefficients_of(f"{own}{separator}a", names) or coefficients_of("a", names)
+        return Units().of(bare, poles, coefficients_of(f"{own}{separator}b", names) - 1)
     return Units().of_submodel(name) if re.fullmatch(r"g\d+_[ab]\d+", name) else "-"

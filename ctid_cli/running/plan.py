@@ -19,13 +19,14 @@ from ctid_cli.canonical import content_hash
 from ctid_cli.errors import UsageError
 from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.models.additive import AdditiveModel, Term
+from ctid_cli.models.several_inputs import MultiInputModel
 from ctid_cli.running.job import DataCell, EstimatorCell, Job, Wanted
 from ctid_cli.simulation.components import CustomEstimation, is_custom
 from ctid_cli.simulation.dataset import DataSet, SimulatedSource, Source, joined, located
 from ctid_cli.simulation.frequency_measures import FrequencyEstimation, Measuring, SignalDataSet, SignalSource
 from ctid_cli.simulation.start_points import NO_START, StartPoint
 from ctid_cli.specification.load import load_spec
-from ctid_cli.specification.spec import OF_DATA, MonteCarloSection, Spec
+from ctid_cli.specification.spec import MonteCarloSection, Spec
 from ctid_cli.specification.sweeps import MAX_COMBINATIONS, Variant, replaced, variants
 from ctid_cli.specification.system_sections import start_points, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
@@ -97,7 +98,7 @@ class Plan:
     @property
     def files(self) -> list[tuple[str, str]]:
         """Path and SHA-256 of each file that data sets are made from."""
-        sections: list[Any] = [self.spec.data, self.spec.sampling, (self.spec.generator or ((), None))[1]]
+        sections: list[Any] = [self.spec.data, self.spec.sampling, *self.spec.generators.values()]
         read = [one for one in sections if getattr(one, "sha256", None) is not None and not one.custom]
         return [(joined(self.spec.folder.resolve(), section.file), section.sha256) for section in read]
 
@@ -181,7 +182,7 @@ def build_plan(spec: Spec, runs: int | None = None) -> Plan:
         if number > most:
             raise UsageError(f"{spec.experiment}: {number} {what} are too many; at most {most} are allowed")
     cases = [(name, variant) for name, section in spec.estimators.items() for variant in variants(section)]
-    names = _column_names(parts | {"estimator": [variant for _, variant in cases]})
+    names = _column_names({**parts, ("estimator",): [variant for _, variant in cases]})
     estimators = tuple(_estimator_cell(name, variant, names) for name, variant in cases)
     starts = start_points(spec.starts)
     if any(NO_START in starts_of(cell.estimator.start_from, starts) for cell in estimators):
@@ -205,7 +206,7 @@ def simulate_dataset(
         A specification: the path of a YAML file, or its content.
     key : tuple of int
         Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
-        fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance.
+        fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance, inputs.
     overrides : sequence of str, default ()
         Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
     allow_code : bool, default False
@@ -265,13 +266,13 @@ def simulate_dataset(
     return source.dataset(replicate)
 
 
-def data_parts(spec: Spec) -> dict[str, list[Variant]]:
+def data_parts(spec: Spec) -> dict[KeyPath, list[Variant]]:
     """Return the variants of the sections that data are made from; of a measured record only those of its loop."""
-    return {name: found for name in OF_DATA if (found := variants(getattr(spec, name)))}
+    return {path: variants(section) for path, section in spec.of_data.items()}
 
 
 def data_cells(
-    spec: Spec, parts: Mapping[str, list[Variant]], names: Mapping[KeyPath, str] | None = None
+    spec: Spec, parts: Mapping[KeyPath, list[Variant]], names: Mapping[KeyPath, str] | None = None
 ) -> Iterator[DataCell]:
     """Yield every combination of the variants of the sections; swept fields have the names of their columns."""
     names = _column_names(parts) if names is None else names
@@ -280,7 +281,7 @@ def data_cells(
     custom = tuple((name, variant.options) for name, variant in measures.items())
     for point in itertools.product(*parts.values()):
         chosen = dict(zip(parts, point, strict=True))
-        content: dict[str, Any] = {name: _without_place(variant.values) for name, variant in chosen.items()}
+        content = _nested({path: _without_place(variant.values) for path, variant in chosen.items()})
         if spec.signal is not None:
             content |= {"disturbance": content.get("disturbance"), "seed": seed}
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
@@ -290,17 +291,29 @@ def data_cells(
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
-            if is_custom(chosen["system"].options):
-                content["system"]["truth"] = truth_of(chosen["system"])
+            system = chosen.get(("system",))
+            if system is not None and is_custom(system.options):
+                content["system"]["truth"] = truth_of(system)
             # What is measured of an estimate is stored with it, so that it belongs to its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
         if measures:
             content["custom_measures"] = {
                 name: {**variant.values, "unit": variant.options.unit} for name, variant in measures.items()
             }
-        swept = {names[name, *path]: value for name, v in chosen.items() for path, value in v.swept.items()}
-        source = source_of(spec, {name: variant.options for name, variant in chosen.items()})
+        swept = {names[*place, *path]: value for place, v in chosen.items() for path, value in v.swept.items()}
+        source = source_of(spec, _nested({path: variant.options for path, variant in chosen.items()}))
         yield DataCell(content, content_hash(content), swept, source, custom)
+
+
+def _nested(values: Mapping[KeyPath, Any]) -> dict[str, Any]:
+    """Return values by their key paths as mappings of mappings."""
+    found: dict[str, Any] = {}
+    for path, value in values.items():
+        inner = found
+        for key in path[:-1]:
+            inner = inner.setdefault(str(key), {})
+        inner[str(path[-1])] = value
+    return found
 
 
 def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
@@ -319,8 +332,13 @@ def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
     if loop is not None:
         loop = dataclasses.replace(loop, reference=located(loop.reference, folder))
         loop = loop.at(sampling.interval) if hasattr(sampling, "interval") else loop
-    excitation, fresh = located(options.get("excitation"), folder), "fresh_fit" in (spec.measures or ())
-    return SimulatedSource(options["system"], excitation, sampling, options.get("noise"), seed, loop, fresh)
+    fresh = "fresh_fit" in (spec.measures or ())
+    system: Any = options.get("system")
+    excitation: Any = located(options.get("excitation"), folder)
+    if inputs := options.get("inputs"):
+        system = MultiInputModel.of({name: one["system"] for name, one in inputs.items()})
+        excitation = {name: located(one["excitation"], folder) for name, one in inputs.items()}
+    return SimulatedSource(system, excitation, sampling, options.get("noise"), seed, loop, fresh)
 
 
 def _measuring(spec: Spec) -> Measuring:
@@ -344,9 +362,9 @@ def estimation(variant: Variant) -> Any:
     return CustomEstimation(variant.options) if is_custom(variant.options) else variant.options
 
 
-def _column_names(parts: Mapping[str, Iterable[Variant]]) -> dict[KeyPath, str]:
+def _column_names(parts: Mapping[KeyPath, Iterable[Variant]]) -> dict[KeyPath, str]:
     """Name of the column of every swept field: its last word, or more of its path where that is taken."""
-    distinct = list(dict.fromkeys((name, *path) for name, cases in parts.items() for v in cases for path in v.swept))
+    distinct = list(dict.fromkeys((*place, *path) for place, cases in parts.items() for v in cases for path in v.swept))
     last, reserved = [path[-1] for path in distinct], reserved_names()
     return {
         path: ".".join(map(str, path)) if path[-1] in reserved or last.count(path[-1]) > 1 else str(path[-1])
@@ -367,6 +385,8 @@ def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
     content = {key: _without_place(value) if isinstance(value, dict) else value for key, value in canonical.items()}
     for name in ("measures", "limits"):  # say what is shown, and what may not be exceeded, not what is computed
         content.pop(name, None)
+    if content.get("inputs") is None:  # results of before there were several inputs stay those of the specification
+        content.pop("inputs", None)
     if content.get("monte_carlo") is not None:
         content["monte_carlo"] = {"seed": content["monte_carlo"]["seed"]}
     return content

@@ -25,7 +25,8 @@ import numpy as np
 
 from ctid_cli.canonical import canonical_json, plain
 from ctid_cli.custom_code import reason
-from ctid_cli.errors import DataError
+from ctid_cli.errors import DataError, OptionError
+from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.running.job import DataCell, measured
 from ctid_cli.running.limits import Limits
@@ -118,14 +119,14 @@ def try_out(spec: Spec) -> Found:
 def _settings(spec: Spec) -> list[Setting]:
     """Return the distinct settings, each with the first level of the noise: the others decide on nothing else."""
     parts = data_parts(spec)
-    if spec.signal is None and spec.data is None:
+    if spec.signal is None and spec.data is None and spec.inputs is None:
         if spec.loop is None and spec.excitation is None:
             return []
         # The other sections are tried although the system is wrong.
-        parts.setdefault("system", [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
+        parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
     if spec.data is None and spec.sampling is None:
         return []
-    parts |= {"noise": parts["noise"][:1]} if "noise" in parts else {}
+    parts = {path: found[:1] if path == ("noise",) else found for path, found in parts.items()}
     settings: list[Setting] = []
     samples = 0
     points = itertools.product(*parts.values())
@@ -134,9 +135,7 @@ def _settings(spec: Spec) -> list[Setting]:
             samples += cell.source.sampling.length
         if samples > MAX_TRIAL_SAMPLES and settings:
             break
-        case: dict[KeyPath, Variant] = {
-            (name,): variant for name, variant in zip(parts, point, strict=True) if name != "noise"
-        }
+        case = {path: variant for path, variant in zip(parts, point, strict=True) if path != ("noise",)}
         settings.append(Setting(cell, swept_in(case)))
     return settings
 
@@ -211,15 +210,19 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
         return None, [((*at, "kind") if error.section in custom else at, str(error))]
     except Exception:  # of which a run says more: it is stored with every estimate
         return None, []
+
+    def excited(r: Any) -> Any:
+        return np.concatenate([signal.values for signal in r.held.values()])
+
     made: dict[str, Callable[[Any], Any]] = {
         "sampling": lambda r: r.t,
-        "excitation": lambda r: r.input.values,
         "loop.reference": lambda r: None if r.loop is None else r.loop.reference,
         "system": lambda r: r.noise_free,
         "noise": lambda r: r.y,
     }
     for place in custom:
-        one, other = (np.asarray(made[place](data.record), dtype=np.float64) for data in (first, second))
+        of = made.get(place, excited)
+        one, other = (np.asarray(of(data.record), dtype=np.float64) for data in (first, second))
         if not np.array_equal(one, other, equal_nan=True):
             return None, [((*place.split("."), "kind"), f"{GLOBAL} the rng that it is given")]
     return first, []
@@ -242,7 +245,7 @@ def _unusable(estimator: Any, data: Any) -> str:
     """Say why an estimator cannot use a record at all; empty where it can."""
     try:
         estimator.prepare(data.record)
-    except DataError as error:
+    except (DataError, OptionError) as error:
         return str(error)
     except Exception:  # of which a run says more: it is stored with every estimate
         return ""
@@ -296,8 +299,8 @@ def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapp
     if truth and all(lacks.values()):
         names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"
         yield f"returns {names}; true values are known of {', '.join(truth)} only"
-    others = [name for name in truth if name != "delay"]
-    asked = {"delay_relative_error": ["delay"] if "delay" in truth else [], "parameter_relative_error": others}
+    delays = [name for name in truth if is_delay(name)]
+    asked = {"delay_relative_error": delays, "parameter_relative_error": [n for n in truth if n not in delays]}
     for rule, wanted in asked.items():
         lacking = [each for each in wanted if lacks[each]]
         if lacking and success.get(rule) is not None:

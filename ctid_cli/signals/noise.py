@@ -28,13 +28,14 @@ LEVEL_UNITS = {
 MAX_SNR_DB = 1000
 
 
-def stream(seed: int, role: Role, replicate: int) -> np.random.Generator:
-    """Return the random numbers of one role in one replicate; they depend on nothing else.
+def stream(seed: int, role: Role, replicate: int, number: int = 0) -> np.random.Generator:
+    """Return the random numbers of one role in one replicate, of the first or a further input; of nothing else.
 
     Levels (noise power, record length, estimators) do not enter, so every level of an experiment sees the
     same input and the same noise shape in the same replicate, and adding a level changes no other.
     """
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROLES[role], replicate)))
+    further = (number,) if number else ()
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROLES[role], replicate, *further)))
 
 
 class Noise(Checked):

@@ -277,10 +277,12 @@ class CustomEstimation:
 
     def _fit(self, record: Record, start: Any = None) -> Fit:
         """Estimate from a copy of the record without the noise-free output."""
-        given = replace(record, inputs=replace(record.input), noise_free=None)
+        inputs = {name: replace(signal) for name, signal in record.held.items()}
+        given = replace(record, inputs=inputs, noise_free=None)
         found = called(self.options, "fit", given, start)
-        pairs = [(given.t, record.t), (given.y, record.y), (given.input.t, record.input.t)]
-        pairs += [(given.input.values, record.input.values)]
+        pairs = [(given.t, record.t), (given.y, record.y)]
+        for name, signal in record.held.items():
+            pairs += [(given.held[name].t, signal.t), (given.held[name].values, signal.values)]
         if not all(np.array_equal(now, then, equal_nan=True) for now, then in pairs):
             raise _changes(self.options, "fit")
         return taken(found, record, f"{type(self.options).__name__}.fit")

@@ -20,6 +20,7 @@ from ctid_cli.inference.intervals import normal_quantile
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import ContinuousController, ContinuousPid, Relay
 from ctid_cli.models.factoring import factored, factored_jacobian
+from ctid_cli.models.several_inputs import MultiInputModel, parts_of
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.excitation import Excitation
@@ -61,7 +62,9 @@ class InSubmodels(NamedTuple):
 
 
 def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
-    """Return the submodels' parameters of an estimate, with errors and quantiles for an estimated fraction.
+    """Return parameters by name, with errors and quantiles for an estimated fraction.
+
+    These are the submodels' parameters of one transfer function, and all of several inputs.
 
     The covariance of a fraction's coefficients is transformed by the Jacobian of its partial fractions. A fraction has
     no such parameters if its poles are repeated, or their number or the number of complex pairs does not fit the terms.
@@ -69,6 +72,8 @@ def additive_parameters(fit: Any, terms: Sequence[Term] | None) -> InSubmodels:
     additive = getattr(fit, "additive", None)
     if additive is not None:
         return InSubmodels(additive.parameters)
+    if isinstance(fit.model, MultiInputModel):
+        return InSubmodels(fit.coefficients)
     if terms is None or fit.model is None:
         return InSubmodels()
     try:
@@ -98,7 +103,7 @@ class DataSet:
     """A record with its true model and validation record, where known."""
 
     record: Record
-    true_model: TransferFunction | AdditiveModel | None = None
+    true_model: TransferFunction | AdditiveModel | MultiInputModel | None = None
     validation: Record | None = None
     #: Function that returns the record of a fresh data set, if requested.
     fresh: Callable[[], Record] | None = None
@@ -110,15 +115,16 @@ class DataSet:
         law = fit.law
         # Custom estimators may give parameters of any name, and no model.
         named, model = getattr(fit, "named", {}), fit.model
+        fraction = None if isinstance(model, MultiInputModel) else model
         # Only fits by useful redundancy have a search.
         search = getattr(fit, "search", None)
         return {
             "status": fit.status.name,
             "message": getattr(fit, "message", "") or str(fit.status.value),
             "start_delay": None if start is None else start.delay,
-            "delay": named.get("delay") if model is None else model.delay,
-            "numerator": None if model is None else model.numerator,
-            "denominator": None if model is None else model.denominator,
+            "delay": named.get("delay") if fraction is None else fraction.delay,
+            "numerator": None if fraction is None else fraction.numerator,
+            "denominator": None if fraction is None else fraction.denominator,
             "parameters": {**named, **(parameters or {})} or None,
             "standard_errors": errors,
             "covariance": "" if law is None else law.kind,
@@ -143,8 +149,9 @@ class DataSet:
 class SimulatedSource:
     """Data sets from a simulated system."""
 
-    system: TransferFunction | AdditiveModel | System
-    excitation: Excitation | None
+    #: Of several inputs the model with the excitation of each by its name.
+    system: TransferFunction | AdditiveModel | MultiInputModel | System
+    excitation: Excitation | Mapping[str, Excitation] | None
     sampling: Sampling
     noise: Noise | None
     seed: int
@@ -176,11 +183,19 @@ class SimulatedSource:
                 raise DataError(f"the loop with the true system is unstable: {largest}; lower the gain")
 
     @property
+    def generators(self) -> dict[str, tuple[str, Any]]:
+        """Place and what makes it of each input, or of the reference of the loop, by its name."""
+        if self.loop is not None:
+            return {"u": ("loop.reference", self.loop.reference)}
+        if isinstance(self.excitation, Mapping):
+            return {name: (f"inputs.{name}.excitation", one) for name, one in self.excitation.items()}
+        return {"u": ("excitation", self.excitation)}
+
+    @property
     def parts(self) -> dict[str, Any]:
         """Components that generate the data, by specification key and in order of evaluation."""
-        reference = None if self.loop is None else self.loop.reference
-        parts = {"sampling": self.sampling, "excitation": self.excitation, "loop.reference": reference}
-        return parts | {"system": self.system, "noise": self.noise}
+        generators = dict(self.generators.values())
+        return {"sampling": self.sampling, **generators, "system": self.system, "noise": self.noise}
 
     def _realised(self, replicate: int) -> DataSet:
         with at("sampling"):
@@ -188,35 +203,28 @@ class SimulatedSource:
             if times.size < 2 or not (np.diff(times) > 0).all():
                 wanted = "must return two or more instants that increase"
                 raise ComponentError(f"{_called(self.sampling, 'times')} {wanted}")
-        with at("excitation" if self.loop is None else "loop.reference"):
-            applied = self._applied(times, replicate)
-        true_model = self.system if isinstance(self.system, TransferFunction | AdditiveModel) else None
+        applied: dict[str, HeldSignal] = {}
+        for number, (name, (place, generator)) in enumerate(self.generators.items()):
+            with at(place):
+                applied[name] = _applied(generator, times, stream(self.seed, "input", replicate, number))
         if self.loop is not None:
-            assert true_model is not None
-            held = HeldSignal(times, applied.at(times), applied.hold)
-            return DataSet(self._record_in(self.loop, true_model, held, replicate), true_model=true_model)
+            system = self.system
+            assert isinstance(system, TransferFunction | AdditiveModel)
+            reference = applied["u"]
+            held = HeldSignal(times, reference.at(times), reference.hold)
+            return DataSet(self._record_in(self.loop, system, held, replicate), true_model=system)
+        true_model = (
+            self.system if isinstance(self.system, TransferFunction | AdditiveModel | MultiInputModel) else None
+        )
         with at("system"):
             if true_model is None:
-                output = samples_of(self.system, "simulate", applied, times, size=times.size)
+                output = samples_of(self.system, "simulate", applied["u"], times, size=times.size)
             else:
                 output = _simulated(true_model, applied, times)
         y = output + self._drawn(times, output, replicate)
-        known = applied
         if self.sampling.input_record == "sampled":
-            known = HeldSignal(times, applied.at(times), applied.hold)
-        return DataSet(Record(times, y, known, noise_free=output), true_model=true_model)
-
-    def _applied(self, times: Array, replicate: int) -> HeldSignal:
-        """Return the input of the simulation, or the reference of the loop."""
-        generator = self.excitation if self.loop is None else self.loop.reference
-        if generator is None:  # a relay needs no reference
-            return HeldSignal(times[:1], np.zeros(1))
-        generator = _as_planned(generator)
-        found = made(generator, "generate", times, stream(self.seed, "input", replicate))
-        if not isinstance(found, HeldSignal):
-            text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
-            raise ComponentError(f"{text}, and a ctid_cli.HeldSignal(t, values) is expected")
-        return found
+            applied = {name: HeldSignal(times, one.at(times), one.hold) for name, one in applied.items()}
+        return DataSet(Record(times, y, applied, noise_free=output), true_model=true_model)
 
     def _record_in(
         self, loop: LoopOptions, system: TransferFunction | AdditiveModel, reference: HeldSignal, replicate: int
@@ -384,13 +392,31 @@ class MeasuredSource:
 Source = SimulatedSource | MeasuredSource
 
 
-def _simulated(system: TransferFunction | AdditiveModel, applied: HeldSignal, times: Array) -> Array:
-    """Return the output of a model."""
+def _applied(generator: Any, times: Array, rng: np.random.Generator) -> HeldSignal:
+    """Return what drives a simulation: an input, or the reference of a loop."""
+    if generator is None:  # a relay needs no reference
+        return HeldSignal(times[:1], np.zeros(1))
+    generator = _as_planned(generator)
+    found = made(generator, "generate", times, rng)
+    if not isinstance(found, HeldSignal):
+        text = f"{_called(generator, 'generate')} returned {type(found).__name__}"
+        raise ComponentError(f"{text}, and a ctid_cli.HeldSignal(t, values) is expected")
+    return found
+
+
+def _simulated(
+    model: TransferFunction | AdditiveModel | MultiInputModel, inputs: Mapping[str, HeldSignal], times: Array
+) -> Array:
+    """Return the output of a model: the sum of its responses to all inputs."""
     from ctid_cli.filtering.simulate import simulate, simulate_additive
 
-    if isinstance(system, AdditiveModel):
-        return simulate_additive(system, applied, times)
-    return simulate(system, applied, times)
+    responses = [
+        simulate_additive(part, inputs[name], times)
+        if isinstance(part, AdditiveModel)
+        else simulate(part, inputs[name], times)
+        for name, part in parts_of(model, inputs).items()
+    ]
+    return np.asarray(np.sum(responses, axis=0))
 
 
 def _fit_percent(model: Any, record: Record | None, output: str) -> float | None:
@@ -401,7 +427,7 @@ def _fit_percent(model: Any, record: Record | None, output: str) -> float | None
     if model is None or record is None or wanted is None:
         return None
     there = np.isfinite(wanted)
-    return float(fit_percent(wanted[there], _simulated(model, record.input, record.t)[there]))
+    return float(fit_percent(wanted[there], _simulated(model, record.held, record.t)[there]))
 
 
 def joined(folder: Path, file: str) -> str:

@@ -18,6 +18,7 @@ from ctid_cli.inference.bounds import (
 from ctid_cli.models.additive import AdditiveModel, Submodel, Term
 from ctid_cli.models.controller import ContinuousController, DiscreteController, Relay
 from ctid_cli.models.factoring import factored, unfactored
+from ctid_cli.models.several_inputs import MultiInputModel
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.excitation import Gaussian
 from ctid_cli.signals.noise import Noise
@@ -72,6 +73,8 @@ def why_biased(source: SimulatedSource, estimator: Any) -> str:
 def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     """Return the system in the estimator's parametrisation, and raise a BiasedError if the estimator is biased."""
     system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
+    if isinstance(system, MultiInputModel):
+        raise DataError("there is no theory here of several inputs; compare standard errors with the scatter instead")
     if (
         not isinstance(system, TransferFunction | AdditiveModel)
         or isinstance(estimator, CustomEstimation)

@@ -15,6 +15,7 @@ from ctid_cli.frequency.base import FrequencyEstimator
 from ctid_cli.inference.monte_carlo import MEASURES, requested
 from ctid_cli.kinds import KINDS
 from ctid_cli.models.controller import Relay
+from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.sampling import RegularSampling
 from ctid_cli.signals.sinusoids import SineDisturbance
@@ -47,7 +48,7 @@ _RULES_OF_SIGNALS = ("band", "by", "window")
 
 def too_many_cases(spec: Spec) -> str:
     """Return why not even the combinations of a specification can be looked at; empty if they can."""
-    cells = math.prod(sweeps.case_count(getattr(spec, name)) for name in OF_DATA)
+    cells = math.prod(map(sweeps.case_count, spec.of_data.values()))
     estimators = sum(map(sweeps.case_count, spec.estimators.values()))
     if cells > (most := sweeps.MAX_COMBINATIONS):
         return f"the lists combine to {cells} data cells, which are too many; at most {most} are allowed"
@@ -67,7 +68,7 @@ def joint_complaints(
     usable = {name: given for name, given in cases.items() if not too_long or name not in ("sampling", "duration")}
     found += [*too_long, *sweeps.checked(usable, CHECKS)]
     places = {path[0] for path, _ in found if path}
-    of_data = {"data", *OF_DATA}
+    of_data = {"data", "inputs", *OF_DATA}
     # A wrong level of the noise, or a wrong estimator, leaves the rest to be tried.
     if files_are_good and not places & of_data - {"noise"}:
         faulty = {path[1] for path, _ in found if path[:1] == ("estimators",)}
@@ -85,18 +86,26 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
     """
     on_signal = spec.signal is not None
     found: dict[str, dict[KeyPath, list[Case]]]
-    found = {name: {(name,): _cases(spec, (name,), getattr(spec, name))} for name in OF_DATA}
+    found = {name: {(name,): []} for name in OF_DATA}
+    for path, section in spec.of_data.items():
+        found[str(path[-1])][path] = _cases(spec, path, section)
     if (hasattr(spec.sampling, "sha256") and not files_are_good) or (on_signal and not _is_regular(spec)):
         found["sampling"] = {}
     if spec.disturbance is None:
         found["disturbance"] = {("disturbance",): [(None, {})]}
     # What keeps an unstable system finite, if anything does.
     found["feedback"] = {("loop",): [(None, {})]} if spec.loop is None else found["loop"]
-    if spec.generator is not None:
-        found["generator"] = {spec.generator[0]: _cases(spec, *spec.generator)}
-    if spec.system is not None:
-        systems = sweeps.variants(spec.system)
-        found["truth"] = {("system",): [(truth_of(one), sweeps.swept_in({("system",): one})) for one in systems]}
+    # The systems again, each with the name of its input where there are several.
+    found["driven"] = {
+        path: [(("" if path[1:] == () else str(path[1]), one), swept) for one, swept in cases]
+        for path, cases in found["system"].items()
+    }
+    found["generator"] = {path: _cases(spec, path, section) for path, section in spec.generators.items()}
+    found["truth"] = {
+        path: [(truth_of(one), sweeps.swept_in({path: one})) for one in sweeps.variants(section)]
+        for path, section in spec.of_data.items()
+        if path[-1] == "system"
+    }
     if spec.measured is not None and files_are_good:
         found["duration"] = {("data",): [(spec.measured.dataset(0).record.duration, {})]}
     for cases in found["sampling"].values():
@@ -322,7 +331,9 @@ def _of_unknown_structure(relative_start: Any, custom_system: Any) -> Iterator[C
 
 
 def _of_relative_errors(success: Any, truth: Mapping[str, float]) -> Iterator[Complaint]:
-    for rule, names in (("delay_relative_error", ["delay"]), ("parameter_relative_error", [*truth.keys() - {"delay"}])):
+    delays = [name for name in truth if is_delay(name)]
+    rules = {"delay_relative_error": delays or ["delay"], "parameter_relative_error": [*truth.keys() - {*delays}]}
+    for rule, names in rules.items():
         if getattr(success, rule) is None:
             continue
         if not names or not truth.keys() >= set(names):

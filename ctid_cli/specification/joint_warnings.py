@@ -95,7 +95,14 @@ def _of_open_loop(loop: Any, estimator: Any) -> Iterator[Complaint]:
         yield ("estimator",), f"{ignored}; {cure}"
 
 
-def _of_delay(system: Any, estimator: Any) -> Iterator[Complaint]:
+def _own(estimator: Any, name: str) -> Any:
+    """Return the estimator of one of several inputs, which have names, by itself."""
+    return estimator.of_input(name) if name and hasattr(estimator, "of_input") else estimator
+
+
+def _of_delay(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
+    name, system = driven
+    estimator = _own(estimator, name)
     true, bounds, known = system.delay, getattr(estimator, "delay_bounds", None), getattr(estimator, "delay", None)
     if bounds is not None and not bounds[0] <= true <= bounds[1]:
         outside = f"[{bounds[0]:g}, {bounds[1]:g}] s do not hold the delay of the system, {true:g} s"
@@ -115,14 +122,16 @@ def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Complaint]:
         yield ("estimator", "covariance"), f"{short}; write covariance: auto, unless that is the point"
 
 
-def _of_structure(system: Any, estimator: Any) -> Iterator[Complaint]:
+def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
     """Say that no parameters make the model the system."""
+    name, system = driven
+    estimator = _own(estimator, name)
     key, more = ("terms", "add to the terms") if hasattr(estimator, "terms") else ("", "")
-    for name, needed, given in zip(("poles", "zeros"), _degrees(system), _degrees(estimator), strict=False):
+    for what, needed, given in zip(("poles", "zeros"), _degrees(system), _degrees(estimator), strict=False):
         if given < needed:
-            few = f"the system has {needed} {name if needed > 1 else name[:-1]} and this model {given}"
-            cure = more or f"write {name}: {needed}"
-            yield ("estimator", key or name), f"{few}, so that it can only come near; {cure}"
+            few = f"the system has {needed} {what if needed > 1 else what[:-1]} and this model {given}"
+            cure = more or f"write {what}: {needed}"
+            yield ("estimator", key or what), f"{few}, so that it can only come near; {cure}"
             return
 
 

@@ -94,7 +94,7 @@ def load_loop(path: Path) -> LoopOptions:
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of specifications, for editors."""
     schema = Spec.model_json_schema()
-    ways = ("data", "system excitation sampling", "system loop sampling", "signal sampling")
+    ways = ("data", "system excitation sampling", "inputs sampling", "system loop sampling", "signal sampling")
     schema["properties"]["loop"] = {"anyOf": [schema["properties"]["loop"], {"const": "unknown"}]}
     schema["anyOf"] = [{"required": way.split()} for way in ways]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema, "title": "ctid experiment"}
@@ -155,9 +155,9 @@ def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Compl
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
     """Return the specification with the content hashes of its files filled in, and what is wrong with the files."""
-    sections: dict[tuple[str, ...], Any] = {("data",): spec.data, ("sampling",): spec.sampling}
-    if spec.data is None and spec.generator is not None:
-        sections |= dict([spec.generator])
+    sections: dict[KeyPath, Any] = {("data",): spec.data, ("sampling",): spec.sampling}
+    if spec.data is None:
+        sections |= spec.generators
     complaints: list[Complaint] = []
     for place, section in sections.items():
         if hasattr(section, "sha256") and not section.custom:
@@ -200,6 +200,7 @@ def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, any
 
 _SAMPLING = "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
 _MISSING = "is missing; data are simulated with system, excitation (or loop) and sampling"
+_OF_INPUTS = "is given for each input in inputs; leave it out, or give one system and excitation in place of inputs"
 _OF_SYSTEM = "belongs to a system, and there is none here; leave it out"
 _OF_SIGNAL = "belongs to a signal, and there is none here; leave it out"
 _OF_SIMULATION = "belongs to simulated data, and 'data' names a measured record; keep one of the two"
@@ -209,12 +210,18 @@ _OF_LOOP = "the loop makes the input; keep one of the two (a reference stands in
 EXPERIMENTS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "signal": (
         {"sampling": _SAMPLING},
-        dict.fromkeys(("system", "excitation", "loop", "data", "starts"), _OF_SYSTEM)
+        dict.fromkeys(("system", "excitation", "inputs", "loop", "data", "starts"), _OF_SYSTEM)
         | {"noise": f"{_OF_SYSTEM}; what is added to a signal is its disturbance"},
     ),
     "data": (
         {},
-        dict.fromkeys(("system", "excitation", "sampling", "noise"), _OF_SIMULATION) | {"disturbance": _OF_SIGNAL},
+        dict.fromkeys(("system", "excitation", "inputs", "sampling", "noise"), _OF_SIMULATION)
+        | {"disturbance": _OF_SIGNAL},
+    ),
+    "inputs": (
+        {"sampling": _MISSING},
+        dict.fromkeys(("system", "excitation"), _OF_INPUTS)
+        | {"loop": "closes around one input, and there are several here; leave it out", "disturbance": _OF_SIGNAL},
     ),
     "loop": (
         dict.fromkeys(("system", "sampling"), _MISSING),
@@ -267,6 +274,10 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
     if "data" in present:
         return ""
     parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
+    for name, content in _mapping(raw, "inputs").items():
+        section = (spec.inputs or {}).get(name)
+        given = content.get("excitation") if isinstance(content, Mapping) else None
+        parts[f"excitation of {name}"] = given, section and section.excitation
     parts["excitation of the loop"] = _mapping(raw, "loop").get("reference"), getattr(spec.loop, "reference", None)
     for name, (content, section) in parts.items():
         if content not in (None, "none") and not _draws_nothing(name.split()[0], content, section):

@@ -27,19 +27,20 @@ from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.system_sections import (
     AnySystemSection,
     ExcitationSection,
+    InputSection,
     LoopSection,
     StartsSection,
     loop_as_mapping,
 )
 from ctid_cli.specification.values import MAX_WHOLE, ByShape, Name, NotNegative, Number, Positive, Swept, Text, matching
-from ctid_cli.specification.yaml_source import YamlSource
+from ctid_cli.specification.yaml_source import KeyPath, YamlSource
 from ctid_cli.written_files import EXPERIMENT, why_unusable
 
 _EXPERIMENT = matching(
     EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
-#: Sections that data are simulated from; their lists combine to data cells.
+#: Sections that data are simulated from, besides those of several inputs; their lists combine to data cells.
 OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
 
 
@@ -49,6 +50,13 @@ def _usable(name: str) -> str:
     if why:
         raise wrong(f"{name!r} cannot be used here: {why}; choose another name")
     return name
+
+
+def _several_inputs(inputs: dict[str, InputSection]) -> dict[str, InputSection]:
+    """Refuse one input as several ones."""
+    if len(inputs) < 2:
+        raise wrong("inputs are two or more; of one input give system and excitation themselves")
+    return inputs
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -276,6 +284,8 @@ class Spec(Section):
         The system to simulate
     excitation : mapping, optional
         The input of the system, in open loop
+    inputs : mapping of mappings, optional
+        Several inputs by their names, in place of system and excitation, for example 'u1: {system: …, excitation: …}'
     loop : mapping, optional
         What makes the input from the output, in place of excitation
     signal : mapping, optional
@@ -306,6 +316,7 @@ class Spec(Section):
     experiment: Annotated[Text, _EXPERIMENT, AfterValidator(_usable)]
     system: AnySystemSection | None = None
     excitation: ExcitationSection | None = None
+    inputs: Annotated[dict[Name, InputSection], AfterValidator(_several_inputs)] | None = None
     loop: Annotated[LoopSection | None, BeforeValidator(loop_as_mapping)] = None
     signal: SignalSection | None = None
     disturbance: DisturbanceOrNone | None = None
@@ -344,13 +355,21 @@ class Spec(Section):
         return source
 
     @property
-    def generator(self) -> tuple[tuple[str, ...], Section] | None:
-        """Key path and section of what drives the simulation: the excitation, or the reference of the loop."""
-        if self.excitation is not None:
-            return ("excitation",), self.excitation
+    def of_data(self) -> dict[KeyPath, Section]:
+        """Sections that data are simulated from, by their key paths."""
+        inputs: dict[KeyPath, Any] = {}
+        for name, one in (self.inputs or {}).items():
+            inputs |= {("inputs", name, "system"): one.system, ("inputs", name, "excitation"): one.excitation}
+        sections = {(name,): getattr(self, name) for name in OF_DATA} | inputs
+        return {path: section for path, section in sections.items() if section is not None}
+
+    @property
+    def generators(self) -> dict[KeyPath, Section]:
+        """Sections of what drives the simulation, by their key paths: the inputs, or the reference of the loop."""
+        found = {path: section for path, section in self.of_data.items() if path[-1] == "excitation"}
         if self.loop is not None and self.loop.reference is not None:
-            return ("loop", "reference"), self.loop.reference
-        return None
+            found[("loop", "reference")] = self.loop.reference
+        return found
 
     @property
     def custom_measures(self) -> dict[str, CustomMeasureSection]:

@@ -71,8 +71,12 @@ def _combinations(section: Any) -> Iterator[tuple[dict[KeyPath, Any], Any]]:
 
 def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
     """Return a section with another value at a place in it."""
-    name = str(path[0])
-    inner = value if len(path) == 1 else replaced(getattr(section, name), path[1:], value)
+    name, rest = str(path[0]), path[1:]
+    own = getattr(section, name)
+    if rest and isinstance(own, Mapping):
+        inner: Any = {**own, rest[0]: replaced(own[rest[0]], rest[1:], value)}
+    else:
+        inner = replaced(own, rest, value) if rest else value
     return section.model_copy(update={name: inner})
 
 

@@ -11,6 +11,7 @@ from ctid_cli.canonical import content_hash
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.controller import ContinuousController, ContinuousPid, DiscreteController, Relay
+from ctid_cli.models.several_inputs import parameters_of
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Enters
 from ctid_cli.simulation.components import is_custom
@@ -136,6 +137,30 @@ class AdditiveSystemSection(AdditiveSection):
                 yield ("additive", k), f"{submodel.order} poles are too many; at most {MAX_ORDER} can be simulated"
 
 
+_OF_SEVERAL = "is for a system with one input; of several inputs give each its numerator, denominator and delay"
+
+
+class PartSection(SystemSection):
+    """The transfer function from one of several inputs to the output, strictly proper and stable."""
+
+    elsewhere = {"additive": _OF_SEVERAL, "kind": _OF_SEVERAL}  # noqa: RUF012 - of the base class
+
+
+class InputSection(Section):
+    """One of several inputs, and what it drives.
+
+    Parameters
+    ----------
+    system : mapping
+        Transfer function from this input to the output; the output is the sum over all inputs
+    excitation : mapping
+        This input
+    """
+
+    system: PartSection
+    excitation: ExcitationSection
+
+
 _LinearSystem = Annotated[Any, WithKey("additive", AdditiveSystemSection, SystemSection)]
 AnySystemSection = Annotated[Any, WithKey("kind", custom_form("system"), _LinearSystem)]
 
@@ -143,7 +168,7 @@ AnySystemSection = Annotated[Any, WithKey("kind", custom_form("system"), _Linear
 def truth_of(system: Variant) -> dict[str, float]:
     """Return what is true of a variant of the system; the name of an option of a custom one stands for its value."""
     if not is_custom(system.options):
-        return {"delay": system.options.delay, **system.options.parameters}
+        return parameters_of(system.options)
     truth = system.values["truth"].items()
     return {name: system.values[value] if isinstance(value, str) else value for name, value in truth}
 

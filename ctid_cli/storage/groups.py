@@ -14,6 +14,7 @@ import numpy as np
 
 from ctid_cli.arrays import Array, IndexArray
 from ctid_cli.inference import monte_carlo
+from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.manifest import Manifest, true_values
 from ctid_cli.storage.truth import Found
@@ -78,7 +79,7 @@ def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
     parts, given = [], _given_delays(groups, truths, found)
     for number, (values, errors, quantiles) in found.items():
         truth = truths[cells[number]]
-        kept = np.array([name != "delay" or groups["estimator"][number] not in given for name in truth], dtype=bool)
+        kept = np.array([(groups["estimator"][number], name) not in given for name in truth], dtype=bool)
         names, true = np.array([*truth], dtype=object)[kept], np.array([*truth.values()])[kept]
         values, errors, quantiles = values[:, kept], errors[:, kept], quantiles[:, kept]
         values[~monte_carlo.complete(values)] = np.nan
@@ -115,18 +116,20 @@ def errors_of_group(
     return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)))
 
 
-def _given_delays(groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]) -> set[int]:
-    """Return the places of the estimators whose delay is no estimate."""
-    delays: dict[int, list[Array]] = {}
+def _given_delays(
+    groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]
+) -> set[tuple[int, str]]:
+    """Return the places of estimators with the names of delays that are no estimates of theirs."""
+    delays: dict[tuple[int, str], list[Array]] = {}
     for number, (values, errors, _) in found.items():
         cell, estimator = groups.iloc[number, :2].tolist()
-        if "delay" in truths[cell]:
-            k = list(truths[cell]).index("delay")
-            delays.setdefault(estimator, []).append(np.array([values[:, k], errors[:, k]]))
+        for k, name in enumerate(truths[cell]):
+            if is_delay(name):
+                delays.setdefault((estimator, name), []).append(np.array([values[:, k], errors[:, k]]))
     given = set()
-    for estimator, parts in delays.items():
+    for place, parts in delays.items():
         values, errors = np.hstack(parts)
         known = values[np.isfinite(values)]
         if np.isnan(errors).all() and (known == known[:1]).all():
-            given.add(estimator)
+            given.add(place)
     return given

@@ -5,6 +5,8 @@ that made them. A shard is the part of a plan that one of several runs computes:
 place in the plan and the number of shards alone, and what is dealt stays where it is when ``runs`` is raised.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import re
@@ -12,11 +14,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import lcm
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, Self
 
 from ctid_cli.errors import UsageError
 from ctid_cli.storage import columns
 from ctid_cli.written_files import EXPERIMENT
+
+if TYPE_CHECKING:
+    from ctid_cli.models.additive import AdditiveModel
+    from ctid_cli.models.several_inputs import MultiInputModel
+    from ctid_cli.models.transfer_function import TransferFunction
 
 Manifest = dict[str, Any]
 #: Estimates that one plan may ask for.
@@ -234,22 +241,35 @@ def swept_names(manifest: Manifest) -> list[str]:
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
-def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
-    """Return True values of the system that a data cell simulates, by name; empty for a measured record or a signal.
-
-    ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
-    parameters of the submodels of a sum, and its delay; the true values that a custom system gives.
-    """
+def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | MultiInputModel | None:
+    """Return the system that a data cell simulates; None for a custom one, a measured record or a signal."""
     from ctid_cli.models.additive import AdditiveModel, Submodel
+    from ctid_cli.models.several_inputs import MultiInputModel
     from ctid_cli.models.transfer_function import TransferFunction
 
-    system = cell["content"].get("system")
-    if not system:
-        return {}
+    content = cell["content"]
+    if inputs := content.get("inputs"):
+        return MultiInputModel.of({name: TransferFunction(**one["system"]) for name, one in inputs.items()})
+    system = content.get("system") or {}
+    # An option of a custom system may be called delay.
     if "additive" in system:
-        values = AdditiveModel([Submodel(**item) for item in system["additive"]]).sorted().parameters
-    elif "denominator" in system:
-        values = TransferFunction(system["numerator"], system["denominator"]).parameters
-    else:
-        return dict(system.get("truth") or {})
-    return values | {"delay": float(system.get("delay") or 0.0)}
+        parts = [Submodel(**item) for item in system["additive"]]
+        return AdditiveModel(parts, float(system.get("delay") or 0.0))
+    if "denominator" in system:
+        return TransferFunction(system["numerator"], system["denominator"], float(system.get("delay") or 0.0))
+    return None
+
+
+def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
+    """Return true values of the system that a data cell simulates, by name; empty for a measured record or a signal.
+
+    ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
+    parameters of the submodels of a sum, and its delay; those of several inputs; what a custom system gives.
+    """
+    from ctid_cli.models.additive import AdditiveModel
+    from ctid_cli.models.several_inputs import parameters_of
+
+    model = true_system(cell)
+    if model is None:
+        return dict((cell["content"].get("system") or {}).get("truth") or {})
+    return parameters_of(model.sorted() if isinstance(model, AdditiveModel) else model)

@@ -10,12 +10,13 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 from ctid_cli.errors import UsageError
-from ctid_cli.models.additive import AdditiveModel, Submodel
+from ctid_cli.models.additive import AdditiveModel
 from ctid_cli.models.distances import h2_distance, hinf_distance, matched_poles, response_distance
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.storage.estimates import Estimates
 from ctid_cli.storage.groups import errors_of_group
+from ctid_cli.storage.manifest import true_system
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -25,14 +26,11 @@ Distance = Callable[[TransferFunction, TransferFunction], float]
 
 def system_of(cell: Mapping[str, Any], name: str) -> TransferFunction:
     """Return the system that a data cell simulates, as one fraction, for a measure that needs it."""
-    system = cell["content"].get("system") or {}
-    if "additive" in system:
-        parts = [Submodel(**item) for item in system["additive"]]
-        model = unfactored(AdditiveModel(parts, float(system.get("delay") or 0.0)))
-    elif "denominator" in system:
-        model = TransferFunction(system["numerator"], system["denominator"], float(system.get("delay") or 0.0))
-    else:
-        raise UsageError(f"{name} needs a linear system of poles and zeros that is simulated, and there is none here")
+    system = true_system(cell)
+    model = unfactored(system) if isinstance(system, AdditiveModel) else system
+    if not isinstance(model, TransferFunction):
+        what = "with one input that is simulated"
+        raise UsageError(f"{name} needs a linear system of poles and zeros {what}, and there is none here")
     if name in ("h2", "hinf") and not model.is_stable:
         raise UsageError(f"{name} is infinite for a system that integrates; use response:FREQUENCY")
     return model

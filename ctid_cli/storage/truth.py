@@ -2,7 +2,8 @@
 
 An estimate has *converged* if it satisfies every condition of the specification's ``success``:
 
-- ``delay_relative_error``: the estimated delay differs from the true one by at most this fraction of it;
+- ``delay_relative_error``: the estimated delay, or that of each input, differs from the true one by at most this
+  fraction of it;
 - ``fit_percent``: the fit on the record it was estimated from is at least this [%];
 - ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
 - ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ctid_cli.arrays import Array, BoolArray, IndexArray
+from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.storage import columns
 from ctid_cli.storage.column_arrays import AnyArray, ColumnWriter, names_of
 
@@ -68,7 +70,7 @@ def found_under(names: Sequence[str], arrays: Mapping[str, AnyArray], count: int
     values, errors, quantiles = (_by_name(name, arrays) for name in ("parameters", "standard_errors", "quantiles"))
     if "delay" in arrays:
         values["delay"] = arrays["delay"]
-    poles, zeros = _count("a", names), _count("b", names)
+    poles, zeros = coefficients_of("a", names), coefficients_of("b", names)
     if poles and "numerator" in arrays:
         lengths = arrays["numerator_length"]
         alike = (arrays["denominator_length"] == poles + 1) & (lengths >= 0)
@@ -80,9 +82,38 @@ def found_under(names: Sequence[str], arrays: Mapping[str, AnyArray], count: int
             longest = np.maximum(lengths, np.sum(own, axis=0, dtype=int) if own else 0)
             for numbers in (errors, quantiles):
                 _shift_numerator(numbers, alike, longest - zeros, zeros)
+    if prefixes := [name.removesuffix("delay") for name in names if name.endswith("_delay")]:
+        _align_inputs(names, prefixes, values, errors, quantiles, count)
     none = np.full(count, np.nan)
     wanted = [[numbers.get(name, none) for name in names] for numbers in (values, errors, quantiles)]
     return Found(*(np.array(some, dtype=np.float64).reshape(len(names), count).T for some in wanted))
+
+
+def _align_inputs(
+    names: Sequence[str],
+    prefixes: Sequence[str],
+    values: dict[str, Array],
+    errors: dict[str, Array],
+    quantiles: dict[str, Array],
+    count: int,
+) -> None:
+    """Put coefficients of several inputs under the true names, whose prefixes are those of the inputs."""
+
+    def known(start: str) -> IndexArray:
+        there = [np.isfinite(own) for name, own in values.items() if re.fullmatch(rf"{re.escape(start)}\d+", name)]
+        return np.asarray(np.sum([np.zeros(count, dtype=int), *there], axis=0, dtype=int))
+
+    alike = np.ones(count, dtype=bool)
+    for prefix in ("", *prefixes):
+        alike &= known(f"{prefix}a") == coefficients_of(f"{prefix}a", names)
+    for prefix in prefixes:
+        true = coefficients_of(f"{prefix}b", names)
+        shifts = known(f"{prefix}b") - true
+        for numbers in (values, errors, quantiles):
+            _shift_numerator(numbers, alike, shifts, true, prefix)
+    for name in names:
+        if not is_delay(name) and name in values:
+            values[name] = np.where(alike, values[name], np.nan)
 
 
 def _by_name(name: str, arrays: Mapping[str, AnyArray]) -> dict[str, Array]:
@@ -90,9 +121,9 @@ def _by_name(name: str, arrays: Mapping[str, AnyArray]) -> dict[str, Array]:
     return dict(zip(arrays[names_of(name)], arrays[name].T, strict=True)) if name in arrays else {}
 
 
-def _count(letter: str, names: Iterable[str]) -> int:
-    """Return how many of some names are those of coefficients."""
-    return sum(re.fullmatch(rf"{letter}\d+", name) is not None for name in names)
+def coefficients_of(letter: str, names: Iterable[str]) -> int:
+    """Return how many of some names are those of coefficients: a letter, or a prefix and a letter, and a number."""
+    return sum(re.fullmatch(rf"{re.escape(letter)}\d+", name) is not None for name in names)
 
 
 def _add_coefficients(
@@ -108,14 +139,16 @@ def _add_coefficients(
         values[f"b{k}"] = np.where(alike, np.where(places < 0, 0.0, own), values.get(f"b{k}", none))
 
 
-def _shift_numerator(numbers: dict[str, Array], alike: BoolArray, shifts: IndexArray, zeros: int) -> None:
+def _shift_numerator(
+    numbers: dict[str, Array], alike: BoolArray, shifts: IndexArray, zeros: int, prefix: str = ""
+) -> None:
     """Put numbers of coefficients ``b`` under the true names, which are shifted by a number of powers in each model."""
     none, own = np.full(len(alike), np.nan), dict(numbers)
     for k in range(zeros):
-        found = own.get(f"b{k}", none)
+        found = own.get(f"{prefix}b{k}", none)
         for shift in np.unique(shifts[alike]).tolist():
-            found = np.where(alike & (shifts == shift), own.get(f"b{k + shift}", none), found)
-        numbers[f"b{k}"] = found
+            found = np.where(alike & (shifts == shift), own.get(f"{prefix}b{k + shift}", none), found)
+        numbers[f"{prefix}b{k}"] = found
 
 
 def failures(arrays: Mapping[str, AnyArray]) -> BoolArray:
@@ -133,11 +166,10 @@ def judged(
     """Return which estimates satisfy the rule of success, from their values under the true names; None without one."""
     rule, found = success or {}, dict(zip(truth, values.T, strict=True))
     conditions: list[BoolArray] = []
-    if rule.get("delay_relative_error") is not None and "delay" in truth:
-        conditions.append(_near(found["delay"], truth["delay"], rule["delay_relative_error"]))
-    others = truth.keys() - {"delay"}
-    if rule.get("parameter_relative_error") is not None and others:
-        conditions += [_near(found[name], truth[name], rule["parameter_relative_error"]) for name in others]
+    for name in truth:
+        tolerance = rule.get("delay_relative_error" if is_delay(name) else "parameter_relative_error")
+        if tolerance is not None:
+            conditions.append(_near(found[name], truth[name], tolerance))
     if rule.get("band") is not None and measures is not None:
         from ctid_cli.simulation.frequency_measures import is_settled
 

@@ -38,6 +38,9 @@ def folder(tmp_path_factory):
     )
     y[50:53] = np.nan
     write(folder / "missing-loop.csv", (t, u, y, r, v), header)
+    times, first, output = values[:300, 0], values[:300, 1], values[:300, 2]
+    second = np.roll(first, 17)
+    write(folder / "inputs.csv", (times, first, second, first - second, output, output), "t,u1,u2,u3,y,y2")
     w = np.geomspace(0.1, 10.0, 40)
     response = 2.0 / (1j * w + 2.0)
     columns = (w / (2 * np.pi), response.real, response.imag)

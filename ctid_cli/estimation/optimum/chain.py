@@ -166,11 +166,6 @@ def all_numerators(rows: Rows) -> Array:
     return block_diagonal([numerators(*own) for own in rows])
 
 
-def form_of(rows: Rows, length: float) -> "Form":
-    """Return the form in which sections are filtered over a record of some length [s]."""
-    return forms_of(rows, [slice(None)], length)[0]
-
-
 def forms_of(rows: Rows, channels: Sequence[slice], length: float) -> list["Form"]:
     """Return the form of the sections that each channel drives; one kind of all, so that they pass records together."""
     modal = all(_apart(poles_of(*own), length) for own in rows)

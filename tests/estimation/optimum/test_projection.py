@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 from ctid_cli.estimation.optimum import chain
 from ctid_cli.estimation.optimum.arrangement import with_one_denominator
 from ctid_cli.estimation.optimum.box import Box, point_of
-from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, form_of, numerators, poles_of
+from ctid_cli.estimation.optimum.chain import Chain, Modal, chain_dynamics, forms_of, numerators, poles_of
 from ctid_cli.estimation.optimum.projection import Problem, project, slopes
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of, triangle_of
 from ctid_cli.filtering.filter_data import filter_data
@@ -145,7 +145,7 @@ def test_double_poles_are_no_special_case():
 @pytest.mark.parametrize("length", [100.0, 1e-6])
 def test_states_and_slopes_have_the_transfer_functions_that_they_claim(length):
     # Within a very short record all responses overlap.
-    form, rows = form_of([(SPEED, DAMPING)], length), numerators(SPEED, DAMPING)
+    form, rows = forms_of([(SPEED, DAMPING)], [slice(None)], length)[0], numerators(SPEED, DAMPING)
     assert isinstance(form, Modal if length > 1.0 else Chain)
     output, direct = np.array([0.3, -0.2, 0.5, 1.0]), np.array([0.7])
     for s in (0.3j, 1.0 + 2.0j, 5.0j):
@@ -179,7 +179,7 @@ def test_poles_of_a_section_meet_and_part():
 @pytest.mark.parametrize("damping", [1.0, 0.3])
 def test_a_long_record_is_filtered_piece_by_piece(monkeypatch, regular, damping):
     data = filter_data(record_of(MODEL, np.random.default_rng(3), samples=400, regular=regular))
-    form = form_of([(np.array([2.0]), np.array([damping]))], 100.0)
+    form = forms_of([(np.array([2.0]), np.array([damping]))], [slice(None)], 100.0)[0]
     columns = Columns.of(with_one_denominator(2, 0, 0, (0,)), False, True, (0,))
     (whole,) = rows_of([form], columns, Delay(0.8, -1), data, 0.0)
     monkeypatch.setattr(chain, "PIECE", 37)
