@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked
+from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked, written_out
 from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def cell(value: Any, form: str = ".6g") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return format(value, form) if math.isfinite(value) else "-"
+        return written_out(format(value, form)) if math.isfinite(value) else "-"
     return "-" if value is None else str(value)
 
 

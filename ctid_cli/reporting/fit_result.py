@@ -28,10 +28,9 @@ from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
 from ctid_cli.reporting.fit_plot import FitFigures
-from ctid_cli.reporting.inputs_plot import inputs_drawing
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.model_plot import figure_chapters
-from ctid_cli.reporting.pages.page import Chapter, PagedResult
+from ctid_cli.reporting.model_plot import figure_chapters, inputs_drawing
+from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
@@ -129,8 +128,8 @@ class FitResult(PagedResult):
         lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
         lead += count(fit.count, "sample")
         if validation is not None:
-            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
-        title = "Fit of " + ", ".join(record.name or "a record" for record in self.records.data)
+            lead += f"; {number(validation.fit_percent, 4)} % on {shown(validation.name)}, which it was not made from"
+        title = "Fit of " + ", ".join(shown(record.name) or "a record" for record in self.records.data)
         return title, f"{lead}. {fit.status.value}"
 
     def chapters(self) -> Iterator[Chapter]:
@@ -223,9 +222,9 @@ class FitResult(PagedResult):
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
-            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
-            text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
-            yield "validation", text
+            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on "
+            text += f"{shown(validation.name)}, {count(validation.count, 'sample')}"
+            yield "validation", f"{text}; initial state and offset of its own"
             for k in self.predicted:
                 assert fit.noise is not None
                 yield f"  {k} ahead", f"fit {number(validation.prediction_fit(fit.noise, k), 5)} % of predictions"
@@ -326,7 +325,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
     columns = f"input{'s' * record.several} {units.column(measurement, 'input')}, "
     columns += f"output {units.column(measurement, 'output')}"
-    return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
+    return f"{shown(record.name)}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
 def _before(result: Identification, state: str) -> str:

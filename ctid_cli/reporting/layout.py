@@ -97,9 +97,13 @@ def with_error(value: float, error: float) -> str:
 
 
 def _to_digits(value: float, digits: int) -> str:
-    """A number with its trailing zeros: 0.0400, 2.0, 26, 130; as 1.3e+07 where it has many digits that say nothing."""
-    text = f"{value:#.{digits}g}".removesuffix(".")
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+    """A number with its trailing zeros: 0.0400, 2.0, 26, 130."""
+    return written_out(f"{value:#.{digits}g}".removesuffix("."))
+
+
+def written_out(text: str) -> str:
+    """A number below a million without an exponent: 1300, not 1.3e+03."""
+    return f"{float(text):.0f}" if "e+" in text and abs(float(text)) < 1e6 else text
 
 
 def rate(speed: float) -> str:
