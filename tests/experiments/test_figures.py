@@ -17,8 +17,6 @@ CASE_1, CASE_2 = useful_redundancy.CASE_1, useful_redundancy.CASE_2
 COARSE = np.unique(np.concatenate([np.arange(0.0, 15.1, 0.5), np.linspace(7.4, 8.8, 8)]))
 
 
-
-
 class Recorder:
     """Axes in place of matplotlib's that keep what is drawn."""
 
@@ -46,12 +44,6 @@ def quiet():
 def switching():
     """One step on each path: the search has to change the filter."""
     return computed(CASE_2, True, np.array([0.0, 4.0, 7.9, 7.98, 8.0, 8.02, 8.1, 12.0, 15.0]), max_iterations=1)
-
-
-
-
-
-
 
 
 @pytest.mark.parametrize("name", ["quiet", "switching"])
@@ -85,8 +77,6 @@ def test_stars_are_drawn_where_the_search_switched(switching):
     ((x, y),) = axes.lines["$J_0$, least over the coefficients"]
     assert np.array_equal(x, switching.delays)
     assert np.array_equal(y, switching.members.mean(axis=1))
-
-
 
 
 @pytest.mark.parametrize(
@@ -139,8 +129,6 @@ def test_labels_keep_their_distance_and_order():
     assert places.sum() == pytest.approx(values.sum())
     assert places[-1] == 10.0
     assert spread(places, 1.0) == pytest.approx(places)
-
-
 
 
 def test_outline_of_a_long_curve_keeps_its_peaks_and_its_gaps():

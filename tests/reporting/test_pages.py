@@ -82,8 +82,6 @@ def test_published_markdown_is_read_back():
     assert table.frame.equals(frame)
 
 
-
-
 def test_a_table_that_is_too_wide_goes_on_below_with_what_tells_its_rows_apart():
     frame = pd.DataFrame(
         {"SNR": ["5 dB", "", "15 dB"], "start": ["3 s", "7 s", "3 s"], "%": [1, 2, 3], "time": [4, 5, 6]}
