@@ -105,8 +105,11 @@ class Result(ABC):
         return {"schema": self.schema, **content} if self.schema and isinstance(content, dict) else content
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the main table of the result."""
-        return next(section.frame for section in self.sections() if section.frame is not None)
+        """Return the main table of the result; one row of its content where there is none."""
+        import pandas as pd
+
+        frames = [section.frame for section in self.sections() if section.frame is not None]
+        return frames[0] if frames else pd.DataFrame([self.content()])
 
     def plot(self) -> Figure:
         """Draw the main figure of the result."""

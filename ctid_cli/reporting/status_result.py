@@ -276,10 +276,6 @@ class MergeResult(Result):
         """Return what was made for JSON."""
         return asdict(self.merged) | {"folder": str(self.merged.folder)}
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row."""
-        return pd.DataFrame([self.content()])
-
 
 @dataclass(frozen=True, eq=False)
 class ValidationResult(Result):
@@ -306,7 +302,3 @@ class ValidationResult(Result):
     def content(self) -> dict[str, Any]:
         """Return the counts for JSON."""
         return asdict(self) | {"file": str(self.file)}
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row."""
-        return pd.DataFrame([self.content()])
