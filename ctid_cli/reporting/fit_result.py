@@ -139,9 +139,10 @@ class FitResult(PagedResult):
 
     def chapters_of_numbers(self) -> Iterator[Chapter]:
         """Return data and model."""
-        equations = []
+        equations, additive = [], additive_of(self.fitted.fit)
         for name, model in zip(models_of(self.fitted), fractions_of(self.fitted.fit.model), strict=True):
-            terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+            parts = [(model, 0)] if additive is None else [(part, part.integrators) for part in additive.submodels]
+            terms = [(part.numerator.tolist(), part.denominator.tolist(), poles) for part, poles in parts]
             equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
             equations.append(f"Response to {name}: {equation}" if name else equation)
         quality = Section("How good it is", frame=pairs(self.quality()))
@@ -191,7 +192,10 @@ class FitResult(PagedResult):
         signals = list(first.record.held.values())
         for hold, text, signal in zip(holds, first.record.hold_options, signals, strict=False):
             of, _, _ = text.rpartition("=")
-            yield f"input {of}".strip(), f"{HOLDS[hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
+            yield (
+                f"input {of}" if of else "inputs" if first.record.several else "input",
+                f"{HOLDS[hold]} (--hold {text}){_unknown_ends(signal, options, units)}",
+            )
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
