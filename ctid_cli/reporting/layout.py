@@ -37,8 +37,9 @@ WORDS = 32
 
 
 def marked(text: str) -> str:
-    """Escape a text, in which backquotes mark names and commands."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+    """Escape a text, in which backquotes mark names and commands; a p-value and an interval are not broken."""
+    kept = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text).replace(" -+ ", " ±\u00a0")
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(kept))
 
 
 def html_paragraphs(sentences: Sequence[str], style: str = "") -> str:
