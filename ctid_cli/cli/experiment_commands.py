@@ -227,7 +227,7 @@ def _intention(work: Workload, folder: Path) -> str:
 
 def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     from ctid_cli.reporting.results import out_option
-    from ctid_cli.reporting.status_result import precision_lines
+    from ctid_cli.reporting.status_result import precision_sentence
     from ctid_cli.reporting.study import tables_of
 
     stored, option = summary.reused + summary.computed, out_option(out)
@@ -237,7 +237,8 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
         lines.append(f"  older results are now in {summary.moved_aside}")
     if summary.mixed:
         lines.append("  they mix code versions or processors, which tables will say")
-    lines += [f"  {line}" for line in precision_lines(summary.precision)]
+    if precision := precision_sentence(summary.precision):
+        lines.append(f"  {precision}")
     if summary.failed:
         lines.append(f"  {summary.failed} failed; to see why: ctid status {summary.experiment}{option}")
     if summary.stopped_by is not None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 from ctid_cli.cli._common import span
 from ctid_cli.cli._options import flag
@@ -37,7 +37,6 @@ DIRECT = (
 )
 #: One transfer function, or a sum of submodels.
 ModelForm = Literal["fraction", "additive"]
-T = TypeVar("T")
 FormOption = Annotated[ModelForm, flag("--model", "One transfer function, or a sum of submodels.")]
 #: Numbers of second-order submodels that a sum is chosen from.
 MODES = 1, 6
@@ -45,34 +44,6 @@ HoldOption = Annotated[AskedHold, flag("--hold", "Input between its samples; els
 
 
 # --- options ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class PerInput(Generic[T]):
-    """What an option says of all inputs, and of single ones."""
-
-    shared: T | None
-    own: dict[str, T]
-
-
-def per_input(option: str, given: Sequence[str] | None, read: Callable[[str], T]) -> PerInput[T]:
-    """Read an option that is given for all inputs, or as INPUT=VALUE for single ones."""
-    shared: T | None = None
-    own: dict[str, T] = {}
-    for text in given or ():
-        name, equals, value = (part.strip() for part in text.rpartition("="))
-        try:
-            found = read(value)
-        except ValueError:
-            what = f"{option} must be a whole number, or INPUT=NUMBER for one of several inputs"
-            raise UsageError(f"{what}; got {text!r}") from None
-        if (equals and name in own) or (not equals and shared is not None):
-            raise UsageError(f"{option} is given twice{f' for {name}' * bool(equals)}; give it once")
-        if equals:
-            own[name] = found
-        else:
-            shared = found
-    return PerInput(shared, own)
 
 
 def delay_range(text: str) -> tuple[float, float]:
@@ -86,11 +57,35 @@ def delay_range(text: str) -> tuple[float, float]:
 
 def read_hold(text: str) -> AskedHold:
     """Read how an input behaves between its samples."""
-    found = next((hold for hold in get_args(AskedHold) if hold == text), None)
-    if found is None:
-        allowed = f"{', '.join(get_args(AskedHold))}, or INPUT=HOLD for one of several inputs"
-        raise UsageError(f"--hold must be one of {allowed}; got {text!r}")
-    return cast(AskedHold, found)
+    if text in get_args(AskedHold):
+        return cast(AskedHold, text)
+    allowed = f"{', '.join(get_args(AskedHold))}, or INPUT=HOLD for one of several inputs"
+    raise UsageError(f"--hold must be one of {allowed}; got {text!r}")
+
+
+def per_input(option: str, given: Sequence[str] | None) -> dict[str, Any]:
+    """Read an option that is given for single inputs, INPUT=VALUE, or for all: that is the value without a name."""
+    found: dict[str, Any] = {}
+    for text in given or ():
+        name, _, value = (part.strip() for part in text.rpartition("="))
+        if name in found:
+            raise UsageError(f"{option} is given twice{f' for {name}' * bool(name)}; give it once")
+        try:
+            found[name] = OF_INPUTS[option](value)
+        except ValueError:
+            what = f"{option} must be a whole number, or INPUT=NUMBER for one of several inputs"
+            raise UsageError(f"{what}; got {text!r}") from None
+    return found
+
+
+#: Options that single inputs may have, and how their values are read.
+OF_INPUTS: dict[str, Callable[[str], Any]] = {
+    "--poles": int,
+    "--zeros": int,
+    "--delay": delay_range,
+    "--integrators": int,
+    "--hold": read_hold,
+}
 
 
 @dataclass(frozen=True)
@@ -109,12 +104,12 @@ class StructureOptions:
     @property
     def bounds(self) -> tuple[float, float] | None:
         """Range of the delay, a known one twice; None where it is not given for all inputs."""
-        return per_input("--delay", self.delays, delay_range).shared
+        return per_input("--delay", self.delays).get("")
 
     @property
     def integrators(self) -> int | None:
         """Poles at the origin; None where they are not given for all inputs."""
-        return per_input("--integrators", self.each_integrators, int).shared
+        return per_input("--integrators", self.each_integrators).get("")
 
 
 @dataclass(frozen=True)
@@ -214,12 +209,12 @@ class ModelOptions(StructureOptions):
     @property
     def poles(self) -> int | None:
         """Number of poles; None where it is not given for all inputs."""
-        return per_input("--poles", self.each_poles, int).shared
+        return per_input("--poles", self.each_poles).get("")
 
     @property
     def zeros(self) -> int | None:
         """Number of zeros; None where it is not given for all inputs."""
-        return per_input("--zeros", self.each_zeros, int).shared
+        return per_input("--zeros", self.each_zeros).get("")
 
 
 @dataclass(frozen=True)
@@ -302,16 +297,22 @@ class Asked:
     inputs: tuple[str, ...] = ()
 
     @property
+    def each(self) -> dict[str, dict[str, Any]]:
+        """What is given of single inputs, and of all, by option."""
+        model = self.model
+        texts = model.each_poles, model.each_zeros, model.delays, model.each_integrators, self.treatment.each_hold
+        return {option: per_input(option, given) for option, given in zip(OF_INPUTS, texts, strict=True)}
+
+    @property
     def hold(self) -> AskedHold | tuple[Hold, ...]:
         """How the inputs behave between their samples; where one is given by itself, that of each."""
-        given = per_input("--hold", self.treatment.each_hold, read_hold)
-        if not given.own:
-            return given.shared or "auto"
-        each = [given.own.get(name, given.shared or "zoh") for name in self.inputs]
-        found = tuple(hold for hold in each if hold != "auto")
-        if len(found) < len(each):
+        given = self.each["--hold"]
+        if not {*given} - {""}:
+            return cast(AskedHold, given.get("", "auto"))
+        holds = tuple(given.get(name, given.get("", "zoh")) for name in self.inputs)
+        if "auto" in holds:
             raise UsageError("--hold auto chooses one for all inputs; give INPUT=zoh, foh or band-limited")
-        return found
+        return holds
 
     @property
     def simulated(self) -> bool:
@@ -405,7 +406,7 @@ def _given(asked: Asked) -> Given:
     treatment = asked.treatment
     model = with_delays(asked.model, asked.inputs)
     bounds = model.parameter_bounds
-    inputs = inputs_of(model, asked.inputs)
+    inputs = inputs_of(replace(asked, model=model))
     own_poles = [one.poles for one in inputs or () if one.poles is not None]
     own_zeros = any(one.zeros is not None for one in inputs or ())
     poles = model.poles if model.poles is not None else max(own_poles, default=None)
@@ -437,45 +438,35 @@ def given_of(structure: StructureOptions, treatment: TreatmentOptions, hold: Ask
     )
 
 
-def inputs_of(model: ModelOptions, names: Sequence[str]) -> tuple[InputModel, ...] | None:
+def inputs_of(asked: Asked) -> tuple[InputModel, ...] | None:
     """Return what is given of each of several inputs."""
     from ctid_cli.estimators.delay_profile import InputModel
 
-    each: dict[str, PerInput[Any]] = {
-        "poles": per_input("--poles", model.each_poles, int),
-        "zeros": per_input("--zeros", model.each_zeros, int),
-        "delay_bounds": per_input("--delay", model.delays, delay_range),
-        "integrators": per_input("--integrators", model.each_integrators, int),
-    }
-    if not names:
+    if not asked.inputs:
         return None
-    poles = each["poles"]
-    missing = [name for name in names if name not in poles.own]
-    if poles.own and poles.shared is None and missing:
-        raise UsageError(f"--poles is given for {', '.join(poles.own)} and not for {', '.join(missing)}")
+    own = asked.each
+    poles = [name for name in own["--poles"] if name]
+    missing = [name for name in asked.inputs if name not in poles]
+    if poles and asked.model.poles is None and missing:
+        raise UsageError(f"--poles is given for {', '.join(poles)} and not for {', '.join(missing)}")
+    options = {"poles": "--poles", "zeros": "--zeros", "delay_bounds": "--delay", "integrators": "--integrators"}
     return tuple(
-        InputModel(name, **{field: one.own[name] for field, one in each.items() if name in one.own}) for name in names
+        InputModel(name, **{field: own[option][name] for field, option in options.items() if name in own[option]})
+        for name in asked.inputs
     )
 
 
 def _refuse_inputs(asked: Asked) -> None:
     """Options of single inputs that the record does not have, and what is not available for several."""
-    model = asked.model
-    for option, texts in (
-        ("--poles", model.each_poles),
-        ("--zeros", model.each_zeros),
-        ("--delay", model.delays),
-        ("--integrators", model.each_integrators),
-        ("--hold", asked.treatment.each_hold),
-    ):
-        for text in texts or ():
-            name, equals, _ = text.rpartition("=")
-            if equals and name not in asked.inputs:
-                named = f"the inputs are {', '.join(asked.inputs)}" if asked.inputs else "name several with --input"
-                raise UsageError(f"{option} {text} is for an input {name!r}; {named}")
-    if len(asked.inputs) > 1 and asked.model.model == "additive":
+    for option, values in asked.each.items():
+        for name in {*values} - {"", *asked.inputs}:
+            named = f"the inputs are {', '.join(asked.inputs)}" if asked.inputs else "name several with --input"
+            raise UsageError(f"{option} is given for {name!r}, which is no input; {named}")
+    if not asked.inputs:
+        return
+    if asked.model.model == "additive":
         raise UsageError("--model additive has one input; give one --input, or drop --model")
-    if len(asked.inputs) > 1 and asked.loop != "none":
+    if asked.loop != "none":
         raise UsageError(
             "a record in a loop is fitted with one input; give one --input, or drop --loop and --reference"
         )

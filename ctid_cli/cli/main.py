@@ -7,13 +7,11 @@ import typer
 
 import ctid_cli
 from ctid_cli.cli._common import Command, ComputingCommand
-from ctid_cli.cli.check_command import check
-from ctid_cli.cli.compare_command import compare
 from ctid_cli.cli.experiment_commands import accuracy, init, run, schema, validate
 from ctid_cli.cli.fit_command import fit
-from ctid_cli.cli.frf_command import frf
 from ctid_cli.cli.order_command import order
 from ctid_cli.cli.page_commands import figure, report
+from ctid_cli.cli.record_commands import check, compare, frf
 from ctid_cli.cli.reproduce_command import reproduce
 from ctid_cli.cli.result_commands import export, merge, status, table, verify
 from ctid_cli.cli.track_command import track

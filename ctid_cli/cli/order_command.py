@@ -20,6 +20,7 @@ from ctid_cli.cli.fit_structure import (
     TreatmentOptions,
     as_usage_errors,
     given_of,
+    per_input,
 )
 from ctid_cli.cli.response_fit import frequency_files
 from ctid_cli.errors import UsageError
@@ -56,6 +57,9 @@ def order(
             f"{files[0]} is a frequency response: its structure is given, not chosen; use ctid fit --poles"
         )
     _refuse_other_form(model, poles=poles, zeros=zeros, modes=modes)
+    for option, texts in (("--delay", structure.delays), ("--integrators", structure.each_integrators)):
+        if per_input(option, texts).keys() - {""}:
+            raise UsageError(f"{option} INPUT=VALUE is for ctid fit; structures are ranked with one for all inputs")
     ranges = _range("--poles", poles, int(not structure.integrators)), _range("--zeros", zeros, 0)
     given = replace(given_of(structure, treatment, hold), poles=ranges[0], zeros=ranges[1])
     if model == "additive":

@@ -12,6 +12,7 @@ from ctid_cli.inference.response_test import ResponseTest
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import AskedHold, Hold, InitialState, InputBefore, LossKind, Offset
+from ctid_cli.text import probability
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class Choice:
         evidence = f" {self.answer.evidence}" if self.answer.explained == self.answer.explained else ""
         return (
             "There is no model here: the output is not seen to answer to the input "
-            f"(p = {self.answer.p_value:.2g}).{evidence}"
+            f"({probability(self.answer.p_value)}).{evidence}"
         )
 
     def words(self) -> list[str]:

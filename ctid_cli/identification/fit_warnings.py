@@ -16,7 +16,7 @@ from ctid_cli.inference.signal_features import growth_time, residual_outliers, s
 from ctid_cli.inference.uncertainty import Uncertainty
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.record import Record
-from ctid_cli.text import count, listed
+from ctid_cli.text import count, listed, probability
 
 #: Sentences that are printed.
 MOST = 5
@@ -79,7 +79,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     named = [FitWarning(_observed(remedy, found, time_unit), remedy) for remedy in tried.remedies]
     mended = {remedy.kind for remedy in tried.remedies}
     if not seen:
-        no_model = f"No model: the output is not seen to respond to the input (p = {found.answer.p_value:.2g})"
+        no_model = f"No model: the output is not seen to respond to the input ({probability(found.answer.p_value)})"
         return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
     others = list(_of_residuals(found, mended, time_unit))
     if not named:
@@ -133,7 +133,7 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
         return ""
     of = f" of experiment {record + 1}" * (len(found.records) > 1)
     which = f" {names[name]}" * (len(names) > 1)
-    return f"The residuals{of} depend on the input{which}{', most on later values' * later} (p = {p:.2g})"
+    return f"The residuals{of} depend on the input{which}{', most on later values' * later} ({probability(p)})"
 
 
 def _outliers(found: Identification, time_unit: str) -> str:
@@ -203,7 +203,7 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
         # Dynamics that are missed may leave something for later inputs to tell.
         if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
             what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
-            yield f"{what} (p = {seen.feedback_p_value:.1g}), as in a loop, where noise biases the estimate"
+            yield f"{what} ({probability(seen.feedback_p_value)}), as in a loop, where noise biases the estimate"
 
 
 def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
@@ -219,7 +219,7 @@ def _of_noise(fit: MeasuredFit) -> Iterator[str]:
     """That the estimate depends on how the noise is modelled."""
     if fit.noise is not None and fit.noise.differs:
         what = "The output-error fit and the fit with the noise model differ by more than chance gives"
-        found = f"(Hausman's test, p = {fit.noise.test.p_value:.2g})"
+        found = f"(Hausman's test, {probability(fit.noise.test.p_value)})"
         yield f"{what} {found}: the model of the plant or of the noise is too small"
 
 

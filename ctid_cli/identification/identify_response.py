@@ -11,7 +11,7 @@ from ctid_cli.inference.criteria import information_criteria, r_t_squared, young
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
 from ctid_cli.signals.frequency_data import FrequencyData
-from ctid_cli.text import count
+from ctid_cli.text import count, probability
 
 
 def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -> Identification:
@@ -80,15 +80,13 @@ def _answer(fit: FrequencyDomainFit) -> ResponseTest:
 def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
     """Yield what to know before the model is used, the costliest first."""
     if not answer.seen:
-        yield f"No model: the values are not seen to be anything but noise (p = {answer.p_value:.2g})"
+        yield f"No model: the values are not seen to be anything but noise ({probability(answer.p_value)})"
         return
     if fit.misfit_p_value < MISFIT:
-        what = (
-            f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say (p = "
-        )
+        what = f"The residuals are {np.sqrt(fit.excess):.3g} times as large as the standard errors of the data say"
         hold = ", or the input is not constant between the samples (ctid frf --hold)" * (fit.data.interval > 0.0)
         missed = f"the model misses a part of the response{hold}, or the errors are too small"
-        yield f"{what}{fit.misfit_p_value:.2g}): {missed}"
+        yield f"{what} ({probability(fit.misfit_p_value)}): {missed}"
     if not fit.white and not fit.data.correlated:
         yield (
             "The residuals of neighbouring lines are correlated: the model misses a part of the response, or the lines "

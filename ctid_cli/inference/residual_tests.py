@@ -11,6 +11,7 @@ from ctid_cli.arrays import Array
 from ctid_cli.inference.intervals import normal_quantile, robust_deviation
 from ctid_cli.inference.noise_model import NoiseModel, Rows, autoregress, fit_noise_model, row_blocks
 from ctid_cli.signals.record import Record
+from ctid_cli.text import probability
 
 
 def normal_tail(z: float) -> float:
@@ -142,20 +143,21 @@ class ResidualTests:
         """Results of the tests in words."""
         if np.isnan(self.whiteness_p_value):
             return "The residuals are exactly zero: there is nothing to test."
-        first = f"The residuals pass as white at the {100 * self.level:g} % level (p = {self.whiteness_p_value:.2g})."
+        white, cross = probability(self.whiteness_p_value), probability(self.cross_p_value)
+        first = f"The residuals pass as white at the {100 * self.level:g} % level ({white})."
         if not self.white:
             first = first.replace("pass as white", "are not white").removesuffix(".")
             first += ": the noise is coloured, so that standard errors for white noise do not hold."
         if np.isnan(self.cross_p_value):
             second = f"Their correlation with the {self.driver} cannot be tested: it does not vary enough."
         elif self.uncorrelated:
-            second = f"They are not seen to depend on the {self.driver} (p = {self.cross_p_value:.2g})."
+            second = f"They are not seen to depend on the {self.driver} ({cross})."
         elif int(np.argmax(np.abs(self.cross_correlation))) < self.lags:
             why = "as with feedback from the output, a delay that is too long, or clocks that differ"
-            second = f"They depend on the {self.driver}, most on later values (p = {self.cross_p_value:.2g}), {why}."
+            second = f"They depend on the {self.driver}, most on later values ({cross}), {why}."
         else:
             what = "the model misses a part of the response"
-            second = f"They depend on the {self.driver} (p = {self.cross_p_value:.2g}): {what}."
+            second = f"They depend on the {self.driver} ({cross}): {what}."
         return f"{first} {second}"
 
 

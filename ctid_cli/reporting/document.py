@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from ctid_cli.canonical import plain
-from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked
+from ctid_cli.reporting.layout import html_paragraphs, html_table, latex, markdown_table, picked, written_out
 from ctid_cli.text import WIDTH, wrapped
 
 if TYPE_CHECKING:
@@ -105,8 +105,11 @@ class Result(ABC):
         return {"schema": self.schema, **content} if self.schema and isinstance(content, dict) else content
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the main table of the result."""
-        return next(section.frame for section in self.sections() if section.frame is not None)
+        """Return the main table of the result; one row of its content where there is none."""
+        import pandas as pd
+
+        frames = [section.frame for section in self.sections() if section.frame is not None]
+        return frames[0] if frames else pd.DataFrame([self.content()])
 
     def plot(self) -> Figure:
         """Draw the main figure of the result."""
@@ -148,7 +151,7 @@ def cell(value: Any, form: str = ".6g") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return format(value, form) if math.isfinite(value) else "-"
+        return written_out(format(value, form)) if math.isfinite(value) else "-"
     return "-" if value is None else str(value)
 
 

@@ -118,18 +118,23 @@ class FitFigures:
 
     def draw_autocorrelation(self, axes: Any) -> None:
         """Autocorrelation of the residuals, or innovations, of each experiment, with the band of white ones."""
-        tests = self.result.tests[:: self._inputs]
+        tests, several = self.result.tests[:: self._inputs], len(self.measurements) > 1
         name_axes(axes, y=f"autocorrelation\nof the {self.result.fit.left_over} [-]")
-        self._draw_lags(axes, [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests])
+        labels = [f"experiment {k}" if several else "" for k in range(1, len(tests) + 1)]
+        curves = [(np.arange(1, test.lags + 1), test.autocorrelation) for test in tests]
+        _draw_lags(axes, curves, labels)
         if tests:
-            _draw_band(axes, [test.autocorrelation_band for test in tests], tests[0].level, "white")
+            _draw_band(axes, tests[0].autocorrelation_band, tests[0].level, "white")
 
     def draw_cross_correlation(self, axes: Any) -> None:
         """Correlation of the residuals of each experiment with its delayed input, or each of several."""
-        result, tests = self.result, self.result.tests
+        result, tests, several = self.result, self.result.tests, len(self.measurements) > 1
         name_axes(axes, y=f"correlation of the {result.fit.left_over}\nwith the delayed {result.driver} [-]")
-        self._draw_lags(axes, [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests])
-        _draw_band(axes, [test.cross_correlation_band for test in tests], tests[0].level, "independent")
+        labels = [test.driver if self._inputs > 1 else f"experiment {k}" * several for k, test in enumerate(tests, 1)]
+        curves = [(np.arange(-test.lags, test.lags + 1), test.cross_correlation) for test in tests]
+        _draw_lags(axes, curves, labels)
+        if tests:
+            _draw_band(axes, tests[0].cross_correlation_band, tests[0].level, "independent")
 
     @property
     def delay(self) -> float:
@@ -139,14 +144,6 @@ class FitFigures:
     @property
     def _inputs(self) -> int:
         return len(fractions_of(self.result.fit.model))
-
-    def _draw_lags(self, axes: Any, curves: Sequence[tuple[IntArray, Array]]) -> None:
-        axes.set_xlabel("lag [samples]")
-        if not curves:
-            axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
-        for k, ((lags, values), line) in enumerate(zip(curves, LINES, strict=False), start=1):
-            label = f"experiment {k}" if len(self.measurements) > 1 else None
-            axes.plot(lags, values, line, color=DARK, markersize=3, linewidth=0.8, label=label)
 
     def draw_profile(self, axes: Any) -> None:
         """The search over the delay."""
@@ -196,9 +193,18 @@ def curve(t: Array, use: BoolArray | IndexArray, values: Array) -> tuple[Array, 
     return outline(t, full)
 
 
-def _draw_band(axes: Any, bands: Sequence[float], level: float, what: str) -> None:
+def _draw_lags(axes: Any, curves: Sequence[tuple[IntArray, Array]], labels: Sequence[str]) -> None:
+    """The correlations of the first experiments, or inputs."""
+    axes.set_xlabel("lag [samples]")
+    if not curves:
+        axes.text(0.5, 0.5, "too few residuals", ha="center", va="center", transform=axes.transAxes)
+    for (lags, values), label, line in zip(curves, labels, LINES, strict=False):
+        axes.plot(lags, values, line, color=DARK, markersize=3, linewidth=0.8, label=plain(label) or None)
+
+
+def _draw_band(axes: Any, band: float, level: float, what: str) -> None:
     """The band that correlations of the first experiment stay in, and the legend above it."""
-    axes.axhspan(-bands[0], bands[0], color=BAND, zorder=0, label=f"{100 * level:.3g} % band if {what}")
+    axes.axhspan(-band, band, color=BAND, zorder=0, label=f"{100 * level:.3g} % band if {what}")
     axes.axhline(0.0, color="black", linewidth=0.6)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.25 * (high - low))

@@ -28,10 +28,9 @@ from ctid_cli.reporting.estimate import PARAMETER, parameter_rows
 from ctid_cli.reporting.figures.style import Drawing
 from ctid_cli.reporting.fit_content import DERIVED, additive_of, derived_of, fit_content, parameters_of
 from ctid_cli.reporting.fit_plot import FitFigures
-from ctid_cli.reporting.inputs_plot import inputs_drawing
 from ctid_cli.reporting.layout import number
-from ctid_cli.reporting.model_plot import figure_chapters
-from ctid_cli.reporting.pages.page import Chapter, PagedResult
+from ctid_cli.reporting.model_plot import figure_chapters, inputs_drawing
+from ctid_cli.reporting.pages.page import Chapter, PagedResult, shown
 from ctid_cli.reporting.pages.question import formula
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.band_limited import band_limited_doubt
@@ -129,8 +128,8 @@ class FitResult(PagedResult):
         lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
         lead += count(fit.count, "sample")
         if validation is not None:
-            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
-        title = "Fit of " + ", ".join(record.name or "a record" for record in self.records.data)
+            lead += f"; {number(validation.fit_percent, 4)} % on {shown(validation.name)}, which it was not made from"
+        title = "Fit of " + ", ".join(shown(record.name) or "a record" for record in self.records.data)
         return title, f"{lead}. {fit.status.value}"
 
     def chapters(self) -> Iterator[Chapter]:
@@ -140,9 +139,10 @@ class FitResult(PagedResult):
 
     def chapters_of_numbers(self) -> Iterator[Chapter]:
         """Return data and model."""
-        equations = []
+        equations, additive = [], additive_of(self.fitted.fit)
         for name, model in zip(models_of(self.fitted), fractions_of(self.fitted.fit.model), strict=True):
-            terms = [(model.numerator.tolist(), model.denominator.tolist(), 0)]
+            parts = [(model, 0)] if additive is None else [(part, part.integrators) for part in additive.submodels]
+            terms = [(part.numerator.tolist(), part.denominator.tolist(), poles) for part, poles in parts]
             equation = formula(terms, delayed=model.delay > 0, digits=DIGITS)
             equations.append(f"Response to {name}: {equation}" if name else equation)
         quality = Section("How good it is", frame=pairs(self.quality()))
@@ -191,7 +191,10 @@ class FitResult(PagedResult):
         record = first.record
         for text, signal in zip(record.hold_options, record.held.values(), strict=False):
             of, _, _ = text.rpartition("=")
-            yield f"input {of}".strip(), f"{HOLDS[signal.hold]} (--hold {text}){_unknown_ends(signal, options, units)}"
+            yield (
+                f"input {of}" if of else "inputs" if record.several else "input",
+                f"{HOLDS[signal.hold]} (--hold {text}){_unknown_ends(signal, options, units)}",
+            )
         if fit.weighting is not None:
             yield "loss", _loss_text(fit, fit.weighting, self.records.data, units)
 
@@ -222,9 +225,9 @@ class FitResult(PagedResult):
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
-            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
-            text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
-            yield "validation", text
+            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on "
+            text += f"{shown(validation.name)}, {count(validation.count, 'sample')}"
+            yield "validation", f"{text}; initial state and offset of its own"
             for k in self.predicted:
                 assert fit.noise is not None
                 yield f"  {k} ahead", f"fit {number(validation.prediction_fit(fit.noise, k), 5)} % of predictions"
@@ -327,7 +330,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
     columns = f"input{'s' * record.several} {units.column(measurement, 'input')}, "
     columns += f"output {units.column(measurement, 'output')}"
-    return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
+    return f"{shown(record.name)}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
 def _before(result: Identification, state: str) -> str:

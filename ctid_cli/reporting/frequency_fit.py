@@ -22,9 +22,9 @@ from ctid_cli.reporting.fit_result import FitResult
 from ctid_cli.reporting.frf_plot import decibels, name_response
 from ctid_cli.reporting.layout import number
 from ctid_cli.reporting.model_plot import bode_drawing, poles_chapter, step_drawing
-from ctid_cli.reporting.pages.page import Chapter
+from ctid_cli.reporting.pages.page import Chapter, shown
 from ctid_cli.reporting.records import Records
-from ctid_cli.text import count
+from ctid_cli.text import count, probability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,10 +68,8 @@ class FrequencyFitResult(FitResult):
         """Return the data, and what reading them has shown."""
         data, time = self.fit.data, self.units.time
         low, high = data.frequencies[[0, -1]]
-        line = (
-            f"{data.name or 'frequency response'}: {count(data.frequencies.size, 'line')} from {low:.6g} to {high:.6g}"
-        )
-        return Section(sentences=[f"{line} rad/{time}", *data.notes])
+        name, lines = shown(data.name) or "frequency response", count(data.frequencies.size, "line")
+        return Section(sentences=[f"{name}: {lines} from {low:.6g} to {high:.6g} rad/{time}", *data.notes])
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the data were taken."""
@@ -113,7 +111,7 @@ class FrequencyFitResult(FitResult):
         yield "cost", f"{number(fit.cost)}, mean square of a weighted real or imaginary part"
         if fit.data.standard_error is not None:
             size = f"{number(np.sqrt(fit.excess), 4)} times the standard errors of the data"
-            yield "residuals", f"{size} (p = {number(fit.misfit_p_value, 2)})"
+            yield "residuals", f"{size} ({probability(fit.misfit_p_value)})"
         sizes = f"N = {criteria.count} real equations and p = {criteria.parameters} parameters"
         yield "AICc, BIC", f"{number(criteria.aicc)}, {number(criteria.bic)} with {sizes}"
         yield "condition number", number(fit.condition_number, 3)
@@ -132,7 +130,7 @@ class FrequencyFitResult(FitResult):
         fit = self.fit
         lines = count(fit.data.frequencies.size, "weighted line")
         lead = f"{spelled(self.fitted.options)}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
-        return f"Fit of {fit.data.name or 'a frequency response'}", lead
+        return f"Fit of {shown(fit.data.name) or 'a frequency response'}", lead
 
     def chapters(self) -> Iterator[Chapter]:
         """Return data, model and figures."""
@@ -181,6 +179,6 @@ def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
         error.semilogx(w, decibels(np.abs(values - model)), ".", color=DARK, markersize=3, label="residual")
         name_response(gain, phase, error, units)
         name_axes(error, y=f"residual [{units.amount('dB re 1', units.gain)}]", legend="best")
-        gain.set_title(plain_text(data.name), loc="left")
+        gain.set_title(plain_text(shown(data.name)), loc="left")
 
     return Drawing(8.0, 7.0, draw)

@@ -37,8 +37,9 @@ WORDS = 32
 
 
 def marked(text: str) -> str:
-    """Escape a text, in which backquotes mark names and commands."""
-    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+    """Escape a text, in which backquotes mark names and commands; a p-value and an interval are not broken."""
+    kept = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text).replace(" -+ ", " ±\u00a0")
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(kept))
 
 
 def html_paragraphs(sentences: Sequence[str], style: str = "") -> str:
@@ -97,9 +98,13 @@ def with_error(value: float, error: float) -> str:
 
 
 def _to_digits(value: float, digits: int) -> str:
-    """A number with its trailing zeros: 0.0400, 2.0, 26, 130; as 1.3e+07 where it has many digits that say nothing."""
-    text = f"{value:#.{digits}g}".removesuffix(".")
-    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+    """A number with its trailing zeros: 0.0400, 2.0, 26, 130."""
+    return written_out(f"{value:#.{digits}g}".removesuffix("."))
+
+
+def written_out(text: str) -> str:
+    """A number below a million without an exponent: 1300, not 1.3e+03."""
+    return f"{float(text):.0f}" if "e+" in text and abs(float(text)) < 1e6 else text
 
 
 def rate(speed: float) -> str:

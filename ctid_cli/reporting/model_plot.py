@@ -18,7 +18,7 @@ from ctid_cli.reporting.document import Section
 from ctid_cli.reporting.figures.style import BAND, DARK, MARK, MIDDLE, Drawing, name_axes, plain
 from ctid_cli.reporting.fit_plot import MOST_DRAWN, FitFigures, draw_overlay
 from ctid_cli.reporting.frf_plot import decibels, draw_points, name_response
-from ctid_cli.reporting.pages.page import Chapter
+from ctid_cli.reporting.pages.page import Chapter, shown
 from ctid_cli.signals.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -89,6 +89,27 @@ def _shade(level: float) -> dict[str, Any]:
     return {"color": DARK, "alpha": 0.25, "linewidth": 0.0, "label": f"{100 * level:.3g} % band of the model"}
 
 
+def inputs_drawing(figures: FitFigures) -> Drawing:
+    """Output, residuals and their correlation of a fit with several inputs, then a row for each input."""
+    models, n = models_of(figures.result), figures.drawn
+
+    def draw(figure: Figure) -> None:
+        heights = [2.0, 1.2] * n + [2.0] + [1.4, 1.0] * len(models)
+        grid = figure.add_gridspec(len(heights), 2, height_ratios=heights)
+        figures.draw_experiments(figure, grid)
+        figures.draw_autocorrelation(figure.add_subplot(grid[2 * n, 0]))
+        figures.draw_cross_correlation(figure.add_subplot(grid[2 * n, 1]))
+        for k, (name, model) in enumerate(models.items()):
+            row, units = 2 * n + 1 + 2 * k, figures.units.of_input(k)
+            step, gain = figure.add_subplot(grid[row : row + 2, 0]), figure.add_subplot(grid[row, 1])
+            draw_step(step, model.step_response(), units)
+            draw_bode(gain, figure.add_subplot(grid[row + 1, 1], sharex=gain), model.frequency_response(), units)
+            for axes, what in ((step, "step of"), (gain, "response to")):
+                axes.set_title(plain(f"{what} {name}"), loc="left")
+
+    return Drawing(8.0, 3.4 * n + 2.8 + 3.2 * len(models), draw)
+
+
 def poles_drawing(band: PoleBand, zeros: ComplexArray, units: Units) -> Drawing:
     """Poles with the regions that hold them, and zeros, in the complex plane."""
 
@@ -154,7 +175,7 @@ def figure_chapters(figures: FitFigures, validation: Measurement | None) -> Iter
     output = [Section(drawing=figures.outputs(), caption="Measured and simulated.")]
     outcome, more = result.validation, len(figures.measurements) - MOST_DRAWN
     if outcome is not None and validation is not None:
-        caption = f"The same on {outcome.name}, from which nothing was estimated but the initial state and the offset."
+        caption = f"The same on {shown(outcome.name)}, from which only the initial state and the offset were estimated."
         output.append(Section(drawing=validation_drawing(outcome, validation, units), caption=caption))
     output += [Section(sentences=[f"{more} more experiments are not drawn."])] if more > 0 else []
     yield Chapter("Output", output)
@@ -195,9 +216,9 @@ def _responses(figures: FitFigures) -> list[Section]:
         notes.append(f"The record gives no frequency response without a model: {error}.")
     bode, step = bode_drawing(result.frequency_response(w), found, units), step_drawing(result.step_response(), units)
     return [
-        Section(drawing=bode, caption="Frequency response, with pointwise 95 % bands."),
-        Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
+        Section(drawing=bode, caption="Frequency response, with pointwise 95 % bands; points without a model."),
         Section(notes=notes),
+        Section(drawing=step, caption="Response to a unit step, with its pointwise band."),
     ]
 
 

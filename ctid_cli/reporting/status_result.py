@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from ctid_cli.storage.merge import Merged
     from ctid_cli.storage.status import Verification
 
-#: Failed estimates, and data cells that are not precise enough, that texts list.
-LISTED, CELLS_LISTED = 10, 5
+#: Failed estimates that texts list.
+LISTED = 10
 #: Columns of failed estimates.
 OF_FAILURES = ("id", "estimator", "replicate", "start", "message")
 MIXED = "mixes code versions or processors"
@@ -192,30 +192,21 @@ def precision_frame(cells: Sequence[CellPrecision]) -> pd.DataFrame:
 
 
 def block_sentence(cells: Sequence[CellPrecision]) -> str:
-    """Return what a finished block has brought."""
+    """Return what a finished block has brought; ``ctid status`` has the widest interval of each data cell."""
     more = [cell for cell in cells if cell.state == "open"]
-    text = f"{len(more)} of {len(cells)} data cells need more data sets, up to {max(c.needed for c in more)}"
-    widest = max((cell for cell in more if cell.widest), key=_excess, default=None)
-    return text if widest is None else f"{text}; widest interval: {_cell_sentence(widest)}"
+    return f"{len(more)} of {len(cells)} data cells need more data sets, up to {max(c.needed for c in more)}"
 
 
-def precision_lines(cells: Sequence[CellPrecision]) -> list[str]:
-    """Return what a run has come to: how many data sets, and which data cells are not as precise as asked for."""
+def precision_sentence(cells: Sequence[CellPrecision]) -> str:
+    """Return what a run has come to: how many data sets, and whether intervals are as narrow as asked for."""
     if not cells or any(cell.state == "open" for cell in cells):
-        return []
-    sizes, missed = [cell.needed for cell in cells], [cell for cell in cells if cell.state == "at_most"]
-    if not missed:
-        several = " to ".join(dict.fromkeys((str(min(sizes)), str(max(sizes)))))
-        return [f"{several} data sets in each data cell: all intervals are as narrow as asked for"]
-    lines = [f"{len(missed)} of {len(cells)} data cells ended at {max(sizes)} data sets with wider intervals:"]
-    lines += [f"  {_cell_sentence(cell)}" for cell in sorted(missed, key=_excess, reverse=True)[:CELLS_LISTED]]
-    return [*lines, f"  and {len(missed) - CELLS_LISTED} more"] if len(missed) > CELLS_LISTED else lines
-
-
-def _cell_sentence(cell: CellPrecision) -> str:
-    assert cell.widest is not None
-    options = "".join(f"{name} = {number(value)}, " for name, value in cell.swept.items())
-    return f"{options}{_measure(cell.widest)}: {_width(cell.widest)}, {_asked(cell.widest)} asked"
+        return ""
+    sizes, missed = [cell.needed for cell in cells], sum(cell.state == "at_most" for cell in cells)
+    if missed:
+        ended = f"{missed} of {len(cells)} data cells ended at {max(sizes)} data sets with wider intervals"
+        return f"{ended}, which ctid status lists"
+    several = " to ".join(dict.fromkeys((str(min(sizes)), str(max(sizes)))))
+    return f"{several} data sets in each data cell: all intervals are as narrow as asked for"
 
 
 def _measure(widest: Widest) -> str:
@@ -236,11 +227,6 @@ def _asked(widest: Widest) -> str:
 def _with_unit(half_width: float, widest: Widest) -> str:
     shown, unit = (100 * half_width, "%") if widest.measure == "rmse" else (half_width, "points")
     return f"± {shown:.3g} {unit}"
-
-
-def _excess(cell: CellPrecision) -> float:
-    assert cell.widest is not None
-    return cell.widest.excess
 
 
 # --- ctid verify, merge and validate ---------------------------------------------------------------------------------
@@ -290,10 +276,6 @@ class MergeResult(Result):
         """Return what was made for JSON."""
         return asdict(self.merged) | {"folder": str(self.merged.folder)}
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row."""
-        return pd.DataFrame([self.content()])
-
 
 @dataclass(frozen=True, eq=False)
 class ValidationResult(Result):
@@ -320,7 +302,3 @@ class ValidationResult(Result):
     def content(self) -> dict[str, Any]:
         """Return the counts for JSON."""
         return asdict(self) | {"file": str(self.file)}
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row."""
-        return pd.DataFrame([self.content()])

@@ -52,7 +52,7 @@ class TrackResult(PagedResult):
         head = [] if self.signal is None else [signal_line(self.signal), *self.signal.notes]
         warnings = [f"- {warning}" for warning in track_warnings(self.track)]
         return [
-            Section("", [*head, *(f"- {reason}" for reason in self.chosen())]),
+            Section("", [*head, *(f"- {reason}" for reason in self.chosen())], drawing=self.drawing()),
             *self.tones(),
             Section("Warnings:" if warnings else "", warnings),
         ]
@@ -91,10 +91,6 @@ class TrackResult(PagedResult):
         if signal is None:
             return track_drawing(self.track, 0.0, None, "")
         return track_drawing(self.track, signal.start, signal.unit, Path(signal.file).name)
-
-    def plot(self) -> Any:
-        """Draw frequencies and amplitudes over time."""
-        return self.drawing().figure()
 
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and how many tones there are."""

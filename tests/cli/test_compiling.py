@@ -1,10 +1,5 @@
 """Who waits for compiled functions is told so: once, on stderr, and only where there is something to wait for."""
 
-import json
-import os
-import subprocess
-import sys
-
 import pytest
 import typer
 
@@ -12,7 +7,6 @@ from ctid_cli.cli import _compiling
 from ctid_cli.cli._common import ComputingCommand
 from ctid_cli.cli._compiling import ANNOUNCEMENT, CompilationNotice
 from ctid_cli.cli.main import app
-from tests.cli.records import tones, write
 
 #: Commands that show, move or describe files, and need not load Numba.
 STORED = {"status", "export", "verify", "merge", "init"}
@@ -57,20 +51,6 @@ def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, m
         notice.on_end(None)
     assert clock.waits == waits
     assert capsys.readouterr() == ("", times * f"{ANNOUNCEMENT}\n")
-
-
-def test_a_command_tells_it_in_a_pipe_and_with_a_filled_cache_never(tmp_path):
-    """Real compilation, announced at once: JSON stays JSON, and what is loaded from disk is no compilation."""
-    write(tmp_path / "signal.csv", tones(500), "t,y")
-    program = "from ctid_cli.cli import _compiling, main; _compiling.SILENT = 0.0; main.main()"
-    command = [sys.executable, "-c", program, "track", "signal.csv", "--tones", "1", "--json"]
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    told = []
-    for _ in range(2):
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-        json.loads(done.stdout)
-        told.append(done.stderr.count(ANNOUNCEMENT))
-    assert told == [1, 0]
 
 
 def test_every_command_that_computes_tells_it():

@@ -60,14 +60,6 @@ def test_a_sum_of_submodels_is_printed_written_and_read_back(ctid, tmp_path):
     assert again.validation.applied.residuals[0].size == 800
 
 
-@pytest.mark.parametrize("state", ["estimate", "periodic"])
-def test_the_state_before_the_record(ctid, tmp_path, state):
-    file = record(tmp_path / "one.csv", MODES)
-    content = fitted(ctid, file, "--model", "additive", "--terms", "2,2", "--initial-state", state, "--out", tmp_path)
-    states = [item["name"] for item in content["parameters"] if item["name"].startswith("x")]
-    assert states == (["x1", "x2", "x3", "x4"] if state == "estimate" else [])
-
-
 def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
     file = record(tmp_path / "rigid.csv", RIGID)
     options = ("--model", "additive", "--terms", "0/0,2/0", "--integrators", 1, "--out", tmp_path)

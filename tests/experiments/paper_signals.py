@@ -1,4 +1,4 @@
-"""The four signals of the finite-time paper, by direct simulation, and what is measured on them.
+"""The four signals of the finite-time paper, by direct simulation.
 
 The signals are A: two tones without noise, B: with a third, unmodelled one, C: with uniform noise, D: with a step of
 both frequencies, read in two ways: the phase jumps with the frequency, or goes on.
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ctid_cli.arrays import Array
-from ctid_cli.frequency.base import FrequencyTrack
 
 #: Standard deviation of noise between -0.2 and 0.2.
 SIGMA = 0.4 / np.sqrt(12.0)
@@ -62,31 +61,6 @@ def signal(name: str, interval: float, duration: float, seed: int | None = None,
         noise = np.random.default_rng(seed).uniform(-0.2, 0.2, t.size)
         return np.asarray(np.sin(2 * t) + np.sin(3 * t) + noise)
     return from_frequencies(stepped(interval, duration)[0], interval, jump=jump)
-
-
-# Measures ----------------------------------------------------------------------------------------------
-
-
-def settle(track: FrequencyTrack, truth: Array, band: float, since: float = 0.0, until: float = np.inf) -> float:
-    """Time after `since` from which on both errors stay below a band; infinite if they do not."""
-    chosen = (track.t >= since - 1e-9) & (track.t < until - 1e-9)
-    error = np.abs(track.frequencies - truth).max(axis=1)[chosen]
-    outside = np.flatnonzero(~(error < band))
-    if not outside.size:
-        return 0.0
-    return np.inf if outside[-1] == error.size - 1 else float(track.t[chosen][outside[-1] + 1] - since)
-
-
-def cramer_rao(duration: float, interval: float, sigma: float, phases: tuple[float, float] = (0.0, 0.0)) -> Array:
-    """Smallest standard deviations of the frequencies of ``sin(2 t + p1) + sin(3 t + p2)`` in white Gaussian noise."""
-    t = clock(interval, duration)
-    t = t - t.mean()
-    columns = []
-    for omega, phase in zip(TRUTH, phases, strict=True):
-        angle = omega * t + phase
-        columns += [t * np.cos(angle), np.cos(angle), np.sin(angle)]
-    J = np.column_stack(columns)
-    return np.asarray(sigma * np.sqrt(np.diag(np.linalg.inv(J.T @ J))[::3]), dtype=float)
 
 
 def drem(kind: type[Any], name: str, **options: Any) -> Any:

@@ -1,6 +1,5 @@
 """Figures of the study of finite-time frequency estimation: what is drawn is what was found."""
 
-import numpy as np
 import pytest
 
 from ctid_cli.studies.catalogue import find_figures
@@ -18,31 +17,6 @@ def out(tmp_path_factory):
     for name in NAMES:
         run_here(name, folder, SHORT)
     return folder
-
-
-def legend_texts(legend):
-    return [text.get_text() for text in legend.get_texts()]
-
-
-@pytest.mark.parametrize("number", STUDY.figures)
-def test_every_figure_draws_every_tracker_and_says_what_is_derived(number, out, drawn):
-    (item,) = find_figures([f"finite-time-frequency/{number}"])
-    item.svg(out)
-    (figure,) = drawn
-    readings = 2 if number == "4" else 1
-    panels = np.array(figure.axes).reshape(2 * readings, 3)
-    assert [axes.get_title(loc="left") for axes in panels[0]] == list(figures.GROUPS)
-    for axes, labels in zip(panels[-1], figures.GROUPS.values(), strict=True):
-        assert legend_texts(axes.get_legend()) == list(labels.values())
-        assert axes.get_xlabel() == "time [s]"
-        assert axes.get_yscale() == "log"
-        assert axes.get_xlim() == (0.0, 33.0)
-    for row, axes in zip(panels[:, 0], ("frequency [rad/s]", "larger error [rad/s]") * readings, strict=True):
-        assert row.get_ylabel().endswith(axes)
-    common = legend_texts(figure.legends[0])
-    assert "true frequencies" in common
-    assert any("invalid" in text for text in common)
-    assert ("nonlinear least squares, whole record" in common) is (number in "23")
 
 
 def test_the_grey_band_ends_where_finite_time_is_exact(out, drawn):

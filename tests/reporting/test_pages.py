@@ -1,6 +1,5 @@
 """Pages: well-formed, complete in themselves, and safe whatever messages and files hold."""
 
-import re
 from pathlib import Path
 
 import pandas as pd
@@ -81,13 +80,6 @@ def test_published_markdown_is_read_back():
     title, words, table = sections_of(text)
     assert (title.title, words.sentences) == ("Title", ["Some words."])
     assert table.frame.equals(frame)
-
-
-def test_styles_are_those_of_print_and_phones():
-    css = re.sub(r"\s+", " ", (Path(experiment_page.__code__.co_filename).parent / "templates/style.css").read_text())
-    assert "@media print" in css
-    assert "overflow-x: auto" in css
-    assert "http" not in css
 
 
 def test_a_table_that_is_too_wide_goes_on_below_with_what_tells_its_rows_apart():

@@ -6,13 +6,12 @@ import pytest
 
 from ctid_cli.inference.monte_carlo import CellPrecision, Widest
 from ctid_cli.reporting.status_result import (
-    CELLS_LISTED,
     MergeResult,
     Overview,
     StatusResult,
     VerificationResult,
     block_sentence,
-    precision_lines,
+    precision_sentence,
 )
 from ctid_cli.storage.merge import Merged
 from ctid_cli.storage.status import ExperimentStatus, Finding, GroupStatus, Verification
@@ -82,23 +81,10 @@ def test_a_merge_says_what_is_missing(snapshot):
     assert MergeResult(merged, Path("out")).summary() == snapshot
 
 
-def test_a_block_says_what_is_farthest_from_what_was_asked():
-    cells = [cell(), cell("open", 15.0, widest=percentage(1.2)), cell("open", 20.0, widest=RMSE)]
-    text = "2 of 3 data cells need more data sets, up to 613; widest interval: "
-    assert (
-        block_sentence(cells) == text + "snr_db = 20, rmse of delay (search, order = 2, start 3): ± 8.12 %, ± 5 % asked"
-    )
-    # A measure that is not known at all is farther than any other.
-    unknown = cell("open", 1.0, widest=percentage(None))
-    assert "snr_db = 1, percentage (search): not known, ± 1 points asked" in block_sentence([*cells, unknown])
-
-
-def test_a_summary_names_the_cells_that_are_not_precise_enough():
-    assert precision_lines([]) == precision_lines([cell(), cell("open")]) == []
-    (line,) = precision_lines([cell(needed=200), cell()])
-    assert line == "200 to 613 data sets in each data cell: all intervals are as narrow as asked for"
-    missed = [cell("at_most", k, 5000, percentage(1.1 + k)) for k in range(CELLS_LISTED + 2)]
-    first, *listed, last = precision_lines([cell(), *missed])
-    assert first == f"{CELLS_LISTED + 2} of {CELLS_LISTED + 3} data cells ended at 5000 data sets with wider intervals:"
-    assert listed[0] == "  snr_db = 6, percentage (search): ± 7.1 points, ± 1 points asked"
-    assert (len(listed), last) == (CELLS_LISTED, "  and 2 more")
+def test_what_a_block_and_a_run_have_brought():
+    open_, missed = cell("open", 20.0, widest=RMSE), cell("at_most", 15.0, 5000, percentage(1.1))
+    assert block_sentence([cell(), open_]) == "1 of 2 data cells need more data sets, up to 613"
+    assert precision_sentence([]) == precision_sentence([cell(), open_]) == ""
+    narrow = "200 to 613 data sets in each data cell: all intervals are as narrow as asked for"
+    assert precision_sentence([cell(needed=200), cell()]) == narrow
+    assert precision_sentence([cell(), missed]).startswith("1 of 2 data cells ended at 5000 data sets with wider")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -88,10 +89,8 @@ class Drawing(NamedTuple):
 
     def figure(self) -> Figure:
         """Draw it."""
-        from ctid_cli.reporting.figures.notebook_figure import NotebookFigure
-
         with _style():
-            figure = NotebookFigure(figsize=(self.width, self.height), layout="constrained")
+            figure = _notebook_figure()(figsize=(self.width, self.height), layout="constrained")
             self.draw(figure)
         return figure
 
@@ -114,6 +113,20 @@ class Drawing(NamedTuple):
             figure.set_layout_engine("none")
             figure.savefig(file, format="svg", metadata=_METADATA["svg"])
         return file.getvalue()
+
+
+@cache
+def _notebook_figure() -> type[Figure]:
+    """Return the class of figures that a notebook shows without pyplot, with Matplotlib that is loaded now."""
+    from matplotlib.figure import Figure
+
+    class NotebookFigure(Figure):
+        def _repr_svg_(self) -> str:
+            file = io.BytesIO()
+            self.savefig(file, format="svg", metadata=_METADATA["svg"])
+            return file.getvalue().decode()
+
+    return NotebookFigure
 
 
 def _style() -> Any:

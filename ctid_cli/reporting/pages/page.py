@@ -149,7 +149,8 @@ def _provenance(stored: Mapping[str, Any]) -> list[Section]:
             rows.append((label, "its samples are in the file"))
             continue
         how = [f"{key} {each[key]}" for key in ("hold", "interval", "from", "to") if each.get(key) is not None]
-        how += [f"{role} {name!r}" for role, name in each["columns"].items() if name is not None]
+        columns = [(role, name if isinstance(name, list) else [name]) for role, name in each["columns"].items() if name]
+        how += [f"{role} {name!r}" for role, names in columns for name in names]
         rows += [(label, ", ".join([shown(each["path"]), *how])), ("its SHA-256", each["sha256"])]
     rows.append(("checksum of the file", str(stored.get("checksum", ""))))
     command = shown_command(stored["command"]) + "\n"
