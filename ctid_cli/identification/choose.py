@@ -110,9 +110,10 @@ class _Choosing:
         if (narrower, confirmed) != (delays, setting):
             delays, setting = narrower, confirmed
             ranking = self._grid(setting, delays)
+        ranking = standing(ranking, self._held(setting))
         while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
-            ranking = self._grid(setting, delays)
+            ranking = standing(self._grid(setting, delays), self._held(setting))
         said = [*self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
         return self._chosen(ranking.best.options, setting, ranking, said)
 
@@ -135,7 +136,7 @@ class _Choosing:
             options = replace(options, fixed=self.given.fixed, nested=True)
         if not self.all_from_start:
             options = replace(options, initial_state="estimate", input_before=None)
-        fitted = tuple(with_hold(record, setting.hold) for record in self.many)
+        fitted = tuple(self._held(setting))
         measured = best.options.prepare(fitted).laid_out
         answer = answer_of(best.options, measured.records, measured.used())
         said = [*self.said, *about]
@@ -146,8 +147,10 @@ class _Choosing:
     def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        held = [with_hold(record, setting.hold) for record in self.many]
-        return standing(grid(held, setting, self.span, delays, self.several), held)
+        return grid(self._held(setting), setting, self.span, delays, self.several)
+
+    def _held(self, setting: Setting) -> list[Record]:
+        return [with_hold(record, setting.hold) for record in self.many]
 
     def _small(
         self,
