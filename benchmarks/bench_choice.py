@@ -17,6 +17,7 @@ Then step records with a lead of 1, 5 and 15 samples, whose error is compared wi
 """
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -34,6 +35,8 @@ INTERVAL = 1.0
 REDRAWS = 5
 #: Range of the delay of the true structure in the true treatment, in samples.
 DELAYS = (0.0, 20.0)
+#: Leads of step records [samples], and the number from which on these are drawn.
+LEADS, FIRST_LEAD = (1, 5, 15), 10**6
 GROUPS: dict[str, Callable[["Case"], bool]] = {
     "all": lambda case: True,
     "10 dB and more": lambda case: case.snr_db >= 10,
@@ -217,15 +220,17 @@ def measured(case: Case) -> dict[str, object]:
     found = choice.options.fit(choice.records, None)
     hold = choice.records[0].input.hold
     row |= {"error": case.error(found.model, hold), "command": choice.words(), "hold": hold}
-    own = replace(choice.options, poles=1, zeros=0)
-    return {**row, "chosen": case.reference(own), "true": case.reference(case.true_treatment)}
+    row["true"] = case.reference(case.true_treatment)
+    if case.number < FIRST_LEAD:
+        row["chosen"] = case.reference(replace(choice.options, poles=1, zeros=0))
+    return row
 
 
 def steps(seed: int, count: int) -> Iterator[Case]:
     """Step records at rest with short leads."""
-    for number in range(count):
-        case = next(case for case in (drawn(seed, k) for k in range(10**6 * (number + 1), 10**7)) if _is_step(case))
-        yield replace(case, at_rest=True, step=(1, 5, 15)[number % 3])
+    found = filter(_is_step, (drawn(seed, number) for number in itertools.count(FIRST_LEAD)))
+    for case, lead in zip(found, itertools.islice(itertools.cycle(LEADS), count), strict=False):
+        yield replace(case, at_rest=True, step=lead)
 
 
 def _is_step(case: Case) -> bool:
@@ -268,7 +273,7 @@ def main() -> None:
             print(shares(name, own(some), reference))
     far = sum(row["error"] is None or (row["error"] > 1 and row["chosen"] < 0.5) for row in own(cases))
     print(f"errors above 1 where the reference is below .5, and refused records: {far}")
-    for lead in (1, 5, 15):
+    for lead in LEADS:
         some = [case for case in leads if case.step == lead]
         if some:
             print(shares(f"lead of {lead}", own(some), "true"))

@@ -28,6 +28,8 @@ from ctid_cli.inference.noise_model import NoiseModel, fit_noise_model
 from ctid_cli.models.additive import terms_text
 from ctid_cli.signals.treatment import Holds
 
+#: Output errors of records, and their derivatives by what least squares may still change.
+Errors = tuple[Sequence[Array], Sequence[Array]]
 #: Options of the models that are compared: one fraction, or a sum of submodels.
 Searched = DelayProfile | AdditiveOutputError
 #: What a parameter counts over its share in BIC. Of 134 simulated records of known structure, models so chosen had at
@@ -131,6 +133,16 @@ def ranked(candidates: Sequence[Candidate]) -> Ranking:
 def in_order(judged: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """Return candidates by their criterion, those that are not admissible last."""
     return tuple(sorted(judged, key=lambda each: (not each.is_admissible, each.criterion)))
+
+
+def criteria_of(models: Sequence[Errors], parameters: Sequence[int]) -> list[float]:
+    """Return the criterion of models of the same samples under the noise of the one that is closest."""
+    closest, _ = min(models, key=lambda model: sum(float(e @ e) for e in model[0]))
+    noise = noise_of(closest)
+    return [
+        penalised(squared_innovations(errors, slopes, noise), innovations_count(errors, noise), size)
+        for (errors, slopes), size in zip(models, parameters, strict=True)
+    ]
 
 
 def noise_of(residuals: Sequence[Array]) -> NoiseModel:

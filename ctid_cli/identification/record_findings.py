@@ -182,7 +182,10 @@ class _Sentences:
         for topic, term, words in named:
             size = self._interval(term, self.output)
             if term.detected:
-                yield Finding("warning", topic, f"{words} {size}, {probability(term.p_value)}.")
+                # Nearly every process has an operating point.
+                yield Finding(
+                    "note" if topic == "offset" else "warning", topic, f"{words} {size}, {probability(term.p_value)}."
+                )
             else:
                 missed.append(f"{topic} {size}")
         p = probability(parts.feedback_p_value)

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ctid_cli.arrays import Array, BoolArray
+from ctid_cli.arrays import Array
 from ctid_cli.errors import CtidError
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.estimators.delay_profile import DelayProfile, MeasuredFit
@@ -16,9 +16,8 @@ from ctid_cli.estimators.identification import Options
 from ctid_cli.estimators.loop_output_error import LoopOutputError
 from ctid_cli.estimators.measured_submodels import MeasuredSubmodels
 from ctid_cli.identification.candidates import with_hold
-from ctid_cli.identification.criterion import noise_of, penalised
+from ctid_cli.identification.criterion import criteria_of
 from ctid_cli.identification.held_back import Near, compared, held_back_errors, long_enough, near_model
-from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.inference.signal_features import input_moves, residual_outliers
 from ctid_cli.models.additive import Term, terms_text
 from ctid_cli.signals.held import Hold, regular_interval
@@ -416,19 +415,13 @@ def criteria(fits: Sequence[MeasuredFit], parameters: Sequence[int], wild: Seque
     ``wild`` is how far outliers are from their neighbours, which does not count.
     """
     masks = [np.logical_and.reduce(uses) for uses in zip(*(fit.used for fit in fits), strict=True)]
-    tamed = [[e - off[use] for e, off, use in zip(fit.residuals, wild, fit.used, strict=True)] for fit in fits]
-    cut = [
-        [_at(e, use, mask) for e, use, mask in zip(errors, fit.used, masks, strict=True)]
-        for errors, fit in zip(tamed, fits, strict=True)
-    ]
-    closest = min(cut, key=lambda errors: sum(float(e @ e) for e in errors))
-    noise = noise_of(closest)
-    found = []
-    for fit, errors, size in zip(fits, cut, parameters, strict=True):
-        psi = [_at(fit.sensitivities[k] @ fit.tangent, fit.used[k], mask) for k, mask in enumerate(masks)]
-        count = innovations_count(errors, noise)
-        found.append(penalised(squared_innovations(errors, psi, noise), count, size))
-    return found
+    models = []
+    for fit in fits:
+        common = [mask[use] for mask, use in zip(masks, fit.used, strict=True)]
+        tamed = [e - off[use] for e, off, use in zip(fit.residuals, wild, fit.used, strict=True)]
+        slopes = [(psi @ fit.tangent)[at] for psi, at in zip(fit.sensitivities, common, strict=True)]
+        models.append(([e[at] for e, at in zip(tamed, common, strict=True)], slopes))
+    return criteria_of(models, parameters)
 
 
 def _outliers(fit: MeasuredFit, k: int) -> Array:
@@ -438,11 +431,6 @@ def _outliers(fit: MeasuredFit, k: int) -> Array:
     found = np.zeros(law.used[k].size)
     found[np.flatnonzero(law.used[k])[places]] = off
     return found
-
-
-def _at(values: Array, used: BoolArray, mask: BoolArray) -> Array:
-    """Values at the used samples, cut to fewer samples."""
-    return values[mask[used]]
 
 
 def typed(old: Any, new: Any) -> str:

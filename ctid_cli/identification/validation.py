@@ -8,9 +8,8 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimators.delay_profile import MeasuredFit
 from ctid_cli.estimators.identification import Validation, laid_out_validation, validated
 from ctid_cli.identification.choice import Given
-from ctid_cli.identification.criterion import Searched, noise_of, penalised
+from ctid_cli.identification.criterion import Searched, criteria_of
 from ctid_cli.identification.initial_states import states_of
-from ctid_cli.inference.criteria import innovations_count, squared_innovations
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Offset
 
@@ -33,10 +32,6 @@ def judged_on(record: Record, options: Searched, fit: MeasuredFit, given: Given)
     applied = [own._applied(fit, laid_out) for own, laid_out in tried]
     common = np.logical_and.reduce([each.used[0] for each in applied])
     left = [each.residuals[0][common[each.used[0]]] for each in applied]
-    noise = noise_of([min(left, key=lambda e: float(e @ e))])
-    scores = []
-    for e, (_, laid_out) in zip(left, tried, strict=True):
-        squared = squared_innovations([e], [np.zeros((e.size, 0))], noise)
-        scores.append(penalised(squared, innovations_count([e], noise), laid_out.layout.own))
-    best = int(np.argmin(scores))
+    sizes = [laid_out.layout.own for _, laid_out in tried]
+    best = int(np.argmin(criteria_of([([e], [np.zeros((e.size, 0))]) for e in left], sizes)))
     return replace(validated(applied[best], record), options=tried[best][0])

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ctid_cli.estimators.additive_output_error import AdditiveOutputError
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Searched
+from ctid_cli.identification.criterion import Candidate, Searched
 from ctid_cli.identification.judged import JudgedCandidate, judged_candidates
 from ctid_cli.identification.sentences import spelled
 from ctid_cli.reporting.document import Column, Result, Section
@@ -76,16 +76,18 @@ class OrderSearchResult(Result):
         """Draw error and criterion over all poles, a line for each number of zeros; with an integrator open marks."""
         error, criterion = figure.subplots(1, 2)
         best = self.choice.ranking.best
+        is_sum = isinstance(best.options, AdditiveOutputError)
         by_size = sorted(self.choice.ranking.candidates, key=lambda each: each.options.order)
-        for family in sorted({_family(each.options) for each in by_size}):
-            zeros, integrators = family
-            own = [each for each in by_size if _family(each.options) == family]
+        lines: dict[tuple[int, int], list[Candidate]] = {}
+        for each in by_size:
+            # All sums are one line.
+            lines.setdefault((0 if is_sum else each.options.zeros, each.options.integrators), []).append(each)
+        for (zeros, integrators), own in sorted(lines.items()):
             poles = [each.options.order for each in own]
             look = dict(LOOKS[zeros % len(LOOKS)], markersize=5, linewidth=1.0)
             look |= {"fillstyle": "none", "linestyle": ":"} if integrators else {}
-            label = (
-                f"{'second-order submodels' if zeros < 0 else count(zeros, 'zero')}{', integrator' * bool(integrators)}"
-            )
+            label = "second-order submodels" if is_sum else count(zeros, "zero")
+            label += ", integrator" * bool(integrators)
             error.plot(poles, np.sqrt([each.fit.cost for each in own]), label=label, **look)
             criterion.plot(poles, [each.criterion - best.criterion for each in own], label=label, **look)
         if self.choice.seen:
@@ -169,8 +171,3 @@ def _structure(options: Searched) -> dict[str, Any]:
         terms = [asdict(term) for term in options.terms]
         return {"modes": len(terms), "integrators": options.integrators, "terms": terms}
     return picked(options, STRUCTURE)
-
-
-def _family(options: Searched) -> tuple[int, int]:
-    """Return the zeros and integrators of structures that are drawn as one line; all sums are one, of -1 zeros."""
-    return -1 if isinstance(options, AdditiveOutputError) else options.zeros, options.integrators

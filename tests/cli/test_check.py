@@ -40,7 +40,7 @@ def test_json(ctid, rig):
     content = json.loads(done.stdout)
     assert content["columns"]["time"] == {"column": "time [h]", "unit": "h"}
     assert (content["file"], content["worst"], content["n_samples"]) == (rig, "warning", 2000)
-    assert (content["findings"][0]["topic"], content["offset"]["detected"]) == ("offset", True)
+    assert (content["findings"][0]["topic"], content["offset"]["detected"]) == ("start", True)
     assert content["delay_early"] <= 1.3 <= content["delay_late"]
     assert content["snr_db_low"] < content["snr_db"] < content["snr_db_high"]
     assert (content["input_levels"], content["output_quantum"]) == ([1.0, 3.0], None)
