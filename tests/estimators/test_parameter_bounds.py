@@ -18,6 +18,7 @@ from ctid_cli import (
 )
 from ctid_cli.errors import OptionError
 from ctid_cli.estimation.common import Fixed
+from ctid_cli.identification.fit_warnings import of_search
 from ctid_cli.inference.fit import Status
 
 T = 0.1 * np.arange(400)
@@ -82,7 +83,7 @@ def test_a_coefficient_at_its_bound_is_one_that_is_fixed_there():
 def test_a_parameter_at_its_bound_is_told_as_such():
     found = identify(record_of(2), DelayProfile(2, 0, (0.0, 0.0), bounds=(Bound("a1", 1.0, 2.0),)))
     assert {item.name: item.status for item in found.estimates}["a1"] == "at bound"
-    assert any("At the given bound: a1 = 1" in text for text in found.warnings)
+    assert next(of_search(found.fit, "s")).startswith("At the given bound: a1 = 1;")
 
 
 def test_errors_of_the_others_hold_along_the_bound():
