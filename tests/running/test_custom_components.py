@@ -51,7 +51,7 @@ class Noise(ctid_cli.Noise):
     def generate(self, output, rng):
         if self.unseeded:
             return np.random.randn(output.size)
-        # The sign of the first sample changes from one data set to the next: 0.64, -0.08, ...
+        # The sign of the first sample changes from one data set to the next: 0.32, -0.57
         return LEVEL * rng.standard_normal(output.size) - output
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ noise:       {kind: "./parts.py:Noise"}
 estimators:
   good:      {kind: "./parts.py:Mean"}
   bad:       {kind: "./parts.py:Mean", mischief: [raise, die, nan]}
-monte_carlo: {runs: 3, seed: 5}
+monte_carlo: {runs: 2, seed: 2}
 """
 #: Estimators of ctid, of which measures are taken.
 OWN = (
@@ -134,9 +134,9 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fil
         (row["estimator"], row.get("mischief"), row["replicate"]): result
         for result, row in zip(stored.results.values(), stored.rows(), strict=True)
     }
-    jobs = [plan.job(0, replicate) for replicate in range(3)]
+    jobs = [plan.job(0, replicate) for replicate in range(2)]
     bad = [k for k, job in enumerate(jobs) if job.cell.dataset(job.replicate).record.y[0] > 0]
-    assert 0 < len(bad) < 3
+    assert bad == [0]
     for k, job in enumerate(jobs):
         here = outcomes_of(replace(job, wanted=job.wanted[:1]))[0].result
         assert results["good", None, k] == here
@@ -198,7 +198,7 @@ def test_what_is_odd_on_the_first_data_set_is_a_warning(file, overrides, words):
 
 
 def test_a_component_that_ends_the_process_is_left_to_the_run(file):
-    assert planned(file, "estimators.bad.mischief=always").data_sets == 3
+    assert planned(file, "estimators.bad.mischief=always").data_sets == 2
 
 
 def test_the_value_of_a_measure_is_stored_with_every_estimate_and_in_every_table(file, tmp_path):
