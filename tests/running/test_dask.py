@@ -19,6 +19,9 @@ from ctid_cli.signals.files import COPIES
 from ctid_cli.simulation.dataset import require_content
 from tests.running.fakes import Toy, exported, run, toy_plan
 
+# As errors, warnings would end the threads of dask that they come from.
+pytestmark = pytest.mark.filterwarnings("default")
+
 
 def plan() -> Plan:
     hostile = (Toy("leave", at=3, order=6), Toy("grow", at=4, order=7))
