@@ -256,7 +256,8 @@ class FitResult(PagedResult):
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         for name, end in fit.bounds_met:
             yield "at bound", f"{name} = {end:g}, as given"
-        if fit.box is not None and (fit.held_poles or fit.status is Status.RIDGE):
+        at_box = fit.held_poles or (fit.status in (Status.AT_BOUND, Status.RIDGE) and not fit.bounds_met)
+        if fit.box is not None and at_box:
             yield "admissible", fit.box.sentence(units.time)
             for name, limit, value in fit.box.limits_met(fit.held_poles):
                 unit = "" if name == "least_damping" else f" rad/{units.time}"
