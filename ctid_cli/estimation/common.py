@@ -342,7 +342,7 @@ def assessed(
     rows = problem.rows(theta) if tangent.shape[1] and kind != "white" else None
     if rows is not None:
         psi, error = rows
-        law = estimate_uncertainty([psi], [error], kind, draws, regular=problem.data.interval > 0.0, tangent=tangent)
+        law = estimate_uncertainty([psi], [error], kind, draws, tangent=tangent)
     elif tangent.shape[1] and kind == "white":
         hessian = tangent.T @ equations.hessian @ tangent
         covariance = white_noise_covariance(hessian, equations.squared_error, problem.samples)

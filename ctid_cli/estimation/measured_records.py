@@ -35,7 +35,6 @@ from ctid_cli.estimation.optimum.search import local_minimum
 from ctid_cli.estimation.optimum.triangle import Columns, Delay, rows_of
 from ctid_cli.estimation.parameter_layout import Degrees, Layout, SumDegrees
 from ctid_cli.filtering.filter_data import FilterData, filter_data, used_samples
-from ctid_cli.inference.covariance import nearly_regular
 from ctid_cli.inference.innovations import sampled
 from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.robust_loss import Weighting
@@ -305,11 +304,6 @@ class MeasuredRecords:
     def spread(self) -> float:
         """Sum of the squares of the outputs about the mean of each record."""
         return float(sum(np.sum((y - y.mean()) ** 2) for y in self.outputs))
-
-    @property
-    def regular(self) -> bool:
-        """Whether lags counted in samples are lags in time, up to jitter."""
-        return all(nearly_regular(data.t) for data in self.data)
 
     def used(self) -> tuple[BoolArray, ...]:
         """Which samples of each record enter the sums."""

@@ -91,8 +91,6 @@ class MeasuredFit(DeferredFields, Fit):
         Poles at a bound of that set [rad/s]; standard errors take them as known.
     tangent : ndarray, shape (p, f)
         Directions in which the parameters could move: those of the identity unless poles or the delay are held.
-    regular : bool
-        Whether lags counted in samples are lags in time, up to jitter.
     known : tuple of str
         Names of the parameters that were fixed.
     noise : NoiseEstimate or None
@@ -117,7 +115,6 @@ class MeasuredFit(DeferredFields, Fit):
     weighting: Weighting | None = None
     held_poles: tuple[complex, ...] = ()
     tangent: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    regular: bool = True
     known: tuple[str, ...] = ()
     noise: NoiseEstimate | None = None
     bounds_met: tuple[Met, ...] = ()
@@ -141,9 +138,10 @@ class MeasuredFit(DeferredFields, Fit):
         Uncertainty
             Covariance, and how many standard errors intervals reach.
         """
-        noise: Any = {"regular": self.regular, "tangent": self.tangent, "progress": progress}
         linear = self.linear
-        found = estimate_uncertainty(linear.sensitivities, linear.residuals, kind, draws, **noise)
+        found = estimate_uncertainty(
+            linear.sensitivities, linear.residuals, kind, draws, tangent=self.tangent, progress=progress
+        )
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
@@ -224,7 +222,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`.
     in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`MeasuredFit`; of the levels of the inputs those of all inputs of one record after the other.
-    poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
+    poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`MeasuredFit`.
     """
 
@@ -702,7 +700,6 @@ def fitted(
         held_poles=tuple(found.held_poles.tolist()),
         tangent=_tangent(layout, found, given),
         known=tuple(np.array(layout.names)[given].tolist()),
-        regular=measured.regular,
         **values,
     )
     return fit

@@ -42,7 +42,7 @@ class FrequencyDomainFit(MeasuredFit):
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` has the real parts of all lines, then
         the imaginary ones.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     data : FrequencyData
         The frequency response.
@@ -72,7 +72,7 @@ class FrequencyDomainFit(MeasuredFit):
         psi, e = self.sensitivities[0] @ self.tangent, self.residuals[0]
         if kind == "robust" or (kind == "auto" and self.correlated):
             lines = self.data.frequencies.size
-            found, noise = robust_covariance(np.split(psi, [lines]), np.split(e, [lines]), regular=True)
+            found, noise = robust_covariance(np.split(psi, [lines]), np.split(e, [lines]))
             return Uncertainty("robust", self.tangent, found, noise.effective_count(e.size))
         inverse = unit_inverse(psi.T @ psi) if e.size > psi.shape[1] else None
         if inverse is None:

@@ -52,7 +52,7 @@ class LoopFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     loop_radius : float
         Largest magnitude of the poles of the loop with the controller over one sampling interval [-].
@@ -229,7 +229,6 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
             offsets=(float(own[-1]) if problem.offset else laid_out.offset,),
             input_offsets=(laid_out.input_offset,),
             starts=Starts(found.tried, found.agree),
-            regular=problem.data.interval > 0.0,
             known=tuple(held),
             loop_radius=found.radius,
             cost=np.nan,

@@ -37,7 +37,7 @@ class SubmodelsFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
-    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, regular, known, noise, bounds_met
+    law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     additive : AdditiveModel or None
         The submodels; None where one transfer function was asked for.
@@ -231,7 +231,6 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
             offsets=(laid_out.offset,),
             input_offsets=(laid_out.input_offset,),
             tangent=problem.tangent,
-            regular=problem.data.interval > 0.0,
             known=tuple(names[k] for k in problem.fixed),
             additive=ordered if self.factored else None,
             start_method=method,

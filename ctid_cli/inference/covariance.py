@@ -52,18 +52,7 @@ def condition_number(hessian: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0 else float("inf")
 
 
-#: A clock counts as regular for the noise if 95 % of its intervals are within this fraction of their median.
-NEARLY_REGULAR = 0.05
-
-
-def nearly_regular(times: Array) -> bool:
-    """Return whether lags in samples are lags in time, up to jitter."""
-    intervals = np.diff(times)
-    middle = float(np.median(intervals))
-    return bool(np.mean(np.abs(intervals - middle) <= NEARLY_REGULAR * middle) >= 0.95)
-
-
-def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regular: bool) -> tuple[Array, NoiseModel]:
+def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array]) -> tuple[Array, NoiseModel]:
     r"""Return the covariance ``M^-1 Sigma M^-1`` of an unweighted output-error estimate, and the coloured noise.
 
     With noise v independent of the input (open loop) and ``M = sum psi psi'``,
@@ -72,19 +61,14 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
               = \sum_\tau R_v(\tau) \sum_t \psi_{t+\tau} \psi_t'.
 
     The noise is an autoregression by restricted maximum likelihood (:func:`fit_residual_noise`), common to all
-    experiments.
+    experiments, and ``R_v`` its autocovariance. White residuals give ``s^2 M^-1``.
 
-    *Regular clock*: ``R_v`` is that of this autoregression. White residuals give ``s^2 M^-1``. With missing samples
-    lags count the remaining samples: a stationary noise with samples missing at random, or with a few long gaps, is
-    still nearly stationary.
+    Lags count samples, on irregular clocks and with missing samples too: noise in continuous time that is sampled at
+    random instants, independent of it, is stationary from sample to sample. Measured for such clocks, first- to
+    third-order systems, noise of up to 50 samples' time constant: .92 to 1.02 of the true deviation. Where intervals of
+    .02 and .2 s come in bursts of 100 samples it is .78 to .97.
 
-    *Irregular clock*: a heteroskedasticity and autocorrelation consistent Sigma of ``psi eps`` in the order of the
-    samples: each column is whitened by an autoregression whose order Akaike's criterion chooses, and the covariance of
-    the whitened columns is divided by the autoregressions' gains, times ``N/(N - p)``. It does not require stationary
-    noise from sample to sample, but is less precise: standard errors are more often too large than too small, for step
-    inputs by up to a half. The autoregression of the noise then only determines the effective sample size.
-
-    With feedback from the output to the input the noise is not independent of psi, and neither form is valid.
+    With feedback from the output to the input the noise is not independent of psi, and the formula is not valid.
     """
     size, count = psi[0].shape[1], sum(block.size for block in residuals)
     found = unit_inverse(sum((block.T @ block for block in psi), np.zeros((size, size)))) if count > size else None
@@ -93,24 +77,8 @@ def robust_covariance(psi: Sequence[Array], residuals: Sequence[Array], *, regul
     inverse, scale = found
     scaled = [block * scale for block in psi]
     noise = fit_residual_noise(scaled, residuals)
-    if regular:
-        sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
-        return sandwich(inverse, scale, sigma), noise
-    sigma = _long_run_covariance([block * error[:, None] for block, error in zip(scaled, residuals, strict=True)])
-    return sandwich(inverse, scale, sigma, 1.0 - size / count), noise
-
-
-def _long_run_covariance(scores: Sequence[Array]) -> Array:
-    """Return the covariance of the sum of the rows of independent blocks, by an autoregression for every column."""
-    models = [fit_noise_model([block[:, j] for block in scores]) for j in range(scores[0].shape[1])]
-    start = max(model.order for model in models)
-    white = [np.column_stack([m.innovations(block[:, j]) for j, m in enumerate(models)])[start:] for block in scores]
-    used = sum(block.shape[0] for block in white)
-    if used == 0:
-        return np.full((len(models), len(models)), np.nan)
-    gain = np.array([model.coefficients.sum() for model in models])
-    total = sum((block.T @ block for block in white), np.zeros((len(models), len(models))))
-    return np.asarray(total / np.outer(gain, gain) * sum(block.shape[0] for block in scores) / used)
+    sigma = sum((noise.covariance_of(block) for block in scaled), np.zeros((size, size)))
+    return sandwich(inverse, scale, sigma), noise
 
 
 #: A coefficient or delay whose standard error exceeds its magnitude by this factor is called undetermined.

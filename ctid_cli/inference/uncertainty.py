@@ -42,9 +42,7 @@ class BootstrapT:
         return float(np.quantile(ratios, level))
 
 
-def bootstrap_t(
-    psi: Sequence[Array], noise: NoiseModel, draws: int, *, regular: bool, progress: Progress | None = None
-) -> BootstrapT:
+def bootstrap_t(psi: Sequence[Array], noise: NoiseModel, draws: int, *, progress: Progress | None = None) -> BootstrapT:
     """Draw noise, and estimate from each draw the parameters, to first order, and their covariance.
 
     To first order ``theta + M^-1 sum psi v`` is the estimate and ``v - psi M^-1 sum psi v`` are the residuals.
@@ -59,7 +57,7 @@ def bootstrap_t(
         drawn = [source.generate(np.empty(len(block)), rng) for block in psi]
         errors[k] = solve @ np.concatenate(drawn)
         left = [v - block @ errors[k] for v, block in zip(drawn, psi, strict=True)]
-        covariances[k] = robust_covariance(psi, left, regular=regular)[0]
+        covariances[k] = robust_covariance(psi, left)[0]
         if progress is not None:
             progress(k + 1, draws)
     return BootstrapT(errors, covariances)
@@ -159,7 +157,6 @@ def estimate_uncertainty(
     kind: Covariance,
     draws: int = DRAWS,
     *,
-    regular: bool,
     tangent: Array | None = None,
     progress: Progress | None = None,
 ) -> Uncertainty:
@@ -176,10 +173,10 @@ def estimate_uncertainty(
         found = white_noise_covariance(hessian, sum(float(e @ e) for e in residuals), count)
         kind = "white"
     else:
-        found, noise = robust_covariance(free, residuals, regular=regular)
+        found, noise = robust_covariance(free, residuals)
         effective = noise.effective_count(count)
         if kind == "bootstrap" and np.isfinite(found).all():
-            bootstrap = bootstrap_t(free, noise, draws, regular=regular, progress=progress)
+            bootstrap = bootstrap_t(free, noise, draws, progress=progress)
         kind = "robust" if bootstrap is None else "bootstrap"
     return Uncertainty(kind, basis, found, effective, bootstrap)
 

@@ -62,7 +62,7 @@ def test_white_residuals_keep_the_classical_covariance():
 def test_coloured_residuals_take_the_sandwich():
     result = identify([record_of(colour=0.9)], OPTIONS)
     assert result.uncertainty.kind == "robust"
-    expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=True)
+    expected, noise = robust_covariance(result.fit.sensitivities, result.fit.residuals)
     np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
     b0 = by_name(result)["b0"]
     assert b0.standard_error > 1.5 * np.sqrt(np.diag(result.fit.uncertainty("white").covariance))[1]
@@ -82,18 +82,6 @@ def test_intervals_that_reach_beyond_the_linear_are_called_unsafe():
     quiet, loud = (identify([Record(t, x + level * drawn, step)], options) for level in (0.01, 0.2))
     assert not any("unsafe" in warning for warning in quiet.warnings)
     assert any("unsafe" in warning and "a1" in warning for warning in loud.warnings)
-
-
-@pytest.mark.parametrize(("jitter", "regular"), [(0.002, True), (0.04, False)])
-def test_a_clock_that_jitters_a_little_counts_as_regular(jitter, regular):
-    record = record_of(colour=0.9)
-    t = record.t + np.random.default_rng(2).uniform(-jitter, jitter, record.n_samples)
-    moved = Record(t, record.y, HeldSignal(t, record.input.values))
-    result = identify([moved], OPTIONS)
-    expected, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=regular)
-    np.testing.assert_allclose(result.uncertainty.covariance, expected, rtol=1e-9)
-    other, _ = robust_covariance(result.fit.sensitivities, result.fit.residuals, regular=not regular)
-    assert not np.allclose(expected, other, rtol=1e-3)
 
 
 def test_a_delay_at_its_bound_has_no_standard_error():

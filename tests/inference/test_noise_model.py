@@ -134,7 +134,7 @@ def test_intervals_of_short_records_of_slow_noise_cover():
     for _ in range(200):
         v = noise(rng, [1.0, -0.95], 600)
         error = np.linalg.lstsq(psi, v)[0]
-        covariance, model = robust_covariance([psi], [v - psi @ error], regular=True)
+        covariance, model = robust_covariance([psi], [v - psi @ error])
         reach = student_quantile(max(2.0, model.effective_count(600) - 4))
         covered += np.abs(error) < reach * np.sqrt(np.diag(covariance))
     low, high = binom.ppf([5e-4, 1 - 5e-4], 200, 0.95)
