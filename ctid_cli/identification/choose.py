@@ -158,8 +158,7 @@ class _Choosing:
         if not open_ or self._moves <= {"constant", "steps"}:
             return ranking, setting
         drifting = setting._replace(offset="drift")
-        least, most = self.span.poles
-        span = self.span._replace(poles=(least, min(most, best.order)), integrators=(0,))
+        span = self.span._replace(poles=(self.span.poles[0], best.order), integrators=(0,))
         other = self._grid(drifting, delays, span)
         both = ranked([*ranking.candidates, *other.candidates])
         drift, integrator = both.of(offset="drift"), both.of(integrators=1)
