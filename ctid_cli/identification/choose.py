@@ -17,7 +17,7 @@ from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
 from ctid_cli.identification.choice import Choice, Given
-from ctid_cli.identification.criterion import Ranking, Searched, ranked
+from ctid_cli.identification.criterion import Ranking, Searched
 from ctid_cli.identification.held_back import standing
 from ctid_cli.identification.initial_states import (
     State,
@@ -44,9 +44,6 @@ REACH, FURTHER = 1.5, 3
 AT_END = 0.9
 #: A range this much narrower is worth another grid.
 MUCH_NARROWER = 0.5
-#: An integrator that is better than a drift of the output by less is not believed: with an input that goes on moving it
-#: shows itself by far more. Very strong evidence by Kass and Raftery (1995).
-CLEARLY = 10.0
 #: Criteria that differ by less are equal but for rounding: of integrators alone a state is an offset.
 TIE = 1e-3
 
@@ -97,7 +94,7 @@ class _Choosing:
         self.many, self.all_from_start = (records, True) if whole else parts_of(records, MANY)
         self.several = Several(given.delays_of_inputs, not isinstance(given.zeros, int))
         self.first_hold: Holds = "zoh" if given.hold == "auto" else given.hold
-        self.said: dict[str, str] = {}
+        self.said: list[str] = []
 
     def choice(self) -> Choice:
         """Return what is chosen."""
@@ -117,7 +114,6 @@ class _Choosing:
         while self.given.delays_given is None and _at_end(ranking, delays) and delays[1] < latest:
             delays = 0.0, _rounded(min(2.0 * delays[1], latest))
             ranking = standing(self._grid(setting, delays), self._held(setting))
-        ranking, setting = self._or_drift(ranking, setting, delays)
         said = [*self.about_span, *sentences.of_grid(ranking, delays, self.given, self.time_unit)]
         return self._chosen(ranking.best.options, setting, ranking, said)
 
@@ -143,37 +139,15 @@ class _Choosing:
         fitted = tuple(self._held(setting))
         measured = best.options.prepare(fitted).laid_out
         answer = answer_of(best.options, measured.records, measured.used())
-        said = [*self.said.values(), *about]
+        said = [*self.said, *about]
         said += [sentences.of_criterion(ranking)] * bool(said)
         held = tuple(with_hold(record, setting.hold) for record in self.records)
         return Choice(options, held, fitted, ranking, answer, tuple(said))
 
-    def _or_drift(self, ranking: Ranking, setting: Setting, delays: tuple[float, float]) -> tuple[Ranking, Setting]:
-        """Replace an integrator by a drift of the output, unless it is clearly better.
-
-        Of an input that seldom changes the two are the same, and the integrator stays.
-        """
-        best, given = ranking.best.options, self.given
-        open_ = given.offset is None and given.integrators is None and best.integrators > 0
-        if not open_ or self._moves <= {"constant", "steps"}:
-            return ranking, setting
-        drifting = setting._replace(offset="drift")
-        span = self.span._replace(poles=(self.span.poles[0], best.order), integrators=(0,))
-        other = self._grid(drifting, delays, span)
-        both = ranked([*ranking.candidates, *other.candidates])
-        drift, integrator = both.of(offset="drift"), both.of(integrators=1)
-        assert drift is not None
-        assert integrator is not None
-        behind = drift.best.criterion - integrator.best.criterion
-        if behind > CLEARLY or not drift.best.is_admissible:
-            return ranking, setting
-        self.said["offset"] = sentences.drift_instead(behind)
-        return standing(drift, self._held(setting)), drifting
-
-    def _grid(self, setting: Setting, delays: tuple[float, float], span: Span | None = None) -> Ranking:
+    def _grid(self, setting: Setting, delays: tuple[float, float]) -> Ranking:
         if not self.all_from_start:
             setting = setting._replace(initial_state="estimate", input_before=None)
-        return grid(self._held(setting), setting, span or self.span, delays, self.several)
+        return grid(self._held(setting), setting, self.span, delays, self.several)
 
     def _held(self, setting: Setting) -> list[Record]:
         return [with_hold(record, setting.hold) for record in self.many]
@@ -222,7 +196,7 @@ class _Choosing:
 
     def _setting(self, span: Span, delays: tuple[float, float], near: AnyModel | None = None) -> Setting:
         """Return state, offset and hold, as structures of a span show them; their minima may be near a known model."""
-        self.said = {}
+        self.said = []
         settings = self._settings(delays[1])
         rests = [each for each in settings if each.initial_state == "rest"]
         if len(rests) > 1:
@@ -239,7 +213,7 @@ class _Choosing:
         holds = self._holds()
         if len(holds) > 1:
             compared = models.compared([setting._replace(hold=hold) for hold in holds])
-            self.said["hold"] = sentences.of_hold(compared)
+            self.said.append(sentences.of_hold(compared))
             setting = setting._replace(hold=compared.best.hold)
         return setting
 
@@ -251,12 +225,12 @@ class _Choosing:
             at_rest = rest.best.criterion <= estimated.best.criterion + TIE
             likely = not at_rest or beginning_is_likely(rest.best, models.noise, self.few, length)
             chosen = rest if at_rest and likely else estimated
-            self.said["state"] = sentences.of_state(rest.best, estimated.best, likely)
+            self.said.append(sentences.of_state(rest.best, estimated.best, likely))
         elif self.given.initial_state is None:
             options = models.best.options
-            self.said["state"] = sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART
+            self.said.append(sentences.rest_assumed(options) if self.from_start else sentences.STATE_OF_PART)
         if self.given.offset is None:
-            self.said["offset"] = sentences.of_offset(chosen)
+            self.said.append(sentences.of_offset(chosen))
         return chosen.best.options
 
     # --- what there is to compare ----------------------------------------------------------------------

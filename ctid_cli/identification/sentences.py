@@ -20,14 +20,6 @@ NO_INTEGRATOR = (
 )
 
 
-def drift_instead(behind: float) -> str:
-    """Return why an integrator was left out, from the criterion of a drift above its own."""
-    return (
-        "Offset: drift (--offset), and no integrator, which does not explain the drift clearly better: the criterion "
-        f"is {abs(behind):.3g} {'above' if behind > 0 else 'below'} that with one (--integrators 1 --offset none)."
-    )
-
-
 def spelled(options: Options) -> str:
     """Return a structure in words: poles, zeros and integrators, of each submodel if there are several."""
     if not isinstance(options, MeasuredSubmodels | AdditiveOutputError) or not options.factored:

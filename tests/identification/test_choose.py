@@ -88,13 +88,6 @@ def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
     assert without_drift.options.integrators == 1
 
 
-def test_an_output_that_drifts_beside_a_moving_input_is_no_integrator():
-    record = record_of(SECOND)
-    drifting = replace(record, y=record.y + 0.01 * record.t)
-    options = choose(drifting).options
-    assert (options.poles, options.zeros, options.integrators, options.offset) == (2, 0, 0, "drift")
-
-
 @pytest.mark.parametrize("why", ["undetermined", "undamped"])
 def test_what_is_no_candidate_comes_last_and_tells_nothing_of_the_noise(why):
     best, other, *_ = choose(record_of(SECOND)).ranking.candidates
