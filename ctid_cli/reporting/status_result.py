@@ -78,6 +78,7 @@ class StatusResult(Result):
             sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
+            aside += " To see them, run their specification again; nothing is computed anew."
             sections.append(Section(sentences=[aside]))
         return [*sections, Section(sentences=self._next())]
 

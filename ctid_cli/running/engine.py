@@ -72,6 +72,8 @@ class RunSummary:
     #: Duration [s].
     seconds: float
     stopped_by: str | None
+    #: Settings of the run before, as in its plan; None without results of one.
+    former: dict[str, Any] | None = None
     #: How well each data cell is known; empty where the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()
     #: Estimator and replicate of estimates that the machine did not let finish, and what was in their way.
@@ -170,6 +172,7 @@ def run_experiment(
             # Until workers are at work, a signal ends the process as it ends any other.
             warm(plan)
         stack.enter_context(stopping)
+        former = log.manifest()["spec"] if states.stored else None
         run = _Run(plan, states, work, folder, log, progress)
         stack.callback(retract, folder)
         run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
@@ -177,7 +180,7 @@ def run_experiment(
         while more:
             run.compute(workers, limits, stopping)
             more = not stopping() and run.needs_more()
-        return run.finish(stopping.reason, moved, begun)
+        return replace(run.finish(stopping.reason, moved, begun), former=former)
 
 
 class _Run:
