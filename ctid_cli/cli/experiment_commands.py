@@ -266,7 +266,9 @@ def _changed(plan: Plan, summary: RunSummary) -> str:
     if not changed:
         return ""
     more = f"; and {len(changed) - CHANGES} more" if len(changed) > CHANGES else ""
-    text = f"{count(summary.left_aside, 'stored estimate')} of {summary.experiment} set aside, not deleted: this run has "
+    text = (
+        f"{count(summary.left_aside, 'stored estimate')} of {summary.experiment} set aside, not deleted: this run has "
+    )
     return (
         f"{text}{'; '.join(changed[:CHANGES])}{more}. To see them, run their specification again, which computes "
         "nothing anew; to keep both in view, give one of them another name (experiment: NAME)"
@@ -285,8 +287,12 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
         section, sets = plan.spec.monte_carlo, plan.data_sets
         at_most = section.most if section is not None and section.until is not None else None
         cells, estimates = len(plan.data_cells), sets * plan.estimates_each
+        # Measured records, and signals, have no such field.
+        noise_free = all(getattr(cell.source, "noise", True) is None for cell in plan.data_cells)
         warnings = list(plan.spec.warnings)
-        emit(ValidationResult(config, plan.experiment, sets, cells, estimates, at_most, warnings), form.form)
+        emit(
+            ValidationResult(config, plan.experiment, sets, cells, estimates, at_most, warnings, noise_free), form.form
+        )
 
 
 @guarded
