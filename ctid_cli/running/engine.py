@@ -18,7 +18,7 @@ from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
-from ctid_cli.running.limits import MACHINE, TOO_MANY_FAILURES, Limits, StopRequest, advice
+from ctid_cli.running.limits import MACHINE, PATIENCE, TOO_MANY_FAILURES, Limits, StopRequest, advice
 from ctid_cli.running.plan import Plan, current_origin
 from ctid_cli.running.states import States, Workload, as_needed, data_sets, jobs_of, stored_precisions
 from ctid_cli.running.suspects import NAMED, Course
@@ -239,7 +239,7 @@ class _Run:
                 for outcomes in found:
                     if stopping() and not told:
                         told = True
-                        what = "waiting for what is in work; once more to stop at once"
+                        what = f"{PATIENCE:g} s for what is in work; once more to stop at once"
                         self._tell(message=f"stopping ({stopping.reason}): {what}")
                     batch += outcomes
                     if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):
