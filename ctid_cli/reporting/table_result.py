@@ -59,8 +59,8 @@ OF_RECORDS = (
     *("id", "status", "delay", "numerator", "denominator", "standard_errors"),
     *("fit_percent", "validation_fit_percent"),
 )
-#: Measures that single large errors can determine. That is said where their Monte Carlo error is above this share of
-#: them, of so many data sets or more: of normal errors the share is 1/sqrt(2 n), 0.22 of ten.
+#: Measures that single large errors can determine. That is said where their Monte Carlo error is above a share of them
+#: and there are at least a few data sets: of normal errors the share is 1/sqrt(2 n), 0.22 of ten.
 OF_SQUARES, WIDE, FEW = ("rmse", "deviation"), 0.5, 10
 #: Estimators, and estimates of a measured record, before a table goes on below.
 ESTIMATORS_PER_BLOCK = 2
