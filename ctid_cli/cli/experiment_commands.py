@@ -52,7 +52,8 @@ _STOPPED = {
     "failures": "stopped because estimates failed, as was asked for",
     "machine": "stopped because the machine did not let estimates finish",
 }
-
+#: Changed settings that are named.
+CHANGES = 3
 
 Dask = Annotated[
     str | None,
@@ -98,9 +99,13 @@ class SpecOptions:
                 both = f"{seen[plan.experiment]} and {config} both describe the experiment {plan.experiment!r}"
                 raise UsageError(f"{both}; run them one at a time, or give one of them another name")
             seen[plan.experiment] = config
-            for warning in plan.spec.warnings:
-                typer.echo(printable(f"warning: {warning}"), err=True)
+            self.warn(plan)
         return plans
+
+    def warn(self, plan: Plan) -> None:
+        """Print what is allowed in a specification but unwise."""
+        for warning in plan.spec.warnings:
+            typer.echo(printable(f"warning: {warning}"), err=True)
 
 
 @dataclass(frozen=True)
@@ -208,6 +213,8 @@ def _run_all(
             summary = run_experiment(plan, folder, stop=stop, progress=reporter, **how)
         if not quiet:
             typer.echo(_conclusion(summary, place.out, part))
+        if changed := _changed(plan, summary):
+            typer.echo(printable(f"warning: {changed}"), err=True)
         if summary.exit_code == ExitCode.MACHINE:
             raise summary.machine_error()
         if summary.exit_code:
@@ -250,6 +257,25 @@ def _conclusion(summary: RunSummary, out: Path, part: Shard | None) -> str:
     return "\n".join([*lines, f"  next: ctid table {name}{option}"])
 
 
+def _changed(plan: Plan, summary: RunSummary) -> str:
+    """Name the settings that have changed since estimates were stored that are set aside; empty without any."""
+    from ctid_cli.reporting.results import differences
+
+    if not summary.left_aside or summary.former is None:
+        return ""
+    changed = differences(plan.spec.canonical(), summary.former, ())
+    if not changed:
+        return ""
+    more = f"; and {len(changed) - CHANGES} more" if len(changed) > CHANGES else ""
+    text = (
+        f"{count(summary.left_aside, 'stored estimate')} of {summary.experiment} set aside, not deleted: this run has "
+    )
+    return (
+        f"{text}{'; '.join(changed[:CHANGES])}{more}. To see them, run their specification again, which computes "
+        "nothing anew; to keep both in view, give one of them another name (experiment: NAME)"
+    )
+
+
 @guarded
 def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
     """Check experiment files without running them.
@@ -262,8 +288,12 @@ def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
         section, sets = plan.spec.monte_carlo, plan.data_sets
         at_most = section.most if section is not None and section.until is not None else None
         cells, estimates = len(plan.data_cells), sets * plan.estimates_each
+        # Measured records, and signals, have no such field.
+        noise_free = all(getattr(cell.source, "noise", True) is None for cell in plan.data_cells)
         warnings = list(plan.spec.warnings)
-        emit(ValidationResult(config, plan.experiment, sets, cells, estimates, at_most, warnings), form.form)
+        emit(
+            ValidationResult(config, plan.experiment, sets, cells, estimates, at_most, warnings, noise_free), form.form
+        )
 
 
 @guarded

@@ -12,12 +12,14 @@ import typer
 
 from ctid_cli.cli._common import Fresh, Jobs, Out, Runs, emit, guarded
 from ctid_cli.cli._options import FormatOptions, flag
+from ctid_cli.cli.experiment_commands import EndOptions, PlaceOptions, SpecOptions, run
 from ctid_cli.errors import MismatchError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ctid_cli.reporting.study import Study
+    from ctid_cli.running.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,22 @@ class Actions:
         return given[0] if given else "run"
 
 
+@dataclass(frozen=True)
+class PublishedSpecs(SpecOptions):
+    """Specifications of studies, in which what is unwise is on purpose."""
+
+    def warn(self, plan: Plan) -> None:
+        """Say nothing."""
+
+
 @guarded
 def reproduce(
     actions: Actions,
     form: FormatOptions,
-    names: Annotated[list[str] | None, typer.Argument(metavar="STUDY", help="Studies; all by default.")] = None,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME", help="Studies, or experiments as --list names them; all by default."),
+    ] = None,
     runs: Runs = None,
     jobs: Jobs = None,
     out: Out = Path("results"),
@@ -60,10 +73,11 @@ def reproduce(
     (exit code 7 if one does not hold). --publish is refused unless one commit of this repository, without changes,
     computed all results. A study runs the code that its own specifications name, as part of the repository.
     """
-    from ctid_cli.cli.experiment_commands import EndOptions, PlaceOptions, SpecOptions, run
-    from ctid_cli.reporting.study import all_studies, find_study, last_part
+    from ctid_cli.reporting.study import find_studies, last_part
 
-    studies = [find_study(name) for name in names or all_studies()]
+    studies = find_studies(names or [])
+    if actions.chosen in ("publish", "first", "update_first"):
+        _require_whole(studies)
     match actions.chosen:
         case "list":
             _list(studies, form)
@@ -75,9 +89,18 @@ def reproduce(
             for study in studies:
                 configs = [study.config(last_part(name)) for name in study.configs]
                 place = PlaceOptions(out=out, fresh=fresh)
-                run(configs, spec=SpecOptions(), place=place, end=EndOptions(), jobs=jobs, runs=runs)
+                run(configs, spec=PublishedSpecs(), place=place, end=EndOptions(), jobs=jobs, runs=runs)
         case first:
             _compute_first(studies, jobs, update=first == "update_first")
+
+
+def _require_whole(studies: Sequence[Study]) -> None:
+    """Refuse some experiments of a study where only the whole study can be published or compared."""
+    from ctid_cli.reporting.study import find_study
+
+    for study in studies:
+        if study.configs != find_study(study.name).configs:
+            raise UsageError(f"--publish, --first and --update-first take whole studies; write {study.name}")
 
 
 def _list(studies: Sequence[Study], form: FormatOptions) -> None:
@@ -89,7 +112,7 @@ def _list(studies: Sequence[Study], form: FormatOptions) -> None:
 def _check(studies: Sequence[Study], out: Path, form: FormatOptions) -> None:
     """Test the claims of studies, and compare the tables of the one that has any."""
     from ctid_cli.reporting.comparison_result import check_tables
-    from ctid_cli.reporting.study import DEFAULT_STUDY
+    from ctid_cli.reporting.study import tables_of
     from ctid_cli.studies.catalogue import read_study
     from ctid_cli.studies.claims import check_claims
 
@@ -98,8 +121,9 @@ def _check(studies: Sequence[Study], out: Path, form: FormatOptions) -> None:
         found = check_claims(read_study(study, out))
         emit(found, form.form)
         failed += [f"{study.name}: {len(found.failed)} claims do not hold"] if found.failed else []
-        if study.name == DEFAULT_STUDY:
-            comparison = check_tables([], out)
+        tables = sorted({str(number) for name in study.configs for number in tables_of(name)})
+        if tables:
+            comparison = check_tables(tables, out)
             emit(comparison, form.form)
             failed += [] if comparison.mismatches.empty else [comparison.verdict]
     if failed:

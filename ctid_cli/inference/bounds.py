@@ -20,7 +20,7 @@ from ctid_cli.inference.sensitivities import Structure, sensitivities
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.controller import DiscreteController
 from ctid_cli.models.factoring import factored, factored_jacobian
-from ctid_cli.models.transfer_function import TransferFunction
+from ctid_cli.models.transfer_function import TransferFunction, cancelled
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.noise import ArmaNoise, Noise
 from ctid_cli.signals.record import Enters, Record
@@ -143,7 +143,10 @@ def accuracy_of_records(
     """Return the accuracy on simulated records of a system, averaged over them."""
     covariance = np.mean([_record_covariance(form, system, record, noise) for record in records], axis=0)
     if not np.isfinite(covariance).all():
-        raise DataError("the data would not determine the parameters, even without noise")
+        model = form.model
+        place = cancelled(model.numerator, model.denominator) if isinstance(model, TransferFunction) else ""
+        why = f": a zero cancels the pole at s = {place}" if place else ""
+        raise DataError(f"the data would not determine the parameters, even without noise{why}")
     parameters = ParameterAccuracy.of(form.model, covariance, form.zeros, form.delay_from is not None)
     # Instruments other than the input are not optimal.
     best = form.instruments == "open_loop"

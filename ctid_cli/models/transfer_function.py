@@ -10,6 +10,9 @@ from ctid_cli.arrays import Array, ComplexArray
 from ctid_cli.errors import DataError
 from ctid_cli.signals.checks import freeze
 
+#: Relative distance of a pole and a zero that cancel: the rounding of double roots.
+CANCELLED = 1e-7
+
 
 class ContinuousModel(ABC):
     """A linear model in continuous time."""
@@ -105,6 +108,15 @@ class TransferFunction(ContinuousModel):
         s = 1j * np.asarray(frequencies, dtype=float)
         gain = np.polyval(self.numerator, s) / np.polyval(self.denominator, s) * np.exp(-s * self.delay)
         return np.asarray(gain, dtype=complex)
+
+
+def cancelled(numerator: Array, denominator: Array) -> str:
+    """Return a pole that a zero cancels, as text; empty without any."""
+    zeros = sorted_roots(numerator)
+    for pole in sorted_roots(denominator):
+        if (np.abs(zeros - pole) <= CANCELLED * np.abs(pole)).any():
+            return f"{pole.real:.4g}" if pole.imag == 0 else f"{pole.real:.4g} ± {abs(pole.imag):.4g}j"
+    return ""
 
 
 def sorted_roots(coefficients: Array) -> ComplexArray:

@@ -35,14 +35,18 @@ class AccuracyResult(Result):
     estimates: Sequence[Mapping[str, Any]]
     #: Number of combinations of swept settings that are not shown.
     left_out: int
-    #: None where the experiment has no stored results.
+    #: None where no setting has enough stored data sets for a comparison.
     surprises: Sequence[str] | None
+    #: Greatest number of stored data sets of a setting; 0 without results.
+    data_sets: int = 0
 
     @classmethod
     def of(cls, plan: Plan, results: Results | None = None) -> AccuracyResult:
         """Return the expected accuracy of every estimator of an experiment, and what its results show beside it."""
         estimates, left_out = expectations(plan)
-        return cls(plan.experiment, estimates, left_out, None if results is None else surprises(results))
+        most = 0 if results is None else max(cell["replicates"] for cell in results.manifest["data_cells"])
+        found = surprises(results) if results is not None and most >= FEWEST else None
+        return cls(plan.experiment, estimates, left_out, found, most)
 
     def sections(self) -> list[Section]:
         """Return tables of standard errors, the formulas that they come from, and what is unexpected."""
@@ -68,9 +72,12 @@ class AccuracyResult(Result):
         ]
 
     def _surprises(self) -> Section:
+        if self.surprises is None:
+            few = f"The stored estimates are not compared with theory: that takes {FEWEST} data sets of a setting."
+            return Section("", [few] if self.data_sets else [])
         if not self.surprises:
             agree = f"The stored estimates are as expected; those of fewer than {FEWEST} data sets are not compared."
-            return Section("", [] if self.surprises is None else [agree])
+            return Section("", [agree])
         return Section("Unexpected in the stored estimates:", [f"- {text}" for text in self.surprises])
 
     def to_frame(self) -> pd.DataFrame:

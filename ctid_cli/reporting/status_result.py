@@ -78,6 +78,7 @@ class StatusResult(Result):
             sections += [Section(frame=found[["status", "estimates"]], notes=notes), *self._failed()]
         if status.left_aside:
             aside = f"{status.left_aside} stored estimates are set aside: the latest run asked for others."
+            aside += " To see them, run their specification again; nothing is computed anew."
             sections.append(Section(sentences=[aside]))
         return [*sections, Section(sentences=self._next())]
 
@@ -291,13 +292,16 @@ class ValidationResult(Result):
     #: Most data sets of a cell, where their number follows from a precision.
     at_most: int | None
     warnings: Sequence[str] = ()
+    #: Whether data are simulated, and none of them with noise.
+    without_noise: bool = False
 
     def sections(self) -> list[Section]:
-        """Return the counts in one sentence."""
+        """Return the counts in one sentence, and whether there is no noise."""
         counts = f"{count(self.data_sets, 'data set')} ({count(self.data_cells, 'data cell')})"
         text = f"{self.file}: ok, {self.experiment}: {counts}, {count(self.estimates, 'estimate')}"
         text += "" if self.at_most is None else f"; at most {self.at_most} data sets of a cell"
-        return [Section(lines=[text])]
+        noise_free = ["  The data are without noise: the file has no section noise."] * self.without_noise
+        return [Section(lines=[text, *noise_free])]
 
     def content(self) -> dict[str, Any]:
         """Return the counts for JSON."""

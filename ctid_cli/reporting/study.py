@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
@@ -110,6 +110,10 @@ class Study:
         """Specification of one of its experiments."""
         return data_folder("configs") / self.configs[self.experiment(short)]
 
+    def only(self, names: Collection[str]) -> Study:
+        """The study with some of its experiments."""
+        return replace(self, experiments={name: item for name, item in self.experiments.items() if name in names})
+
     def plan(self, short: str, overrides: Sequence[str] = ()) -> Plan:
         """Plan of one of its experiments."""
         return build_plan(load_spec(self.config(short), overrides))
@@ -167,6 +171,18 @@ def find_study(name: str = DEFAULT_STUDY) -> Study:
     if name not in studies:
         raise UsageError(f"there is no study named {name!r}; there are {', '.join(studies)}")
     return studies[name]
+
+
+def find_studies(names: Sequence[str]) -> list[Study]:
+    """Studies by their names, all without any; by names of experiments the studies with these experiments only."""
+    chosen: dict[str, list[str]] = {}
+    for name in names or all_studies():
+        study = find_study(name.partition("/")[0])
+        if name not in (study.name, *study.experiments):
+            has = ", ".join(study.experiments)
+            raise UsageError(f"the study {study.name} has no experiment named {name!r}; it has {has}")
+        chosen.setdefault(study.name, []).extend(study.experiments if name == study.name else [name])
+    return [find_study(study).only(experiments) for study, experiments in chosen.items()]
 
 
 def last_part(experiment: str) -> str:

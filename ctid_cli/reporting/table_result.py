@@ -59,6 +59,9 @@ OF_RECORDS = (
     *("id", "status", "delay", "numerator", "denominator", "standard_errors"),
     *("fit_percent", "validation_fit_percent"),
 )
+#: Measures that single large errors can determine. That is said where their Monte Carlo error is above a share of them
+#: and there are at least a few data sets: of normal errors the share is 1/sqrt(2 n), 0.22 of ten.
+OF_SQUARES, WIDE, FEW = ("rmse", "deviation"), 0.5, 10
 #: Estimators, and estimates of a measured record, before a table goes on below.
 ESTIMATORS_PER_BLOCK = 2
 ESTIMATES_PER_BLOCK = 3
@@ -237,12 +240,23 @@ def measure_table(results: Results, names: Sequence[str], remarks: Sequence[str]
     for name, measure in measures.items():
         kind = measure.source if measure.source in ("errors", "status") else "estimates"
         tables.setdefault("poles" if name.endswith(":poles") else kind, []).append(name)
-    shown = [Section(frame=_measured(frame[frame["measure"].isin(own)], measures)) for own in tables.values()]
+    present = frame[(frame["measure"] != "failures") | (frame["value"] != 0)]
+    parts = [part for own in tables.values() if len(part := present[present["measure"].isin(own)])]
+    shown = [Section(frame=_measured(part, measures)) for part in parts]
     told = {name.partition(":")[0]: measure.meaning for name, measure in measures.items()}
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in told.items())
     foot = f"{meanings}. ± is one Monte Carlo standard error, [ ] a 95 % interval; --format csv and json have both."
     if frame["without_value"].any():
         foot += " n: estimates that count; no value: those without what is measured, failed ones among them."
+    if len(present) < len(frame):
+        foot += " Statuses that no estimate ended with are left out."
+    squared = frame["measure"].str.partition(":")[0].isin(OF_SQUARES)
+    wide = squared & (frame["error"] > WIDE * frame["value"]) & (frame["n"] >= FEW)
+    if wide.any() and "robust_deviation" not in told:
+        foot += (
+            " Where ± exceeds half of the value, few large errors determine it; --measure median_bias,robust_deviation"
+        )
+        foot += " tells of the other estimates."
     return TableResult(records_of(frame), [Section(results.experiment), *shown, Section(notes=[foot])], remarks)
 
 
@@ -254,7 +268,9 @@ def _measured(frame: pd.DataFrame, measures: Mapping[str, Measure]) -> pd.DataFr
     most = counted.groupby(place).transform("max")
     first = frame[["failed", "without_value"]].assign(fewer=counted < most, place=place)
     first = first.sort_values("fewer", kind="stable").groupby("place").first()
-    counts = {"n": most.astype(str), "failed": place.map(first["failed"]).astype(str)}
+    counts = {"n": most.astype(str)}
+    if not frame["measure"].isin(["failures"]).any():
+        counts["failed"] = place.map(first["failed"]).astype(str)
     if frame["without_value"].any():
         counts["no value"] = place.map(first["without_value"]).astype(str)
     titles = {name: _title(name, measure) for name, measure in measures.items()}

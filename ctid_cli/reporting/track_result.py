@@ -27,6 +27,8 @@ from ctid_cli.tones.track import Track
 from ctid_cli.tones.track_warnings import track_warnings
 
 TURN = 2.0 * math.pi
+#: Factor by which an amplitude changes that is said to grow or fall [-].
+MUCH = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,20 @@ class TrackResult(PagedResult):
         note += "tone moves."
         note += " A standard error (±) is that of the mean frequency." if np.isfinite(track.error).any() else ""
         note += " Valid is a share of the rows where the tone is there." if partly else ""
-        return [Section.table(rows, columns, notes=[note])]
+        return [Section.table(rows, columns, notes=[note, *self._changes()])]
+
+    def _changes(self) -> Iterator[str]:
+        """Yield which amplitudes grow or fall much, from the first to the last tenth of the valid rows of the tone."""
+        unit = f" {self.signal.unit}" if self.signal and self.signal.unit else ""
+        for k in range(self.track.omega.shape[1]):
+            amplitudes = self.track.amplitudes[self.track.valid[:, k] & np.isfinite(self.track.amplitudes[:, k]), k]
+            if not amplitudes.size:
+                continue
+            tenth = max(amplitudes.size // 10, 1)
+            first, last = float(np.median(amplitudes[:tenth])), float(np.median(amplitudes[-tenth:]))
+            if max(first, last) > MUCH * min(first, last):
+                way = "grows" if last > first else "falls"
+                yield f"The amplitude of tone {k + 1} {way} from {first:.3g} to {last:.3g}{unit}."
 
     def drawing(self) -> Drawing:
         """Return the figure of frequencies and amplitudes over time."""

@@ -19,7 +19,7 @@ from typing import Any
 
 from ctid_cli.errors import DataError, MachineError, RefusedError, UsageError
 from ctid_cli.running.job import Begun, Job
-from ctid_cli.running.limits import Limits
+from ctid_cli.running.limits import Limits, StopRequest
 from ctid_cli.running.plan import Plan, computing_parts
 from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alone, in_parallel, packed, unpacked
 from ctid_cli.signals.files import COPIES
@@ -70,15 +70,21 @@ class DaskWorkers:
                 raise MachineError(f"{self._address} has no worker; {start}. What was finished is stored")
         return max(self.count, 1)
 
-    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
+    def results(self, jobs: Iterator[Job], stopping: StopRequest) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
-        return self._computed(jobs, compute_there, self._look)
+        return self._computed(jobs, compute_there, self._look, stopping)
 
-    def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
+    def alone(self, jobs: Iterator[Job], at_once: int, stopping: StopRequest) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
-        return self._computed(jobs, compute_alone, lambda: min(at_once, self._look()))
+        return self._computed(jobs, compute_alone, lambda: min(at_once, self._look()), stopping)
 
-    def _computed(self, jobs: Iterator[Job], function: Callable[..., Ending], at_once: Callable[[], int]) -> Results:
+    def _computed(
+        self,
+        jobs: Iterator[Job],
+        function: Callable[..., Ending],
+        at_once: Callable[[], int],
+        stopping: StopRequest,
+    ) -> Results:
         def submit(job: Job, task: Task) -> Future[Ending]:
             future: Future[Ending] = self._executor.submit(
                 on_worker, function, task, self._limits, self._expected, self._files
@@ -87,6 +93,8 @@ class DaskWorkers:
 
         for over in in_parallel(jobs, submit, at_once, _died):
             if over is None:
+                if stopping.overdue:
+                    return
                 self._look()
             yield over
 

@@ -18,7 +18,7 @@ from ctid_cli.errors import MachineError, RefusedError
 from ctid_cli.inference.monte_carlo import CellPrecision
 from ctid_cli.processors import usable_processors
 from ctid_cli.running.job import Job
-from ctid_cli.running.limits import MACHINE, TOO_MANY_FAILURES, Limits, StopRequest, advice
+from ctid_cli.running.limits import MACHINE, PATIENCE, TOO_MANY_FAILURES, Limits, StopRequest, advice
 from ctid_cli.running.plan import Plan, current_origin
 from ctid_cli.running.states import States, Workload, as_needed, data_sets, jobs_of, stored_precisions
 from ctid_cli.running.suspects import NAMED, Course
@@ -72,6 +72,8 @@ class RunSummary:
     #: Duration [s].
     seconds: float
     stopped_by: str | None
+    #: Settings of the run before, as in its plan; None without results of one.
+    former: dict[str, Any] | None = None
     #: How well each data cell is known; empty where the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()
     #: Estimator and replicate of estimates that the machine did not let finish, and what was in their way.
@@ -170,6 +172,7 @@ def run_experiment(
             # Until workers are at work, a signal ends the process as it ends any other.
             warm(plan)
         stack.enter_context(stopping)
+        former = log.manifest()["spec"] if states.stored else None
         run = _Run(plan, states, work, folder, log, progress)
         stack.callback(retract, folder)
         run.start(origin, {"jobs": workers.count, "limits": asdict(limits)}, kept)
@@ -177,7 +180,7 @@ def run_experiment(
         while more:
             run.compute(workers, limits, stopping)
             more = not stopping() and run.needs_more()
-        return run.finish(stopping.reason, moved, begun)
+        return replace(run.finish(stopping.reason, moved, begun), former=former)
 
 
 class _Run:
@@ -236,7 +239,7 @@ class _Run:
                 for outcomes in found:
                     if stopping() and not told:
                         told = True
-                        what = "waiting for what is in work; once more to stop at once"
+                        what = f"{PATIENCE:g} s for what is in work; once more to stop at once"
                         self._tell(message=f"stopping ({stopping.reason}): {what}")
                     batch += outcomes
                     if batch and (time.monotonic() - since >= COMMIT_SECONDS or len(batch) >= COMMIT_ESTIMATES):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import faulthandler
+import math
 import os
 import re
 import resource
@@ -141,6 +142,8 @@ def advice(reason: str) -> str:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+#: How long a stop waits for what is in work [s].
+PATIENCE = 5.0
 #: Reasons that are no signals.
 TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 
@@ -148,8 +151,8 @@ TIME_BUDGET, TOO_MANY_FAILURES, MACHINE = "time budget", "failures", "machine"
 class StopRequest:
     """Notices requests to stop; signals, while it is entered.
 
-    The first signal is only noted, so that what is in work can be finished and stored. The second ends the process at
-    once, as without a handler; the workers end with it, and the journal is made for that.
+    The first signal is only noted, so that what is in work has a few seconds to be finished and stored. The second ends
+    the process at once, as without a handler; the workers end with it, and the journal is made for that.
     """
 
     def __init__(self, *, failures: int | None = None, seconds: float | None = None) -> None:
@@ -157,6 +160,7 @@ class StopRequest:
         self.failures = failures
         self._deadline = None if seconds is None else time.monotonic() + seconds
         self._reason: str | None = None
+        self._since = math.inf
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -179,11 +183,17 @@ class StopRequest:
 
     def ask(self, reason: str) -> None:
         """Ask for a stop; the first reason counts."""
-        self._reason = self._reason or reason
+        if self._reason is None:
+            self._reason, self._since = reason, time.monotonic()
 
     def __call__(self) -> bool:
         """Return whether a stop was asked for."""
         return self.reason is not None
+
+    @property
+    def overdue(self) -> bool:
+        """Whether a stop was asked for so long ago that nothing in work is waited for any more."""
+        return time.monotonic() > self._since + PATIENCE
 
     @property
     def reason(self) -> str | None:

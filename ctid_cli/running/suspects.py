@@ -17,7 +17,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING
 
 from ctid_cli.running.job import Job, Short
-from ctid_cli.running.limits import Limits
+from ctid_cli.running.limits import Limits, StopRequest
 from ctid_cli.running.workers import Ending
 from ctid_cli.storage.columns import failed
 from ctid_cli.storage.manifest import Outcome
@@ -47,7 +47,7 @@ class Course:
         jobs: Iterator[Job],
         workers: LocalWorkers | DaskWorkers,
         limits: Limits,
-        stopping: Callable[[], bool],
+        stopping: StopRequest,
         tell: Callable[[str], object],
     ) -> None:
         self._jobs, self._workers, self._limits, self._stopping, self._tell = jobs, workers, limits, stopping, tell
@@ -92,7 +92,7 @@ class Course:
                 jobs, at_once, tries = self._undecided, 1, 2
                 self._undecided = []
             wanted = itertools.takewhile(lambda _: not self._stopping(), jobs)
-            with closing(self._workers.alone(wanted, at_once)) as results:
+            with closing(self._workers.alone(wanted, at_once, self._stopping)) as results:
                 yield from self._settled(results, tries)
         self._short = 0
 
@@ -130,7 +130,7 @@ class Course:
             self._again.append(job.only(rest))
         if in_work and (tries == 0 or outcomes):
             self._suspects.append(job.only(in_work))
-        elif in_work:
+        elif in_work and not self._stopping.overdue:
             outcomes += self._decided(job.only(in_work), ending, tries)
         return outcomes
 

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 from ctid_cli import custom_code
 from ctid_cli.running.job import Begun, Entry, Job, ended, run_job
-from ctid_cli.running.limits import Limits
+from ctid_cli.running.limits import Limits, StopRequest
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.manifest import Key, Outcome
 
@@ -287,7 +287,7 @@ class LocalWorkers:
         #: The records of what is in work, and what will come of it.
         self._at_work: dict[Job, tuple[Path, Future[Ending]]] = {}
 
-    def results(self, jobs: Iterator[Job], stopping: Callable[[], bool]) -> Results:
+    def results(self, jobs: Iterator[Job], stopping: StopRequest) -> Results:
         """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while.
 
         If a worker dies, what was in work is yielded last, with what is known of it, and no further jobs are taken. The
@@ -317,16 +317,16 @@ class LocalWorkers:
                 stop.touch()
             return 0 if self.trouble else self.count + 1
 
-        yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died)
+        yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died, stopping)
 
-    def alone(self, jobs: Iterator[Job], at_once: int) -> Results:
+    def alone(self, jobs: Iterator[Job], at_once: int, stopping: StopRequest) -> Results:
         """Compute jobs each in a process of its own, some at the same time."""
 
         def died(job: Job, error: Exception) -> Ending:
             raise error
 
         with ThreadPoolExecutor(at_once) as threads:
-            yield from self._computed(jobs, compute_alone, threads.submit, lambda: at_once, died)
+            yield from self._computed(jobs, compute_alone, threads.submit, lambda: at_once, died, stopping)
 
     def _computed(
         self,
@@ -335,6 +335,7 @@ class LocalWorkers:
         submit: Callable[..., Future[Ending]],
         at_once: Callable[[], int],
         died: Callable[[Job, Exception], Ending],
+        stopping: StopRequest,
     ) -> Results:
         """Compute jobs, each with a folder for its record, and end what exceeds its time."""
 
@@ -347,7 +348,7 @@ class LocalWorkers:
         try:
             for over in in_parallel(jobs, begin, at_once, died):
                 if over is None:
-                    self._watch()
+                    self._watch(stopping)
                 elif over[0] in self._at_work:
                     record, _ = self._at_work.pop(over[0])
                     shutil.rmtree(record.parent, ignore_errors=True)
@@ -360,12 +361,14 @@ class LocalWorkers:
                 time.sleep(TICK)
             self._at_work.clear()
 
-    def _watch(self) -> None:
-        """Kill what its own watchdog should have ended long ago: a process that is stopped has none."""
+    def _watch(self, stopping: StopRequest) -> None:
+        """Kill what goes on after a stop, or what its own watchdog should have ended: a stopped process has none."""
         limit = self._limits.wall_seconds
-        if limit is None:
-            return
         for record, _ in self._at_work.values():
+            if stopping.overdue:
+                _kill(record)
+            if limit is None:
+                continue
             with suppress(OSError):
                 seconds = time.time() - record.stat().st_mtime
                 # What it imports before its first estimate counts for none.

@@ -9,6 +9,7 @@ import numpy as np
 from ctid_cli.errors import DataError
 from ctid_cli.models.additive import degrees_of
 from ctid_cli.models.controller import Relay
+from ctid_cli.models.transfer_function import TransferFunction, cancelled
 from ctid_cli.signals.noise import stream
 from ctid_cli.specification.joint_checks import MAX_TRIALS, cases_of
 from ctid_cli.specification.messages import Complaint
@@ -61,6 +62,13 @@ def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
         short = f"a record of {duration:.4g} s{delayed} shows little of the slowest pole"
         cure = f"it must last {needed:.3g} s or more"
         yield ("duration",), f"{short}, whose time constant is {slowest:.4g} s; {cure}"
+
+
+def _of_cancellation(system: Any) -> Iterator[Complaint]:
+    for part in getattr(system, "submodels", [system] if isinstance(system, TransferFunction) else []):
+        if place := cancelled(part.numerator, part.denominator):
+            cure = "leave both out, unless that is the point"
+            yield ("system",), f"a zero cancels the pole at s = {place}, so that no data determine either; {cure}"
 
 
 def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Complaint]:
@@ -159,6 +167,6 @@ def _of_warnings(estimator: Any, signal: Any, sampling: Any) -> Iterator[Complai
 
 
 CHECKS = (
-    *(_of_runs, _of_slow_sampling, _of_short_record),
+    *(_of_runs, _of_slow_sampling, _of_short_record, _of_cancellation),
     *(_of_open_loop, _of_delay, _of_white_formula, _of_structure, _of_whole_record, _of_warnings),
 )

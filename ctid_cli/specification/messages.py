@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from typing import Any
 
@@ -39,6 +39,8 @@ SENTENCES = {
     "too_long": "must be a list of at most {max_length}, not {shown}{meaning}",
     "model_type": "must be a mapping with the keys {keys}, not {shown}",
     "extra_forbidden": "there is no such key here{near} allowed: {keys}",
+    "decimal_comma": "there is no such key here; if it is a part of a number, write a decimal point, as in 0.5",
+    "no_colon": "there is no such key here; write a colon after {word}",
     "missing": "is missing; add it{meaning}",
     "no_kind": "must be one of {allowed}, not {shown}",
     "kind_missing": "is missing; allowed: {allowed}",
@@ -62,10 +64,10 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
-    path, kind, value, context = _told(path, kind, value, context)
+    path, kind, value, context = _told(path, kind, value, context, descriptions)
     if kind not in SENTENCES:
         return path, error["msg"]
-    if kind in ("missing", "extra_forbidden"):
+    if kind in ("missing", "extra_forbidden", "decimal_comma", "no_colon"):
         path = (*path, KEY)
     words = _words(path, descriptions) | {"shown": shown(value)} | context
     if kind == "literal_error":
@@ -74,7 +76,9 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
     return path, SENTENCES[kind].format(**words) + _hint(kind, value, words) + "".join(hints)
 
 
-def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tuple[KeyPath, str, Any, dict[str, Any]]:
+def _told(
+    path: KeyPath, kind: str, value: Any, context: dict[str, Any], known: Collection[str]
+) -> tuple[KeyPath, str, Any, dict[str, Any]]:
     """Return what is to be told of an error, where pydantic's own type, or place, says too little."""
     if kind == "no_kind" and not isinstance(value, Mapping):
         text = f"a mapping with a 'kind' (one of {context['allowed']})"
@@ -82,6 +86,10 @@ def _told(path: KeyPath, kind: str, value: Any, context: dict[str, Any]) -> tupl
         return path, "no_form", value, {"allowed": f"{text}{each}"}
     if kind == "no_kind":
         return (*path, "kind"), "no_kind" if "kind" in value else "kind_missing", value.get("kind"), context
+    if kind == "extra_forbidden" and value is None and str(path[-1]).isdigit():
+        return path, "decimal_comma", value, context
+    if kind == "extra_forbidden" and (word := str(path[-1]).partition(" ")[0]) in known:
+        return path, "no_colon", value, {"word": word}
     if kind == "float_type" and type(value) is int:
         # An integer beyond all floating-point numbers.
         return path, "finite_number", float("inf"), context
@@ -105,6 +113,8 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
     """Return what to write in the place of a value, where that can be guessed."""
     if kind in ("float_type", "int_type") and isinstance(value, (list, tuple)):
         return "; this key cannot be swept"
+    if kind == "float_type" and isinstance(value, str) and re.fullmatch(r"[-+]?[0-9]+,[0-9]+", value):
+        return f"; write a decimal point: {value.replace(',', '.')}"
     if kind == "float_type" and isinstance(value, str) and re.match(r"\s*[-+]?\.?[0-9]", value):
         return "; write it without quotes, underscores or a unit"
     if kind == "int_type" and isinstance(value, float) and value.is_integer() and abs(value) < 2**63:

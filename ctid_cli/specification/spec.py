@@ -279,7 +279,7 @@ class Spec(Section):
     Parameters
     ----------
     experiment : str
-        Name of the experiment and of its results folder; '/' makes folders in folders
+        Name of the experiment and of its results folder, for example 'experiment: my-study'; '/' makes folders
     system : mapping, optional
         The system to simulate
     excitation : mapping, optional

@@ -282,7 +282,8 @@ def _syntax_message(error: yaml.MarkedYAMLError) -> str:
         return "the file holds more than one YAML document ('---'); keep one experiment per file"
     context = f" ({error.context.strip()})" if error.context else ""
     hints = {
-        "mapping values are not allowed": "; text with a colon needs quotes, keys of a mapping the same indentation",
+        "mapping values are not allowed": "; a key needs a colon, keys of a mapping the same indentation, "
+        "text with a colon quotes",
         "could not find expected ':'": "; a key needs a colon and a space after it",
         "expected ',' or '}'": "; separate the entries by commas and close the brace",
         "expected ',' or ']'": "; separate the items by commas and close the bracket",

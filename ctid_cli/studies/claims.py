@@ -87,7 +87,7 @@ def check_claims(found: StudyResults) -> CheckedClaims:
     for function, calls in study.claims.items():
         state = getattr(study.module("claims"), function)
         for shorts in calls:
-            if not set(shorts) & set(missing):
+            if set(shorts) <= found.experiments.keys():
                 made = state(*(found[short] for short in shorts))
                 claims += (replace(claim, experiment=" and ".join(shorts)) for claim in made)
     return CheckedClaims(found, claims)

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ctid_cli.cli import experiment_commands
+from ctid_cli.cli import reproduce_command
+from ctid_cli.cli.experiment_commands import SpecOptions
+from ctid_cli.cli.reproduce_command import PublishedSpecs
 from ctid_cli.reporting.comparison_result import check_tables
 from ctid_cli.reporting.study import find_study
 from ctid_cli.studies import first_estimates, publishing
@@ -19,16 +21,27 @@ ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = ROOT / "configs" / "useful_redundancy"
 
 
-def test_run_runs_every_specification(ctid, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        ("coverage", [config.partition("/")[2] for config in find_study("coverage").configs.values()]),
+        ("coverage/first-order useful-redundancy/case1-irregular", ["first_order.yaml", "case1_irregular.yaml"]),
+    ],
+)
+def test_run_runs_the_specifications_of_what_is_named(ctid, tmp_path, monkeypatch, names, files):
     calls = []
     monkeypatch.setattr(
-        experiment_commands, "run", lambda configs, **options: calls.append(options | {"configs": configs})
+        reproduce_command, "run", lambda configs, **options: calls.append(options | {"configs": configs})
     )
-    ctid("reproduce coverage --runs 3 --jobs 1 --out", tmp_path)
-    (call,) = calls
-    names = [config.partition("/")[2] for config in find_study("coverage").configs.values()]
-    assert [file.name for file in call["configs"]] == names
-    assert (call["runs"], call["jobs"], call["place"].out) == (3, 1, tmp_path)
+    ctid(f"reproduce {names} --runs 3 --jobs 1 --out", tmp_path)
+    assert [file.name for call in calls for file in call["configs"]] == files
+    assert {(call["runs"], call["jobs"], call["place"].out) for call in calls} == {(3, 1, tmp_path)}
+
+
+def test_what_is_unwise_in_published_specifications_is_not_said_to_who_reproduces_them(capsys):
+    for specs, said in ((SpecOptions(), "warning: "), (PublishedSpecs(), "")):
+        specs.plans([CONFIGS / "case1_irregular.yaml"])
+        assert capsys.readouterr().err[:9] == said
 
 
 # --- tables ---------------------------------------------------------------------------------------------

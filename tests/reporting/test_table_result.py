@@ -71,6 +71,14 @@ def test_measures_of_parameters_of_estimates_and_of_failures_have_tables_of_thei
     assert table.summary() == snapshot
 
 
+@pytest.mark.parametrize(("last", "said"), [(8.0, False), (1e6, True)])
+def test_an_rmse_of_a_few_large_errors_is_said_to_be_one(make_results, estimate, last, said):
+    results = make_results({(5.0, "0.0"): [estimate(8.0 + 0.1 * k) for k in range(10)] + [estimate(last)]})
+    for data_cell in results.manifest["data_cells"]:
+        data_cell["replicates"] = 11
+    assert ("median_bias,robust_deviation" in measure_table(results, ["rmse:delay"]).summary()) == said
+
+
 def test_the_snr_is_a_key_of_an_experiment_that_does_not_sweep_it(make_results, estimate):
     results = make_results({(15.0, "0.0"): [estimate(8.0)]}, snrs=(15.0,), swept=False)
     assert set(percentage_frame(results)["snr_db"]) == {15.0}

@@ -41,6 +41,12 @@ def test_printed(chosen, track, snapshot):
     assert result.drawing().saved().startswith(b"<?xml")
 
 
+def test_an_amplitude_that_falls_is_said_to(chosen):
+    track = make_track(np.zeros(ROWS, np.uint16))
+    track.amplitudes[:, 1] = np.where(np.arange(ROWS) < 20, 4.0, 1.0)
+    assert "The amplitude of tone 2 falls from 4 to 1 Pa." in TrackResult(track, chosen).summary()
+
+
 def test_csv_and_hdf5_hold_the_same(chosen):
     table = TrackResult(make_track(some_invalid()), chosen).to_frame()
     frame = pd.read_csv(io.BytesIO(frame_bytes(table)), keep_default_na=True)

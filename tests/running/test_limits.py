@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from ctid_cli.errors import MachineError
-from ctid_cli.running import workers
+from ctid_cli.running import limits, workers
 from ctid_cli.running.engine import Progress, preview
 from ctid_cli.running.limits import StopRequest
 from ctid_cli.storage.estimates import read_estimates
@@ -154,6 +154,21 @@ def test_without_descriptors_nothing_is_stored_and_the_run_says_what_to_do(tmp_p
     assert len(read_estimates(tmp_path / "toys")) == 0
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, len(read_estimates(tmp_path / "toys"))) == (0, 6)
+
+
+def test_a_stop_ends_what_takes_long_and_keeps_what_is_finished_of_its_data_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "PATIENCE", 2.0)
+    request = StopRequest()
+
+    def listen(progress: Progress) -> None:
+        if progress.stored:
+            request.ask("a test")
+
+    summary = run(toys(Toy("sleep", at=0), runs=2), tmp_path, stop=request, progress=listen)
+    assert (summary.stopped_by, summary.computed, summary.given_up) == ("a test", 7, ())
+    assert set(read_estimates(tmp_path)["status"]) == {"CONVERGED"}
 
 
 @pytest.mark.parametrize("at_most", [1, 3])
