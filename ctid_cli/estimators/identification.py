@@ -35,7 +35,7 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
 
 #: Estimators of measured records, and records as each of them lays them out.
@@ -49,7 +49,7 @@ DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 @dataclass(frozen=True, eq=False)
 class Validation(DeferredFields):
-    """The model on a record that it was not estimated from."""
+    """The model on another record."""
 
     deferred: ClassVar[tuple[str, ...]] = ("record", "applied")
 
@@ -130,6 +130,11 @@ class Identification(DeferredFields, FittedModel, Shown):
         """Covariance that the standard errors are from, and how many of them intervals reach."""
         assert self.fit.law is not None
         return self.fit.law
+
+    @property
+    def seen_in_validation(self) -> int:
+        """How many samples of the validation record the model was estimated from."""
+        return 0 if self.validation is None else common_samples(self.validation.record, self.records)
 
     @property
     def errors_sentence(self) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification, free_directions, parameters_told
-from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_search
+from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
@@ -96,6 +96,7 @@ def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
         )
     if fit.fit_percent < LOW_FIT and fit.data.standard_error is None:
         yield f"The fit is {fit.fit_percent:.1f} % of the weighted values"
+    yield from of_lost_poles(fit)
     yield from of_search(fit, fit.data.units[0])
     if fit.status in (Status.CONVERGED, Status.AT_BOUND, Status.DELAY_AT_BOUND):
         assert fit.law is not None

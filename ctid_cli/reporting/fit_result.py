@@ -125,11 +125,13 @@ class FitResult(PagedResult):
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and how well the model simulates."""
         fit, validation = self.fitted.fit, self.fitted.validation
-        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures())
+        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures()) + self.lost_poles
         lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
         lead += count(fit.count, "sample")
         if validation is not None:
-            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, which it was not made from"
+            seen = self.fitted.seen_in_validation
+            made = f"of which {count(seen, 'sample')} made it" if seen else "which it was not made from"
+            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, {made}"
         title = "Fit of " + ", ".join(record.name or "a record" for record in self.records.data)
         return title, f"{lead}. {fit.status.value}"
 
@@ -204,13 +206,20 @@ class FitResult(PagedResult):
             return list(zip(names, options._each(names), strict=True))
         return [("", options)]
 
+    @property
+    def lost_poles(self) -> str:
+        """How many of the poles that were asked for the model does not have."""
+        lost = self.fitted.fit.poles_at_infinity
+        return f" ({lost} of the poles at infinity, not shown)" if lost else ""
+
     def structure(self) -> Iterator[tuple[str, str]]:
         """Return the structure of the model, and what of it was known."""
         options = self.fitted.options
         if isinstance(self.fitted.fit, MultiInputFit) and isinstance(options, DelayProfile):
             yield "model", "common denominator" if options.common else "a denominator for each input"
         for name, own in self._structures():
-            yield f"input {name}" if name else "model", f"{spelled(own)}; delay {_searched(own, self.units)}"
+            asked = f"{spelled(own)}{self.lost_poles}"
+            yield f"input {name}" if name else "model", f"{asked}; delay {_searched(own, self.units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
@@ -250,6 +259,8 @@ class FitResult(PagedResult):
     def search(self) -> Iterator[tuple[str, str]]:
         """Return how the search went, and the bounds of the admissible models where it ended at them."""
         fit, units = self.fitted.fit, self.units
+        if fit.status is not Status.CONVERGED:
+            yield "status", fit.status.value
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         if fit.box is not None and (fit.held_poles or fit.status in (Status.AT_BOUND, Status.RIDGE)):

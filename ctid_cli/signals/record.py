@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol, get_args
@@ -327,6 +327,15 @@ def beginning(record: Record, samples: int) -> Record:
         for name, signal in record.held.items()
     }
     return Record(t, record.y[:samples], inputs, name=record.name)
+
+
+def common_samples(record: Record, others: Sequence[Record]) -> int:
+    """Return how many samples of a record are those of others, with which it agrees at all instants they share."""
+    found = 0
+    for other in others:
+        _, own, theirs = np.intersect1d(record.t, other.t, assume_unique=True, return_indices=True)
+        found += own.size * np.array_equal(record.y[own], other.y[theirs], equal_nan=True)
+    return found
 
 
 def _named_inputs(
