@@ -28,7 +28,7 @@ from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of
 from ctid_cli.signals.noise import ArmaNoise
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
 
@@ -522,7 +522,7 @@ class DelayProfile(RecordsEstimator):
         return self.poles + self.integrators
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
-        several = [records] if isinstance(records, Record) else list(records)
+        several = as_records(records)
         if self.noise_model != "white":
             check_clocks(several)
         names = tuple(several[0].held) if several and several[0].several else ("",)

@@ -32,7 +32,7 @@ from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
@@ -72,7 +72,7 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     OptionError
         If what is given does not go together.
     """
-    several = [records] if isinstance(records, Record) else list(records)
+    several = as_records(records)
     given = given or Given()
     given.check()
     if given.delays_given is not None:

@@ -249,8 +249,8 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
 def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
     """That the model has fewer poles than were asked for."""
     if lost := fit.poles_at_infinity:
-        gone = "it has" if lost == 1 else "they have"
-        yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone} run to infinity, where the cost is least"
+        gone = f"{'it has' if lost == 1 else 'they have'} run to infinity, where the cost is least"
+        yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone}"
 
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:

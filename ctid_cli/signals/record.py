@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol, get_args
@@ -344,12 +344,25 @@ def _named_inputs(
     """Return inputs by name, values at the instants of the output held."""
     if isinstance(inputs, HeldSignal):
         return {"u": inputs}
+    if not isinstance(inputs, Mapping):
+        wanted = "a HeldSignal, such as HeldSignal(t, u), or several signals by name"
+        arrays = "Record.from_arrays(t, u, y) takes arrays"
+        raise DataError(f"{where}inputs must be {wanted}, not {type(inputs).__name__}; {arrays}")
     if not inputs:
         raise DataError(f"{where}there is no input")
     return {
         name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float))
         for name, one in inputs.items()
     }
+
+
+def as_records(records: object) -> list[Record]:
+    """Return one record or several as a list; a DataError where something else is given."""
+    several = list(records) if isinstance(records, Iterable) else [records]
+    for one in several:
+        if not isinstance(one, Record):
+            raise DataError(f"records must be a Record or a list of these, not {type(records).__name__}")
+    return several
 
 
 def named(record: Record) -> str:
