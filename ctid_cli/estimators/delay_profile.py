@@ -630,8 +630,7 @@ def with_noise(
 ) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
     joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
-    search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
-    fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
+    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), beside.profile, None)
     law = beside.uncertainty("robust")
     robust = law.covariance
     with np.errstate(invalid="ignore"):
