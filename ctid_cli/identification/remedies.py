@@ -78,7 +78,7 @@ class Remedy:
         made = f"with {self.option}{' besides' * self.besides}"
         if self.held_back:
             return f"{made} the held-back fit is {self.after:.1f} instead of {self.before:.1f} %"
-        numbers = f"BIC is {self.after:.1f} instead of {self.before:.1f}, the fit"
+        numbers = f"BIC of the innovations is {self.after:.1f} instead of {self.before:.1f}, the fit"
         return f"{made} {numbers} {self.fits[1]:.1f} instead of {self.fits[0]:.1f} %"
 
 
