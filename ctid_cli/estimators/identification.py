@@ -126,6 +126,41 @@ class Identification(DeferredFields, FittedModel, Shown):
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
 
     @property
+    def fit_percent(self) -> float:
+        """``100 (1 - ||y - x|| / ||y - mean y||)`` of the records [%]."""
+        return self.fit.fit_percent
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name, those that are known included."""
+        return {item.name: item.estimate for item in self.estimates}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors of the parameters by name; NaN where there is none."""
+        return {item.name: item.standard_error for item in self.estimates}
+
+    def validate(self, record: Record) -> Validation:
+        """Judge the model on another record of the same system.
+
+        Parameters
+        ----------
+        record : Record
+            A record that the model was not estimated from.
+
+        Returns
+        -------
+        Validation
+            Its fit, with the treatment of state and offset that the model was estimated with.
+
+        Raises
+        ------
+        DataError
+            If the record cannot be used.
+        """
+        return validated(self.options._applied(self.fit, laid_out_validation(self.options, record)), record)
+
+    @property
     def uncertainty(self) -> Uncertainty:
         """Covariance that the standard errors are from, and how many of them intervals reach."""
         assert self.fit.law is not None

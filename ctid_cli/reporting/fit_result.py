@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +41,7 @@ from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.storage.fit_file import fit_text
-from ctid_cli.text import count, probability
+from ctid_cli.text import count, listed, probability
 from ctid_cli.written_files import write_file
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
@@ -61,6 +62,8 @@ TREATMENTS = {
     "none": "none",
     "remove": "means of input and output subtracted",
 }
+#: Derived quantities that are greater than zero.
+POSITIVE = re.compile("time_constant|natural_frequency")
 #: Digits of the coefficients in the equation.
 DIGITS = 5
 #: Instants of outliers that the text names.
@@ -131,7 +134,7 @@ class FitResult(PagedResult):
         if validation is not None:
             seen = self.fitted.seen_in_validation
             made = f"of which {count(seen, 'sample')} made it" if seen else "which it was not made from"
-            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name}, {made}"
+            lead += f"; {number(validation.fit_percent, 4)} % on {validation.name or 'a record'}, {made}"
         title = "Fit of " + ", ".join(record.name or "a record" for record in self.records.data)
         return title, f"{lead}. {fit.status.value}"
 
@@ -176,7 +179,12 @@ class FitResult(PagedResult):
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
         rows = derived_of(self.fitted, self.units)
-        return Section.table(rows, DERIVED, notes=list(dict.fromkeys(row.reason for row in rows if row.reason)))
+        notes = list(dict.fromkeys(row.reason for row in rows if row.reason))
+        below = [row.name for row in rows if POSITIVE.search(row.name) and row.low < 0.0]
+        if below:
+            what = f"Intervals of {listed(below)} reach" if len(below) > 1 else f"The interval of {below[0]} reaches"
+            notes.append(f"{what} below 0, where no value can be: the error is too large for a linearised interval.")
+        return Section.table(rows, DERIVED, notes=notes)
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
@@ -232,9 +240,9 @@ class FitResult(PagedResult):
         if fit.noise is not None:
             yield from self._noise(fit.noise)
         if validation is not None:
-            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on {validation.name}, "
-            text += f"{count(validation.count, 'sample')}; initial state and offset of its own"
-            yield "validation", text
+            text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on "
+            text += f"{validation.name or 'a record'}, {count(validation.count, 'sample')}"
+            yield "validation", f"{text}; initial state and offset of its own"
             for k in self.predicted:
                 assert fit.noise is not None
                 yield f"  {k} ahead", f"fit {number(validation.prediction_fit(fit.noise, k), 5)} % of predictions"
@@ -337,7 +345,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
     columns = f"input{'s' * record.several} {units.column(measurement, 'input')}, "
     columns += f"output {units.column(measurement, 'output')}"
-    return f"{record.name}: {count(record.n_samples, 'sample')}{span}; {columns}"
+    return f"{record.name or 'record'}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
 def _before(result: Identification, state: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -356,7 +356,7 @@ def _named_inputs(
     }
 
 
-def as_records(records: object) -> list[Record]:
+def as_records(records: Any) -> list[Record]:
     """Return one record or several as a list; a DataError where something else is given."""
     several = list(records) if isinstance(records, Iterable) else [records]
     for one in several:

@@ -89,7 +89,12 @@ def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     assert found.summary().split("\n\n")[3:5] == printed.split("\n\n")[3:5]
     assert len(found.plot().axes) == 4
     assert found._repr_html_().count("<table") == 4
+    found.plot(tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
     fit = found.fit
+    assert found.fit_percent == fit.fit_percent
+    assert found.parameters == fit.parameters | {"delay": found.options.delay_bounds[0]} | fit.parameters
+    assert found.validate(found.records[0]).fit_percent == pytest.approx(fit.fit_percent)
     frame = fit.to_frame()
     assert frame["estimate"].to_dict() == fit.parameters
     assert frame["standard_error"].to_dict() == fit.standard_errors

@@ -17,6 +17,7 @@ from ctid_cli.filtering.simulate import simulate
 from ctid_cli.identification.choice import Given
 from ctid_cli.identification.identify import identify
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.units import Units
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.fit_content import derived_of, parameters_of
@@ -148,6 +149,21 @@ def test_a_pole_that_ran_to_infinity_is_missing_in_words():
     assert any("1 pole fewer than asked for" in warning for warning in fitted.warnings)
     assert dict(result.settings())["model"].startswith("2 poles, no zero (1 of the poles at infinity, not shown)")
     assert "not shown" in result.page_head()[1]
+
+
+def test_an_interval_below_zero_of_what_is_positive_is_remarked(results):
+    result = results["validated"]
+    first, *rest = result.fitted.derived
+    wide = UncertainValue("time_constant_1", 64.4, 55.0, -45.7, 174.4)
+    changed = replace(result, fitted=replace(result.fitted, derived=(wide, first, *rest)))
+    assert changed.derived().notes[-1].startswith("The interval of time_constant_1 reaches below 0")
+    assert not any("below 0" in note for note in result.derived().notes)
+
+
+def test_a_record_without_a_name_is_called_a_record():
+    one = measurement()
+    lines = FitResult.of(identify(replace(one.record, name=""), DelayProfile(2, 0, (0.73, 0.73)))).data().sentences
+    assert lines[0].startswith("record: 800 samples")
 
 
 def test_validation_on_samples_of_the_fit_is_called_so():
