@@ -1,6 +1,7 @@
 """How messages are put together, in every layer: enumerations, paragraphs, hints at names that are nearly right."""
 
 import difflib
+import os
 import textwrap
 from collections.abc import Iterable
 from importlib import import_module
@@ -64,9 +65,12 @@ class Shown:
         """Return the main table of the result as a DataFrame: parameters of a fit, instants of a track."""
         return self._result().to_frame()
 
-    def plot(self) -> Any:
-        """Return the main figure of the result as a Matplotlib figure."""
-        return self._result().plot()
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
+        """Return the main figure of the result as a Matplotlib figure, saved to a file if one is named."""
+        figure = self._result().plot()
+        if path is not None:
+            figure.savefig(path)
+        return figure
 
     def _result(self) -> Any:
         # By name: results know nothing of the layer that shows them.

@@ -271,7 +271,7 @@ class LoopOptions:
 class FitOptions(TreatmentOptions):
     """Treatment of the initial state and of offsets, of large errors, and of the input between its samples."""
 
-    loss: Annotated[LossKind, flag("--loss", "Loss function of the output errors.")] = "squares"
+    loss: Annotated[LossKind | None, flag("--loss", "Loss function of the output errors.")] = None
     noise: Annotated[str, flag("--noise", "Noise that is estimated with the model.", "white|arma:P,Q|auto")] = "white"
     each_hold: Annotated[
         list[str] | None,
@@ -376,7 +376,7 @@ def options_of(asked: Asked) -> AdditiveOutputError | MeasuredSubmodels | LoopOu
             )
         if model.terms is not None:
             known: Any = {"fixed": model.fixed, "input_before": treatment.level, "noise_model": treatment.noise}
-            return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss, **known)
+            return AdditiveOutputError(model.submodels, bounds, state, offset, treatment.loss or "squares", **known)
     return _given(asked)
 
 
@@ -514,7 +514,7 @@ def _unavailable(asked: Asked) -> Iterator[tuple[bool, str, str]]:
     state, offset, hold = treatment.initial_state, treatment.offset, asked.hold
     low, high = model.bounds or (0.0, 0.0)
     yield treatment.input_before is not None, "--input-before", "use --initial-state estimate"
-    yield treatment.loss != "squares", f"--loss {treatment.loss}", "drop --loss"
+    yield treatment.loss not in (None, "squares"), f"--loss {treatment.loss}", "drop --loss"
     direct = "drop --noise, or fit to the input with --direct"
     yield treatment.noise != "white", f"--noise {treatment.noise}", direct
     one_fraction = model.model == "fraction" and not (asked.iterated and model.integrators)

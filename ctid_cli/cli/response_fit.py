@@ -75,7 +75,7 @@ def _of_records(
         "--initial-state": (treatment.initial_state, rest),
         "--input-before": (treatment.input_before, rest),
         "--offset": (treatment.offset, "an offset is a line at frequency 0; leave that line out"),
-        "--loss": (treatment.loss != "squares" or None, "lines are fitted by weighted squares"),
+        "--loss": (treatment.loss, "lines are fitted by weighted squares"),
         "--noise": (treatment.noise != "white" or None, noise),
         "--hold": (treatment.each_hold, "the file says it, in a comment '# hold: zoh'"),
         "--loop": (loop.loop, "a response that was measured in a loop is taken as it is"),

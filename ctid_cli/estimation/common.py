@@ -29,7 +29,7 @@ from ctid_cli.signals.checks import (
     require_not_negative,
     require_positive,
 )
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.text import listed
 
 
@@ -161,7 +161,7 @@ class Estimator(Generic[LaidOut, AnyFit]):
 
         A DataError says why nothing can be estimated.
         """
-        records = [record] if isinstance(record, Record) else list(record)
+        records = as_records(record)
         for one in records if not hasattr(self, "inputs") else ():
             one.input  # noqa: B018 - refuses several
         in_loop = any(one.in_loop for one in records) and getattr(self, "instruments", "open_loop") == "open_loop"
@@ -186,6 +186,8 @@ class Prepared(Generic[LaidOut, AnyFit]):
 
     def fit(self, start: Start | None = None) -> AnyFit:
         """Estimate from one start."""
+        if not isinstance(start, Start | None):
+            raise TypeError(f"start must be a Start, such as Start(delay=0.5), not {type(start).__name__}")
         fit = self.estimator._estimate(self.laid_out, start)
         if not self.in_ignored_loop:
             return fit

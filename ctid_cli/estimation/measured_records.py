@@ -365,7 +365,9 @@ class MeasuredRecords:
         if self.problem.terms:
             return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)
         poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
-        return best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
+        found = best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
+        # Starts may be without the poles that have run to infinity.
+        return replace(found, poles_at_infinity=self.degrees.poles - self.problem.integrators - poles)
 
     def model(self, found: Optimum) -> AnyModel:
         """The model of an optimum; a sum as one transfer function."""

@@ -84,7 +84,7 @@ def _descend(
     settled = losses is not None
     for k in range(MOST_FITS):
         there = measured.with_outputs(here.modified()).local(here.found.start)
-        there = replace(there, tried=found.tried, agree=found.agree, poles_at_infinity=found.poles_at_infinity)
+        there = replace(there, tried=found.tried, agree=found.agree)
         following = _at(measured, there, kind, here.losses if settled else None)
         if settled and following.cost(here.losses) >= here.cost(here.losses) * (1.0 - DONE):
             break

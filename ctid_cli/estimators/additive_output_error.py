@@ -27,7 +27,7 @@ from ctid_cli.estimators.measured_submodels import SubmodelsFit, sampling_margin
 from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.models.additive import AdditiveModel, Term, degrees_of, names_of
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset
 
 #: How starts were found.
@@ -132,7 +132,7 @@ class AdditiveOutputError(RecordsEstimator):
             check_submodels(start.model, self.terms)
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
-        several = [records] if isinstance(records, Record) else list(records)
+        several = as_records(records)
         if self.noise_model != "white":
             check_clocks(several)
         low, high = self.delay_bounds

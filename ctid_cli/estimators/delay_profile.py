@@ -29,7 +29,7 @@ from ctid_cli.inference.robust_loss import Loss, Weighting, weighted
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty, estimate_uncertainty
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, delays_of, is_delay
 from ctid_cli.signals.noise import ArmaNoise
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset, OutputHold
 
 
@@ -592,7 +592,7 @@ class DelayProfile(RecordsEstimator):
         return self.poles + self.integrators
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
-        several = [records] if isinstance(records, Record) else list(records)
+        several = as_records(records)
         if self.noise_model != "white":
             check_clocks(several)
         names = tuple(several[0].held) if several and several[0].several else ("",)
@@ -716,8 +716,7 @@ def with_noise(
 ) -> MeasuredFit:
     """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
     joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
-    search = {name: getattr(found, name) for name in ("tried", "agree", "poles_at_infinity")}
-    fit = fitted(measured, replace(joint.found, **search), beside.profile, None)
+    fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), beside.profile, None)
     law = beside.uncertainty("robust")
     robust = law.covariance
     with np.errstate(invalid="ignore"):

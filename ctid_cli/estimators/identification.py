@@ -34,7 +34,7 @@ from ctid_cli.inference.sensitivities import Parametric
 from ctid_cli.inference.uncertainty import DRAWS, UNSAFE, Covariance, Progress, Uncertainty, shifts_of_ends
 from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.checks import require_integer
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
 
 #: Estimators of measured records, and records as each of them lays them out.
@@ -48,7 +48,7 @@ DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 @dataclass(frozen=True, eq=False)
 class Validation(DeferredFields):
-    """The model on a record that it was not estimated from."""
+    """The model on another record."""
 
     deferred: ClassVar[tuple[str, ...]] = ("record", "applied")
 
@@ -125,10 +125,50 @@ class Identification(DeferredFields, FittedModel, Shown):
         return f"Identification: {self.uncertainty.kind} covariance, {len(self.warnings)} warnings\n{self.fit!r}"
 
     @property
+    def fit_percent(self) -> float:
+        """``100 (1 - ||y - x|| / ||y - mean y||)`` of the records [%]."""
+        return self.fit.fit_percent
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters by name, those that are known included."""
+        return {item.name: item.estimate for item in self.estimates}
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors of the parameters by name; NaN where there is none."""
+        return {item.name: item.standard_error for item in self.estimates}
+
+    def validate(self, record: Record) -> Validation:
+        """Judge the model on another record of the same system.
+
+        Parameters
+        ----------
+        record : Record
+            A record that the model was not estimated from.
+
+        Returns
+        -------
+        Validation
+            Its fit, with the treatment of state and offset that the model was estimated with.
+
+        Raises
+        ------
+        DataError
+            If the record cannot be used.
+        """
+        return validated(self.options._applied(self.fit, laid_out_validation(self.options, record)), record)
+
+    @property
     def uncertainty(self) -> Uncertainty:
         """Covariance that the standard errors are from, and how many of them intervals reach."""
         assert self.fit.law is not None
         return self.fit.law
+
+    @property
+    def seen_in_validation(self) -> int:
+        """How many samples of the validation record the model was estimated from."""
+        return 0 if self.validation is None else common_samples(self.validation.record, self.records)
 
     @property
     def errors_sentence(self) -> str:

@@ -32,7 +32,7 @@ from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertai
 from ctid_cli.models.controller import ContinuousController, DiscreteController
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import LossKind
 
 #: What a loop can be at the first sample, and what offsets it can have.
@@ -174,7 +174,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return self.delay_bounds[0] < self.delay_bounds[1]
 
     def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutLoop:
-        several = [records] if isinstance(records, Record) else list(records)
+        several = as_records(records)
         if len(several) != 1:
             raise DataError("a loop is fitted to one record; give one file")
         loop, where = several[0].loop, named(several[0])

@@ -23,7 +23,7 @@ from ctid_cli.models.additive import AdditiveModel, Submodel, Term, degrees_of
 from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import LossKind, Offset
 
 
@@ -197,7 +197,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return self.instruments != "open_loop"
 
     def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutSubmodels:
-        several = [records] if isinstance(records, Record) else list(records)
+        several = as_records(records)
         if len(several) != 1:
             raise DataError("submodels are estimated from one record; give one file")
         record, u0, y0 = without_means(several[0]) if self.offset == "remove" else (several[0], [0.0], 0.0)

@@ -44,7 +44,7 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     Raises
     ------
     DataError
-        If the instants do not increase strictly, or the model has more zeros than poles.
+        If the input is no held signal, the instants do not increase strictly, or the model has more zeros than poles.
 
     Notes
     -----
@@ -58,6 +58,9 @@ def simulate(model: TransferFunction, signal: HeldSignal, times: ArrayLike) -> A
     >>> simulate(TransferFunction([1], [1, 1], delay=0.5), step, [0.25, 1.5]).round(6)
     array([0.      , 0.632121])
     """
+    if not isinstance(signal, HeldSignal):
+        what = type(signal).__name__
+        raise DataError(f"the input of a simulation must be a HeldSignal, such as HeldSignal(t, u), not {what}")
     t = plain_array(times)
     if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
         raise DataError("the instants of a simulation must be finite numbers that increase strictly")

@@ -35,8 +35,9 @@ class Given:
         Input before the first sample of a record that begins at rest [input unit].
     hold : {"auto", "zoh", "foh", "band-limited"} or tuple of these but "auto", default "auto"
         The input between its samples; a tuple has the hold of each of several inputs.
-    loss : {"squares", "huber", "tukey"}, default "squares"
-        What output errors count in the fit; the choice is made with their squares.
+    loss : {"squares", "huber", "tukey"}, optional
+        What output errors count in the fit; chosen are squares, or where there are outliers and it helps, tukey. All
+        else is chosen by squares, in the second case without the outliers.
     fixed : tuple of Fixed, optional
         Known parameters of the fit.
     bounds : tuple of Bound, optional
@@ -58,7 +59,7 @@ class Given:
     offset: Offset | None = None
     input_before: InputBefore = None
     hold: AskedHold | tuple[Hold, ...] = "auto"
-    loss: LossKind = "squares"
+    loss: LossKind | None = None
     fixed: tuple[Fixed, ...] | None = None
     noise_model: str = "white"
     inputs: tuple[InputModel, ...] | None = None
@@ -119,7 +120,7 @@ class Given:
             *(poles, zeros, delays),
             initial_state=self.initial_state or "rest",
             offset=self.offset or "none",
-            loss=self.loss,
+            loss=self.loss or "squares",
             fixed=self.fixed,
             integrators=self.integrators or 0,
             input_before=self.input_before,
@@ -188,4 +189,5 @@ class Choice:
         if options.initial_state == "rest" and options.offset != "remove":
             before = options.input_before
             found += ["--input-before", before if before == "first" else f"{before or 0.0:g}"]
+        found += ["--loss", options.loss] if options.loss != "squares" else []
         return [*found, *(word for text in self.records[0].hold_options for word in ("--hold", text))]

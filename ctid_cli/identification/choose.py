@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ctid_cli.estimation.common import check_greatest_delay
-from ctid_cli.estimators.delay_profile import DelayProfile
+from ctid_cli.estimators.delay_profile import DelayProfile, MultiInputFit
 from ctid_cli.estimators.identification import answer_of
 from ctid_cli.identification import sentences
 from ctid_cli.identification.candidates import SMALL, Setting, Several, SmallModels, Span, grid, with_hold
@@ -28,11 +28,12 @@ from ctid_cli.identification.initial_states import (
     without_beginning,
 )
 from ctid_cli.identification.parts import FEW, MANY, parts_of
+from ctid_cli.identification.remedies import outliers_of
 from ctid_cli.inference.input_response import analyse_response
 from ctid_cli.inference.signal_features import input_moves
 from ctid_cli.models.several_inputs import AnyModel, delays_of
 from ctid_cli.signals.held import Hold
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import Holds
 
 #: Greatest delay that is tried unless the record shows a later response, as shares of the record.
@@ -72,13 +73,28 @@ def choose(records: Record | Sequence[Record], given: Given | None = None, time_
     OptionError
         If what is given does not go together.
     """
-    several = [records] if isinstance(records, Record) else list(records)
+    several = as_records(records)
     given = given or Given()
     given.check()
     if given.delays_given is not None:
         for record in several:
             check_greatest_delay(record, given.delays_given[1])
-    return _Choosing(several, given, time_unit).choice()
+    choice = _Choosing(several, given, time_unit).choice()
+    if given.loss is not None or given.noise_model != "white" or isinstance(choice.ranking.best.fit, MultiInputFit):
+        return choice
+    best = choice.ranking.best
+    places = outliers_of(choice.fitted, best.options, best.fit)
+    if not any(off.any() for off in places):
+        return choice
+    times = [record.t[off] for record, off in zip(choice.fitted, places, strict=True)]
+    cleaned = [
+        replace(record, y=np.where(np.isin(record.t, instants), np.nan, record.y))
+        for record, instants in zip(several, times, strict=True)
+    ]
+    chosen = _Choosing(cleaned, replace(given, loss="tukey"), time_unit).choice()
+    left_out = sentences.of_outliers(sum(instants.size for instants in times))
+    held = tuple(with_hold(record, chosen.records[0].hold) for record in several)
+    return replace(chosen, records=held, sentences=(left_out, *chosen.sentences))
 
 
 class _Choosing:
@@ -131,7 +147,7 @@ class _Choosing:
     def _chosen(self, options: Searched, setting: Setting, ranking: Ranking, about: Sequence[str]) -> Choice:
         """Return a choice with what was said of it."""
         best = ranking.best
-        options = replace(options, loss=self.given.loss, noise_model=self.given.noise_model)
+        options = replace(options, loss=self.given.loss or "squares", noise_model=self.given.noise_model)
         if isinstance(options, DelayProfile):
             options = replace(options, fixed=self.given.fixed, bounds=self.given.bounds, nested=True)
         if not self.all_from_start:

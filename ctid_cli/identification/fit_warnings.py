@@ -81,7 +81,7 @@ def fit_warnings(found: Identification, time_unit: str = "s") -> list[FitWarning
     if not seen:
         no_model = f"No model: the output is not seen to respond to the input ({probability(found.answer.p_value)})"
         return [FitWarning(f"{no_model}. {found.answer.evidence[:-1]}"), *named]
-    others = list(_of_residuals(found, mended, time_unit))
+    others = [*of_lost_poles(fit), *_of_residuals(found, mended, time_unit)]
     if not named:
         # Of an estimate that will change, neither its search nor its errors need to be known.
         others += [
@@ -170,6 +170,11 @@ def _slow_pole(found: Identification, time_unit: str) -> str:
 
 def _of_validation(found: Identification) -> Iterator[FitWarning]:
     fitted, other = found.fit.r2, found.validation
+    if other is not None and (seen := found.seen_in_validation):
+        what = f"{seen} of the {count(other.record.n_samples, 'sample')} of the validation record are those that"
+        yield FitWarning(
+            f"{what} the model was estimated from, so its fit there is no test; give a record without them"
+        )
     if other is not None and other.r2 < 0.5 < fitted:
         what = f"The model explains {100 * fitted:.0f} % of the variance of the record it was estimated from, but only"
         yield FitWarning(f"{what} {100 * max(other.r2, 0.0):.0f} % of the validation record's: it does not carry over")
@@ -242,9 +247,13 @@ def of_search(fit: MeasuredFit, time_unit: str) -> Iterator[str]:
                 where = f"end of its range, {delay:.4g} {time_unit}" if delay else "least possible, 0"
                 of = f" of {name.removesuffix('_delay')}" * (len(names) > 1)
                 yield f"The delay{of} is at the {where}, and has no standard error"
-    if fit.poles_at_infinity:
-        lost = "1 pole runs" if fit.poles_at_infinity == 1 else f"{fit.poles_at_infinity} poles run"
-        yield f"{lost} to infinity: more than {fit.model.order} lower the cost no further"
+
+
+def of_lost_poles(fit: MeasuredFit) -> Iterator[str]:
+    """That the model has fewer poles than were asked for."""
+    if lost := fit.poles_at_infinity:
+        gone = f"{'it has' if lost == 1 else 'they have'} run to infinity, where the cost is least"
+        yield f"The model has {count(lost, 'pole')} fewer than asked for: {gone}"
 
 
 def of_conditioning(fit: MeasuredFit, known: Uncertainty) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import get_args
 
 from ctid_cli.errors import DataError
 from ctid_cli.estimators import identification
@@ -12,7 +13,8 @@ from ctid_cli.identification.choose import choose
 from ctid_cli.identification.fit_warnings import with_warnings
 from ctid_cli.identification.validation import judged_on, laid_out_for
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, as_records
+from ctid_cli.text import listed
 
 
 def identify(
@@ -57,6 +59,8 @@ def identify(
         If a record cannot be used, or no response to its input is seen and no number of poles is given.
     OptionError
         If what is given does not go together.
+    TypeError
+        If the options are those of another estimator, which only fits by itself.
 
     Notes
     -----
@@ -74,7 +78,10 @@ def identify(
     >>> found.options.poles, found.options.initial_state
     (1, 'rest')
     """
-    several = [records] if isinstance(records, Record) else list(records)
+    several = as_records(records)
+    if not isinstance(options, Options | Given | None):
+        what = f"options of identify must be {listed(each.__name__ for each in get_args(Options))} or Given"
+        raise TypeError(f"{what}, not {type(options).__name__}; any estimator fits by itself: estimator.fit(record)")
     noise = covariance, bootstrap_draws, progress
     if options is not None and not isinstance(options, Given):
         return with_warnings(identification.identify(options, several, validation, *noise), time_unit)

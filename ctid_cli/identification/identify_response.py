@@ -1,12 +1,14 @@
 """From a measured frequency response to a model with everything that tells whether to believe it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ctid_cli.estimators.frequency_domain import MISFIT, FrequencyDomain, FrequencyDomainFit
 from ctid_cli.estimators.identification import Identification, free_directions, parameters_told
-from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_search
+from ctid_cli.identification.fit_warnings import LOW_FIT, MOST, of_conditioning, of_lost_poles, of_search
+from ctid_cli.identification.remedies import DECISIVE
 from ctid_cli.inference.criteria import information_criteria, r_t_squared, young_information_criterion
 from ctid_cli.inference.fit import Status
 from ctid_cli.inference.response_test import LEVEL, ResponseTest
@@ -61,7 +63,7 @@ def identify_frequency_response(data: FrequencyData, options: FrequencyDomain) -
         criteria=information_criteria(float(residuals @ residuals), fit.count, fit.theta.size - len(fit.known)),
         yic=young_information_criterion(residuals, values, fit.theta[free], fit.law.covariance[np.ix_(free, free)]),
         r_t_squared=r_t_squared(residuals, values),
-        warnings=tuple(f"{text}." for text in list(_warnings(fit, answer))[:MOST]),
+        warnings=tuple(f"{text}." for text in [*_of_delay(fit, options), *_warnings(fit, answer)][:MOST]),
     )
 
 
@@ -75,6 +77,21 @@ def _answer(fit: FrequencyDomainFit) -> ResponseTest:
     p_value = min(chances * float(f_distribution.sf(ratio, size, spare)), 1.0)
     least = float(f_distribution.isf(min(LEVEL / chances, 1.0), size, spare)) * size / spare
     return ResponseTest(fit.r2, least / (1.0 + least), p_value)
+
+
+def _of_delay(fit: FrequencyDomainFit, options: FrequencyDomain) -> Iterator[str]:
+    """Yield that a delay is missing, if lines that the model misses are met with one."""
+    known, most = options.delay_bounds
+    missed = fit.misfit_p_value < MISFIT or not fit.white or fit.fit_percent < LOW_FIT
+    if not missed or known < most or options.zeros >= options.poles + options.integrators:
+        return
+    # A longer delay turns the phase of all lines by more than a quarter.
+    reach = float(f"{known + 0.5 * np.pi / fit.data.frequencies[fit.data.frequencies > 0.0].min():.2g}")
+    searched = replace(options, delay_bounds=(0.0, reach)).prepare(fit.data).fit()
+    sizes = fit.count * np.log(fit.cost), searched.count * np.log(searched.cost) + np.log(searched.count)
+    if sizes[0] - sizes[1] > DECISIVE:
+        fits = f"the fit is {searched.fit_percent:.1f} instead of {fit.fit_percent:.1f} %"
+        yield f"The delay is taken as {known:g} {fit.data.units[0]}: with --delay 0:{reach:g} {fits}"
 
 
 def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
@@ -94,6 +111,7 @@ def _warnings(fit: FrequencyDomainFit, answer: ResponseTest) -> Iterator[str]:
         )
     if fit.fit_percent < LOW_FIT and fit.data.standard_error is None:
         yield f"The fit is {fit.fit_percent:.1f} % of the weighted values"
+    yield from of_lost_poles(fit)
     yield from of_search(fit, fit.data.units[0])
     if fit.status in (Status.CONVERGED, Status.AT_BOUND, Status.DELAY_AT_BOUND):
         assert fit.law is not None

@@ -20,8 +20,6 @@ LEVELS: tuple[Level, ...] = ("ok", "note", "warning", "problem")
 JITTER = 0.05
 #: Below this order of excitation no model with a delay can be told from one without.
 ENOUGH_ORDER = 4
-#: A mean below this fraction of the standard deviation is what rounding leaves where a mean was subtracted.
-ROUNDING = 1e-9
 
 
 class Finding(NamedTuple):
@@ -35,6 +33,12 @@ class Finding(NamedTuple):
 def findings(facts: RecordFacts, time: str, input: str, output: str) -> list[Finding]:
     """Return the facts on a record in sentences, with the units of its signals, the worst first."""
     return sorted(_Sentences(facts, time, input, output), key=lambda finding: -LEVELS.index(finding.level))
+
+
+def _needed(low: float, high: float, digits: int) -> int:
+    """Digits by which the ends of a narrow range differ, and at least as many as are given."""
+    size, width = max(abs(low), abs(high)), high - low
+    return digits + max(math.floor(math.log10(size / width)) - 1, 0) if 0.0 < width < math.inf else digits
 
 
 def _digits(x: float, digits: int) -> str:
@@ -55,7 +59,7 @@ class _Sentences:
         return f"{_digits(x, 4)} {self.time}"
 
     def u(self, x: float) -> str:
-        return f"{_digits(x, 4)} {self.input}".rstrip()
+        return f"{_digits(x, _needed(self.facts.input_low, self.facts.input_high, 4))} {self.input}".rstrip()
 
     def y(self, x: float) -> str:
         return f"{_digits(x, 3)} {self.output}".rstrip()
@@ -64,7 +68,7 @@ class _Sentences:
         yield from self._clock()
         yield self._input()
         yield from self._output()
-        if self.facts.input_kind != "constant" and self.facts.output_deviation > 0:
+        if self.facts.input_kind != "constant" and not self.facts.output_constant:
             yield self._response()
         yield from self._tests()
 
@@ -72,8 +76,8 @@ class _Sentences:
         f = self.facts
         present = f.n_samples - f.n_masked
         if present < FEWEST_SAMPLES:
-            text = f"Only {present} output samples: offset, drift, start, outliers, feedback and noise are not tested."
-            yield Finding("warning", "samples", text)
+            text = "offset, drift, start, outliers, feedback and noise are not tested."
+            yield Finding("warning", "samples", f"Only {count(present, 'output sample')}: {text}")
         spread = f"{self.t(f.interval_min)} to {self.t(f.interval_max)}, median {self.t(f.interval)}"
         if f.regular:
             yield Finding("ok", "sampling", f"The clock is regular, one sample every {self.t(f.interval)}.")
@@ -107,24 +111,32 @@ class _Sentences:
             return Finding("note", "input", f"The input changes only {times}, {self._levels()}.")
         least = "at least " if f.excitation_order >= HIGHEST_ORDER else ""
         text = f"It is persistently exciting of order {least}{f.excitation_order}"
-        band = f"{_digits(f.input_band[0], 2)} to {_digits(f.input_band[1], 3)} rad/{self.time}"
+        low, high = f.input_band
+        band = f"; 95 % of its power lies from {_digits(low, 2)} to {_digits(high, 3)} rad/{self.time}"
         moves = f"The input moves continuously between {self.u(f.input_low)} and {self.u(f.input_high)}."
         if f.input_kind == "levels":
             times = f"{f.input_changes} times {self._levels()}"
             moves = f"The input switches {times} and holds for {self.t(f.shortest_hold)} or longer."
         period = f" It repeats itself every {self.t(f.input_period)}." if math.isfinite(f.input_period) else ""
         level: Level = "warning" if f.excitation_order < ENOUGH_ORDER else "ok"
-        return Finding(level, "input", f"{moves} {text}; 95 % of its power lies from {band}.{period}")
+        return Finding(level, "input", f"{moves} {text}{band * math.isfinite(low)}.{period}")
 
     def _levels(self) -> str:
         f = self.facts
         if 0 < len(f.input_levels) <= 4:
-            return f"between {listed(f'{level:.4g}' for level in f.input_levels)} {self.input}".rstrip()
+            digits = _needed(f.input_low, f.input_high, 4)
+            return f"between {listed(_digits(level, digits) for level in f.input_levels)} {self.input}".rstrip()
         return f"between many levels from {self.u(f.input_low)} to {self.u(f.input_high)}"
 
     def _output(self) -> Iterator[Finding]:
         f = self.facts
-        if not f.output_deviation > ROUNDING * abs(f.output_mean):
+        if math.isfinite(f.growth_time):
+            text = (
+                f"The output diverges: it grows by a factor of e every {self.t(f.growth_time)}, and the input does not"
+            )
+            remedy = "an unstable plant is not among the models; in a loop, give the controller (ctid fit --loop FILE)"
+            yield Finding("problem", "growth", f"{text}; {remedy}.")
+        if f.output_constant:
             yield Finding(
                 "problem", "output", f"The output is constant at {self.y(f.output_mean)}: it does not respond."
             )
@@ -144,6 +156,8 @@ class _Sentences:
     def _response(self) -> Finding:
         f = self.facts
         p = probability(f.answer_p_value)
+        if math.isnan(f.answer_p_value):
+            return Finding("note", "response", "Whether the output responds to the input cannot be tested.")
         if f.answer_p_value > NO_RESPONSE:
             text = (
                 f"No response of the output to the input is seen: noise of its colour follows the input as much ({p})."
@@ -164,8 +178,9 @@ class _Sentences:
         return Finding("ok", "response", "; ".join(filter(None, [*parts, ended])) + ".")
 
     def _interval(self, estimate: Estimate | SlowTerm, unit: str) -> str:
-        ends = f"{_digits(estimate.low, 3)} to {_digits(estimate.high, 3)}"
-        return f"{_digits(estimate.value, 3)} {unit}".rstrip() + f" ({ends})"
+        digits = _needed(estimate.low, estimate.high, 3)
+        ends = f"{_digits(estimate.low, digits)} to {_digits(estimate.high, digits)}"
+        return f"{_digits(estimate.value, digits)} {unit}".rstrip() + f" ({ends})"
 
     def _tests(self) -> Iterator[Finding]:
         """What stands beside the response, and what of it is not detected."""
@@ -196,4 +211,5 @@ class _Sentences:
         missed += ["outliers"] * (not parts.outliers) + ["saturation"] * (not self.facts.saturated)
         if missed:
             text = "; ".join(missed)
-            yield Finding("ok", "not detected", f"{text}. This rules nothing out: the intervals hold 95 %.")
+            rule = f"tests are at the level of {LEVEL:g}, intervals hold 95 % and may leave out 0 all the same"
+            yield Finding("ok", "not detected", f"{text}. This rules nothing out: {rule}.")

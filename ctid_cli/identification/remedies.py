@@ -1,6 +1,7 @@
 """Changes of a fit that are tried on its own records, and those of them that help."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_not
@@ -76,7 +77,7 @@ class Remedy:
         made = f"with {self.option}{' besides' * self.besides}"
         if self.held_back:
             return f"{made} the held-back fit is {self.after:.1f} instead of {self.before:.1f} %"
-        numbers = f"BIC is {self.after:.1f} instead of {self.before:.1f}, the fit"
+        numbers = f"BIC of the innovations is {self.after:.1f} instead of {self.before:.1f}, the fit"
         return f"{made} {numbers} {self.fits[1]:.1f} instead of {self.fits[0]:.1f} %"
 
 
@@ -170,6 +171,18 @@ def tried_remedies(
     except CtidError:
         return found
     return found
+
+
+def outliers_of(
+    records: Sequence[Record], options: DelayProfile | AdditiveOutputError, fit: MeasuredFit
+) -> list[BoolArray]:
+    """Return which samples of each record are outliers, if another loss helps; else none."""
+    wild = [_outliers(fit, k) for k in range(len(records))]
+    found = Trials([], [])
+    if any(off.any() for off in wild):
+        with suppress(CtidError):
+            _best_step(Trial("structure", options, records[0].hold, tuple(records), fit), wild, ("loss",), found)
+    return [(off != 0.0) & bool(found.remedies) for off in wild]
 
 
 def _best_step(

@@ -38,6 +38,12 @@ def _integrators(number: int) -> str:
     return f" and {count(number, 'integrator')}" if number else ""
 
 
+def of_outliers(number: int) -> str:
+    """Return the loss that was chosen for outliers."""
+    what = "1 output sample is an outlier" if number == 1 else f"{number} output samples are outliers"
+    return f"Loss: tukey (--loss), as {what}; all else is chosen without {'it' if number == 1 else 'them'}."
+
+
 def rest_assumed(options: Searched) -> str:
     """Return that no other state could be tried."""
     level = "its first value" if options.input_before == "first" else f"{options.input_before or 0:g}"

@@ -22,7 +22,7 @@ from ctid_cli.inference.spectral_methods import (
 from ctid_cli.signals.checks import require_choice, require_integer
 from ctid_cli.signals.frequency_data import FrequencyData, held_data
 from ctid_cli.signals.held import REGULARITY, Hold, hold_factor
-from ctid_cli.signals.record import Record, named
+from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import ResponseMethod
 
 #: Method of estimation.
@@ -288,7 +288,7 @@ def estimate_frequency_response(
     for name, value, least in (("period", period, 2), ("half_width", half_width, 4), ("points", points, FEWEST)):
         if value is not None:
             require_integer(name, value, least)
-    every = [records] if isinstance(records, Record) else list(records)
+    every = as_records(records)
     if not every:
         raise DataError("there is no record to estimate a frequency response from")
     for record in every:

@@ -100,8 +100,10 @@ def analyse_response(record: Record, moves: InputMoves | None = None) -> InputRe
     moves = moves or input_moves(record)
     grid = regular_grid(record)
     nyquist = math.pi / grid.interval
-    if moves.kind == "constant" or grid.u.size < 8 or not np.any(grid.y):
+    if moves.kind == "constant" or grid.u.size < 8:
         return InputResponse(nyquist)
+    if not np.any(grid.y):
+        return InputResponse(nyquist, _Spectra.of(grid, 0, min(BINS)).input_band)
     if moves.kind == "steps":
         return _after_a_step(record, moves, nyquist)
     alignments = _peaks(np.abs(_cross_correlation(grid.u, grid.y, grid.u.size // 2)[grid.u.size // 2 :]))

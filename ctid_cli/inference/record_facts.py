@@ -20,7 +20,7 @@ from ctid_cli.inference.response_estimates import (
 from ctid_cli.inference.response_model import Signals, fit_response
 from ctid_cli.inference.response_test import LEVEL as NO_RESPONSE
 from ctid_cli.inference.response_test import response_test
-from ctid_cli.inference.signal_features import InputMoves, input_moves, outliers, quantum, saturated
+from ctid_cli.inference.signal_features import InputMoves, growth_time, input_moves, outliers, quantum, saturated
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
@@ -40,8 +40,8 @@ TAILS = (0.01, 0.99)
 ROUNDS = 3
 #: Longest delay in the test of the response [duration of the record].
 LONGEST_DELAY = 0.3
-#: An output is constant if its deviation is below this fraction of its mean.
-CONSTANT = 1e-9
+#: An output is constant if its deviation is below this fraction of its mean: what rounding leaves.
+CONSTANT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,16 @@ class RecordFacts:
     saturated: float
     #: Frequency below which 95 % of the response to the input lies [rad/s].
     output_bandwidth: float
+    #: Time in which a diverging output grows by a factor of e [s]; NaN for any other.
+    growth_time: float = math.nan
     #: p-value of the test for a response to the input [-].
     answer_p_value: float = math.nan
     parts: Decomposition = field(default_factory=Decomposition)
+
+    @property
+    def output_constant(self) -> bool:
+        """Whether the output does not move, but for rounding."""
+        return not self.output_deviation > CONSTANT * abs(self.output_mean)
 
 
 def record_facts(record: Record) -> RecordFacts:
@@ -139,12 +146,7 @@ def record_facts(record: Record) -> RecordFacts:
     steps = np.diff(t) if t.size > 1 else np.array([math.nan])
     interval = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * interval)
-    moving = moves.kind != "constant" and float(present.std()) > CONSTANT * abs(float(present.mean()))
-    parts = decompose(record) if moving and present.size >= FEWEST_SAMPLES else Decomposition()
-    p_value = _response_p_value(record) if moving else math.nan
-    if p_value > NO_RESPONSE:
-        parts = replace(parts, signal_to_noise=UNKNOWN, response_time=UNKNOWN, delay=UNKNOWN)
-    return RecordFacts(
+    facts = RecordFacts(
         name=record.name,
         n_samples=record.n_samples,
         n_masked=int(np.count_nonzero(~record.valid)),
@@ -167,11 +169,17 @@ def record_facts(record: Record) -> RecordFacts:
         output_quantum=quantum(present),
         saturated=saturated(present),
         output_bandwidth=response.bandwidth,
-        answer_p_value=p_value,
-        parts=parts,
+        growth_time=growth_time(t[record.valid], present, record.input.at(t[record.valid])),
         **_range("input", record.input.at(t)),
         **_range("output", present),
     )
+    if moves.kind == "constant" or facts.output_constant:
+        return facts
+    parts = decompose(record) if present.size >= FEWEST_SAMPLES else Decomposition()
+    p_value = _response_p_value(record)
+    if p_value > NO_RESPONSE:
+        parts = replace(parts, signal_to_noise=UNKNOWN, response_time=UNKNOWN, delay=UNKNOWN)
+    return replace(facts, answer_p_value=p_value, parts=parts)
 
 
 def _range(signal: str, x: Array) -> dict[str, Any]:

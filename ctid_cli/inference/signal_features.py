@@ -180,7 +180,8 @@ def growth_time(t: Array, y: Array, u: Array) -> float:
     steps = np.diff(grown)
     # An exponential grows at a constant rate, powers of time ever more slowly, and a late event suddenly.
     even = steps[-2:].min() > 0.5 * steps[-2:].max() and steps[-2:].sum() > 0.8 * steps[:2].sum()
-    unforced = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[-3]))
+    # An input that pauses has been as large before.
+    unforced = grown[-1] - grown[-3] > max(math.log(GROWTH), 2 * (driven[-1] - driven[:-2].max()))
     return float((t[-1] - t[0]) / 4 / (grown[-1] - grown[-3])) if even and unforced else math.nan
 
 

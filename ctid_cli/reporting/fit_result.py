@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ from ctid_cli.signals.measurement import Measurement
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import Hold
 from ctid_cli.storage.fit_file import fit_text
-from ctid_cli.text import count, probability
+from ctid_cli.text import count, listed, probability
 from ctid_cli.written_files import write_file
 
 FIT_DEFINITION = "100 (1 - ||y - x|| / ||y - mean y||)"
@@ -60,6 +61,8 @@ TREATMENTS = {
     "none": "none",
     "remove": "means of input and output subtracted",
 }
+#: Derived quantities that are greater than zero.
+POSITIVE = re.compile("time_constant|natural_frequency")
 #: Digits of the coefficients in the equation.
 DIGITS = 5
 #: Instants of outliers that the text names.
@@ -124,11 +127,13 @@ class FitResult(PagedResult):
     def page_head(self) -> tuple[str, str]:
         """Return the title of the page, and how well the model simulates."""
         fit, validation = self.fitted.fit, self.fitted.validation
-        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures())
+        structure = "; ".join(f"{name} {spelled(own)}".strip() for name, own in self._structures()) + self.lost_poles
         lead = f"{structure}: simulates {number(fit.fit_percent, 4)} % of "
         lead += count(fit.count, "sample")
         if validation is not None:
-            lead += f"; {number(validation.fit_percent, 4)} % on {shown(validation.name)}, which it was not made from"
+            seen = self.fitted.seen_in_validation
+            made = f"of which {count(seen, 'sample')} made it" if seen else "which it was not made from"
+            lead += f"; {number(validation.fit_percent, 4)} % on {shown(validation.name) or 'a record'}, {made}"
         title = "Fit of " + ", ".join(shown(record.name) or "a record" for record in self.records.data)
         return title, f"{lead}. {fit.status.value}"
 
@@ -174,7 +179,12 @@ class FitResult(PagedResult):
     def derived(self) -> Section:
         """Return derived quantities as a table, and why some have no error."""
         rows = derived_of(self.fitted, self.units)
-        return Section.table(rows, DERIVED, notes=list(dict.fromkeys(row.reason for row in rows if row.reason)))
+        notes = list(dict.fromkeys(row.reason for row in rows if row.reason))
+        below = [row.name for row in rows if POSITIVE.search(row.name) and row.low < 0.0]
+        if below:
+            what = f"Intervals of {listed(below)} reach" if len(below) > 1 else f"The interval of {below[0]} reaches"
+            notes.append(f"{what} below 0, where no value can be: the error is too large for a linearised interval.")
+        return Section.table(rows, DERIVED, notes=notes)
 
     def settings(self) -> Iterator[tuple[str, str]]:
         """Return what was estimated, and how the records were taken."""
@@ -206,13 +216,20 @@ class FitResult(PagedResult):
             return list(zip(names, options._each(names), strict=True))
         return [("", options)]
 
+    @property
+    def lost_poles(self) -> str:
+        """How many of the poles that were asked for the model does not have."""
+        lost = self.fitted.fit.poles_at_infinity
+        return f" ({lost} of the poles at infinity, not shown)" if lost else ""
+
     def structure(self) -> Iterator[tuple[str, str]]:
         """Return the structure of the model, and what of it was known."""
         options = self.fitted.options
         if isinstance(self.fitted.fit, MultiInputFit) and isinstance(options, DelayProfile):
             yield "model", "common denominator" if options.common else "a denominator for each input"
         for name, own in self._structures():
-            yield f"input {name}" if name else "model", f"{spelled(own)}; delay {_searched(own, self.units)}"
+            asked = f"{spelled(own)}{self.lost_poles}"
+            yield f"input {name}" if name else "model", f"{asked}; delay {_searched(own, self.units)}"
         if options.fixed:
             yield "known", ", ".join(f"{one.name} = {one.value:.6g}" for one in options.fixed) + " (--fix)"
 
@@ -226,7 +243,7 @@ class FitResult(PagedResult):
             yield from self._noise(fit.noise)
         if validation is not None:
             text = f"fit {number(validation.fit_percent, 5)} %, R2 {number(validation.r2, 6)} on "
-            text += f"{shown(validation.name)}, {count(validation.count, 'sample')}"
+            text += f"{shown(validation.name) or 'a record'}, {count(validation.count, 'sample')}"
             yield "validation", f"{text}; initial state and offset of its own"
             for k in self.predicted:
                 assert fit.noise is not None
@@ -252,6 +269,8 @@ class FitResult(PagedResult):
     def search(self) -> Iterator[tuple[str, str]]:
         """Return how the search went, and the bounds of the admissible models where it ended at them."""
         fit, units = self.fitted.fit, self.units
+        if fit.status is not Status.CONVERGED:
+            yield "status", fit.status.value
         if fit.starts is not None:
             yield "search", f"the best of {count(fit.starts.tried, 'start')}, reached {count(fit.starts.agree, 'time')}"
         for name, end in fit.bounds_met:
@@ -331,7 +350,7 @@ def _record_line(measurement: Measurement, used: int, units: Units) -> str:
     span = f"{part} from {record.t[0]:.6g} to {record.t[-1]:.6g} {units.time}, {clock}"
     columns = f"input{'s' * record.several} {units.column(measurement, 'input')}, "
     columns += f"output {units.column(measurement, 'output')}"
-    return f"{shown(record.name)}: {count(record.n_samples, 'sample')}{span}; {columns}"
+    return f"{shown(record.name) or 'record'}: {count(record.n_samples, 'sample')}{span}; {columns}"
 
 
 def _before(result: Identification, state: str) -> str:

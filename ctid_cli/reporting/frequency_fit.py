@@ -129,7 +129,8 @@ class FrequencyFitResult(FitResult):
         """Return the title of the page, and how well the model fits."""
         fit = self.fit
         lines = count(fit.data.frequencies.size, "weighted line")
-        lead = f"{spelled(self.fitted.options)}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
+        asked = f"{spelled(self.fitted.options)}{self.lost_poles}"
+        lead = f"{asked}: {number(fit.fit_percent, 4)} % of {lines}. {fit.status.value}"
         return f"Fit of {shown(fit.data.name) or 'a frequency response'}", lead
 
     def chapters(self) -> Iterator[Chapter]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ctid_cli.identification.record_findings import ROUNDING, Finding, Level, findings
+from ctid_cli.identification.record_findings import Finding, Level, findings
 from ctid_cli.inference.record_facts import RecordFacts
 from ctid_cli.inference.response_estimates import Estimate
 from ctid_cli.reporting.document import Result, Section
@@ -23,6 +23,8 @@ KEYS = {
     "response_time": ("response_time", "response_time_low", "response_time_high"),
     "delay": ("delay", "delay_early", "delay_late"),
 }
+#: A mean below this fraction of the standard deviation is what rounding leaves where a mean was subtracted.
+ROUNDING = 1e-9
 #: Columns of numbers; the value of a signal is its mean.
 NUMBERS = ("value", "standard deviation", "low", "high")
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -329,18 +329,40 @@ def beginning(record: Record, samples: int) -> Record:
     return Record(t, record.y[:samples], inputs, name=record.name)
 
 
+def common_samples(record: Record, others: Sequence[Record]) -> int:
+    """Return how many samples of a record are those of others, with which it agrees at all instants they share."""
+    found = 0
+    for other in others:
+        _, own, theirs = np.intersect1d(record.t, other.t, assume_unique=True, return_indices=True)
+        found += own.size * np.array_equal(record.y[own], other.y[theirs], equal_nan=True)
+    return found
+
+
 def _named_inputs(
     inputs: HeldSignal | Mapping[str, HeldSignal | ArrayLike], t: Array, where: str
 ) -> dict[str, HeldSignal]:
     """Return inputs by name, values at the instants of the output held."""
     if isinstance(inputs, HeldSignal):
         return {"u": inputs}
+    if not isinstance(inputs, Mapping):
+        wanted = "a HeldSignal, such as HeldSignal(t, u), or several signals by name"
+        arrays = "Record.from_arrays(t, u, y) takes arrays"
+        raise DataError(f"{where}inputs must be {wanted}, not {type(inputs).__name__}; {arrays}")
     if not inputs:
         raise DataError(f"{where}there is no input")
     return {
         name: one if isinstance(one, HeldSignal) else HeldSignal(t, np.asarray(one, dtype=float))
         for name, one in inputs.items()
     }
+
+
+def as_records(records: Any) -> list[Record]:
+    """Return one record or several as a list; a DataError where something else is given."""
+    several = list(records) if isinstance(records, Iterable) else [records]
+    for one in several:
+        if not isinstance(one, Record):
+            raise DataError(f"records must be a Record or a list of these, not {type(records).__name__}")
+    return several
 
 
 def named(record: Record) -> str:

@@ -48,6 +48,12 @@ def test_what_frf_writes_is_fitted_with_the_hold_that_it_took_out(ctid, tmp_path
     assert [item["estimate"] for item in content["parameters"][:2]] == pytest.approx([2.0, 1.0], rel=1e-4)
 
 
+def test_a_delay_that_is_missing_is_named(ctid, tmp_path):
+    response_file(tmp_path)
+    found = ctid("fit --poles 1 --json --out", tmp_path / "new", tmp_path / "frf.csv").stdout
+    assert json.loads(found)["warnings"][0].startswith("The delay is taken as 0 s: with --delay 0:16 the fit is 9")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [("--input u", "several inputs are fitted from records"), ("--weight inverse", "drop --weight")],

@@ -11,15 +11,20 @@ import pytest
 import ctid_cli
 from ctid_cli import (
     CtidError,
+    DataError,
+    DelayProfile,
     Flag,
     FrequencyTrack,
     Given,
+    Record,
     SpecError,
+    Srivc,
     TransferFunction,
     identify,
     read_record,
     read_results,
     run_experiment,
+    simulate,
 )
 from tests.cli.records import rows, write
 
@@ -84,7 +89,12 @@ def test_a_fit_is_shown_as_by_the_command(ctid, tmp_path):
     assert found.summary().split("\n\n")[3:5] == printed.split("\n\n")[3:5]
     assert len(found.plot().axes) == 4
     assert found._repr_html_().count("<table") == 4
+    found.plot(tmp_path / "drawn.png")
+    assert (tmp_path / "drawn.png").read_bytes().startswith(b"\x89PNG")
     fit = found.fit
+    assert found.fit_percent == fit.fit_percent
+    assert found.parameters == fit.parameters | {"delay": found.options.delay_bounds[0]} | fit.parameters
+    assert found.validate(found.records[0]).fit_percent == pytest.approx(fit.fit_percent)
     frame = fit.to_frame()
     assert frame["estimate"].to_dict() == fit.parameters
     assert frame["standard_error"].to_dict() == fit.standard_errors
@@ -113,3 +123,26 @@ def test_completion_knows_the_public_names_and_no_others():
     assert len(names) == len(set(names))
     for name in names:
         assert getattr(ctid_cli, name).__name__ == name
+
+
+T = np.arange(5.0)
+RECORD, PROFILE = Record.from_arrays(T, T, T), DelayProfile(1, 0, (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "message"),
+    [
+        (lambda: Record(T, T, T), "inputs must be a HeldSignal, such as HeldSignal.t, u., or .*, not ndarray"),
+        (
+            lambda: simulate(TransferFunction([1], [1, 1]), T, T),
+            "input of a simulation must be a HeldSignal, .*, not ndarray",
+        ),
+        (lambda: PROFILE.fit(T), "records must be a Record or a list of these, not ndarray"),
+        (lambda: identify(PROFILE, [RECORD]), "records must be a Record or a list of these, not DelayProfile"),
+        (lambda: identify([RECORD], Srivc(1, 0)), "options of identify must be .*, not Srivc; any estimator fits by"),
+        (lambda: Srivc(1, 0).fit(RECORD, 0.5), "start must be a Start, .*, not float"),
+    ],
+)
+def test_what_is_no_record_signal_or_start_is_refused_by_its_type(mistaken, message):
+    with pytest.raises((DataError, TypeError), match=message):
+        mistaken()

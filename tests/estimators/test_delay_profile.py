@@ -239,3 +239,9 @@ def test_a_drift_is_a_constant_and_a_slope(initial_state, irregular):
     assert fit.model.delay == pytest.approx(SYSTEM.delay, abs=1e-6)
     with pytest.raises(ValueError, match="offset drift goes without integrators"):
         DelayProfile(2, 0, (0, 3), offset="drift", integrators=1)
+
+
+def test_a_refinement_without_a_pole_counts_it_among_those_at_infinity():
+    record = record_of(TransferFunction([1.0], [1.0, 1.0]))
+    fit = DelayProfile(2, 0, (0.0, 0.0))._refine([record], (np.array([1.0, 1.0]), 0.0))
+    assert (fit.model.order, fit.poles_at_infinity) == (1, 1)

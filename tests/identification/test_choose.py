@@ -59,6 +59,17 @@ def test_state_and_offset_are_those_that_were_made(made, state, offset):
     assert (options.initial_state, options.offset) == (state, offset)
 
 
+def test_outliers_are_left_out_of_the_choice_and_given_another_loss():
+    record, clean = record_of(SECOND), choose(record_of(SECOND))
+    y = record.y.copy()
+    y[[30, 90, 400]] += (30.0, -40.0, 25.0)
+    choice = choose(replace(record, y=y))
+    assert " ".join(choice.words()) == " ".join(clean.words()).replace(" --hold", " --loss tukey --hold")
+    assert choice.options == replace(clean.options, loss="tukey")
+    assert choice.sentences[0].startswith("Loss: tukey (--loss), as 3 output samples are outliers")
+    assert choose(replace(record, y=y), Given(loss="squares")).options.loss == "squares"
+
+
 @pytest.mark.parametrize("lead", [1, 5, 15])
 def test_an_early_step_is_a_step_from_rest(lead):
     choice = choose(record_of(SECOND, u=step(lead), offset=1.0))

@@ -37,6 +37,9 @@ def test_only_exponential_growth_diverges(grown, diverges):
     t = np.linspace(0.0, 12.0, 600)
     y, u = grown(t), np.sin(3 * t)
     assert growth_time(t, y, u) == (pytest.approx(1.0, rel=0.05) if diverges else pytest.approx(np.nan, nan_ok=True))
+    # An input that pauses does not grow when it goes on.
+    pausing = np.where((t > 7.5) & (t < 9.0), 0.0, u)
+    assert np.isfinite(growth_time(t, y, pausing)) == diverges
     # An input that grows itself explains it.
     assert np.isnan(growth_time(t, y, grown(t)))
 

@@ -14,8 +14,10 @@ from ctid_cli.canonical import plain
 from ctid_cli.errors import DataError
 from ctid_cli.estimators.delay_profile import DelayProfile
 from ctid_cli.filtering.simulate import simulate
+from ctid_cli.identification.choice import Given
 from ctid_cli.identification.identify import identify
 from ctid_cli.inference.fit import Status
+from ctid_cli.inference.intervals import UncertainValue
 from ctid_cli.inference.units import Units
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.reporting.fit_content import derived_of, parameters_of
@@ -24,7 +26,7 @@ from ctid_cli.reporting.layout import picked
 from ctid_cli.reporting.records import Records
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.measurement import Measurement
-from ctid_cli.signals.record import Record
+from ctid_cli.signals.record import Record, beginning
 
 SYSTEM = TransferFunction([3.0], [1.0, 1.2, 4.0], 0.73)
 UNITS = Units("ms", "V", "mA")
@@ -135,6 +137,42 @@ def test_bounds_that_a_pole_met_are_named(results):
     lost = replace(result.fitted.fit, poles_at_infinity=2, status=Status.AT_BOUND)
     text = replace(result, fitted=replace(result.fitted, fit=lost)).summary()
     assert "poles from 1.252e-06 to 100 rad/ms, imaginary parts up to 31.38 rad/ms" in text
+
+
+def test_a_pole_that_ran_to_infinity_is_missing_in_words():
+    one = measurement().record
+    early = simulate(TransferFunction([2.0], [1.0, 1.0]), one.input, one.t + 0.1)  # before what causes it
+    given = Given(2, 0, delay_bounds=(0.0, 0.0), initial_state="rest", offset="none", hold="zoh")
+    fitted = identify(Record(one.t, early, one.input), given)
+    result = FitResult.of(fitted)
+    assert fitted.fit.model.order == 1
+    assert any("1 pole fewer than asked for" in warning for warning in fitted.warnings)
+    assert dict(result.settings())["model"].startswith("2 poles, no zero (1 of the poles at infinity, not shown)")
+    assert "not shown" in result.page_head()[1]
+
+
+def test_an_interval_below_zero_of_what_is_positive_is_remarked(results):
+    result = results["validated"]
+    first, *rest = result.fitted.derived
+    wide = UncertainValue("time_constant_1", 64.4, 55.0, -45.7, 174.4)
+    changed = replace(result, fitted=replace(result.fitted, derived=(wide, first, *rest)))
+    assert changed.derived().notes[-1].startswith("The interval of time_constant_1 reaches below 0")
+    assert not any("below 0" in note for note in result.derived().notes)
+
+
+def test_a_record_without_a_name_is_called_a_record():
+    one = measurement()
+    lines = FitResult.of(identify(replace(one.record, name=""), DelayProfile(2, 0, (0.73, 0.73)))).data().sentences
+    assert lines[0].startswith("record: 800 samples")
+
+
+def test_validation_on_samples_of_the_fit_is_called_so():
+    one = measurement()
+    part = replace(one, record=beginning(one.record, 500))
+    result = result_of(part, other=one, delay=(0.73, 0.73))
+    assert result.fitted.warnings[0].startswith("500 of the 800 samples of the validation record")
+    assert "of which 500 samples made it" in result.page_head()[1]
+    assert "which it was not made from" in result_of(part, other=measurement(1), delay=(0.73, 0.73)).page_head()[1]
 
 
 def test_forms(results):
