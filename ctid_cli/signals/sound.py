@@ -1,4 +1,4 @@
-"""Sound files: their channels as columns of a table, and their clock."""
+"""Sound files: channels as columns of a table, and sampling rate."""
 
 import os
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.table import Columns, Table
 
-#: How the names of sound files end.
+#: Suffixes of sound files.
 SOUNDS = (".wav", ".wave", ".flac", ".aif", ".aiff", ".ogg")
 
 
 def is_sound(path: str | os.PathLike[str]) -> bool:
-    """Return whether the name of a file is that of a sound."""
+    """Return whether a file name has the suffix of a sound file."""
     return Path(path).suffix.lower() in SOUNDS
 
 
