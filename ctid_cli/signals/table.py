@@ -155,8 +155,8 @@ class Table:
     ) -> Columns:
         """Read the column of each role: the named one, or one recognised by its name or position.
 
-        If times must be in seconds, a time column labelled with another unit is refused unless it is selected by its full
-        name with the unit. Without times, their column is identified but not read, and may be absent.
+        If times must be in seconds, a time column labelled with another unit is refused unless it is selected by its
+        name and unit. Without times, their column is identified but not read, and may be absent.
         """
         chosen, notes = self._choose(asked, ("time",) if without_times else ())
         if in_seconds:
