@@ -142,7 +142,7 @@ def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ..
 
 
 def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPrecision, ...]:
-    """Return the precision of every data cell from a journal; empty if the number of data sets is given."""
+    """Return the precision of every data cell from a journal."""
     if _asked(manifest) is None:
         return ()
     return cell_precisions(manifest, {row.key: row.content for row in log.rows()})

@@ -95,8 +95,8 @@ def read_record(
 
     Raises
     ------
-    If the file cannot be used; the message names the file, the line and the remedy.
-        If the file cannot be used; the message names the file, the line and what to do.
+    DataError
+        If the file cannot be used; the message names the file, the line and the remedy.
     """
     require_choice("offset", offset, get_args(Offset))
     record = read_measurement(path, time=time, input=input, output=output, hold=hold, in_seconds=True).record

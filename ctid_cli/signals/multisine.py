@@ -29,8 +29,9 @@ class Multisine(checks.Checked, Excitation):
         Lower end of the band [rad/s]; without a period, the first tone.
     highest_frequency : float, optional
         Upper end of the band [rad/s], below pi over the (mean) clock period.
-    Number of tones, spaced over the band; a single one lies at its lower end. With a period, None means every
-    harmonic in the band.
+    tones : int, optional
+        Number of tones, spaced over the band; a single one lies at its lower end. With a period, None means every
+        harmonic in the band.
     amplitude : float, default 1.0
         Root mean square over whole periods of the tones [input unit].
     clock_period : float, optional

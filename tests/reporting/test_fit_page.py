@@ -1,4 +1,4 @@
-"""The page of a fit: complete in itself, and safe whatever names files and columns have."""
+"""Page of a fit: self-contained, and safe for any names of files and columns."""
 
 import re
 import shlex
@@ -30,7 +30,7 @@ def measurement(seed, name, n=400, noise=0.1):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A fit with everything, its records and its page."""
+    """A fit with all optional parts, its records and its page."""
     measured, other = [measurement(0, HOSTILE)], measurement(1, "other.csv")
     options = DelayProfile(2, 0, (0, 2), initial_state="estimate", offset="estimate")
     result = identify([item.record for item in measured], options, other.record)

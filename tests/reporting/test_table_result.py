@@ -1,4 +1,4 @@
-"""Tables of experiments, from estimates made by hand: who counts, what programs read, and how it is printed."""
+"""Tables of experiments from hand-made estimates: counted estimates, machine-readable output, and text."""
 
 import json
 
@@ -116,7 +116,7 @@ def test_medians_are_of_the_slowest_tone(tmp_path):
     tracks = [of_track(1.0, 3.0, 2.0, 0.1, 0), of_track(2.0, 1.5, 3.0, 0.3, 2), of_track(5.0, 0.0, 9.0, 0.2, 1)]
     results = frequency_results(tmp_path, tracks, [of_record(0.01)])
     assert measured(results) == [[3.0, 3.0, 0.2, 0.2, 3], [None, None, 0.01, 0.05, None]]
-    # Settled in time: not the one with 5 and 9 s, and of whole records those whose errors lie in the band.
+    # Settled in time: not the one with 5 and 9 s; of the whole records, those with errors inside the band.
     assert percentage_frame(results)["converged"].tolist() == [2, 1]
 
 

@@ -1,4 +1,4 @@
-"""What is said and written about a track."""
+"""Text and files of a track."""
 
 import io
 import json

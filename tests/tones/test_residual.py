@@ -1,4 +1,4 @@
-"""What the tones of a track leave of its record."""
+"""Residual of a record after subtraction of its tones."""
 
 from types import SimpleNamespace
 
