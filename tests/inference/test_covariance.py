@@ -1,4 +1,4 @@
-"""Covariances of white and coloured noise, against exact ones and by coverage; sentences on ill-conditioned ones."""
+"""Covariances for white and coloured noise, against exact ones and by coverage; messages on ill-conditioned ones."""
 
 import numpy as np
 import pytest
@@ -178,7 +178,7 @@ def covariance(errors, pairs=()):
 
 
 FIVE = ("a1", "a2", "b0", "b1", "delay")
-# Each pair of parameters 0.6 to 0.8, but the third is nearly the sum of the others.
+# Correlations between pairs are 0.6 to 0.8, but the third parameter is nearly the sum of the others.
 TOGETHER = np.random.default_rng(1).standard_normal((1000, 3))
 TOGETHER[:, 2] = TOGETHER[:, 0] + TOGETHER[:, 1] + 0.01 * TOGETHER[:, 2]
 UNDEFINED = np.full((3, 3), np.nan)
@@ -206,7 +206,7 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
             ("can hardly distinguish", "hardly shows when the response begins"),
         ),
-        # Pairs that share a parameter are one sentence.
+        # Pairs that share a parameter are in one sentence.
         (
             covariance([0.1] * 5, [(0, 1, 0.9997), (1, 2, 0.9997), (0, 2, 0.9996)]),
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),

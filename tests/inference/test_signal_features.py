@@ -1,4 +1,4 @@
-"""Faults of sensors and recorders that are planted in a sequence."""
+"""Faults of sensors and recorders planted in a sequence."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_few_samples_at_one_limit_are_cut_off():
     limit = np.sort(y)[-6]
     assert saturated(y) == 0
     assert saturated(np.minimum(y, limit)) == 6 / 400
-    # An output at rest before it moves may lie below all that follows.
+    # An output at rest before it moves may be below all later values.
     assert saturated(np.concatenate((np.full(40, y.min() - 1), y))) == 0
 
 
@@ -37,7 +37,7 @@ def test_only_exponential_growth_diverges(grown, diverges):
     t = np.linspace(0.0, 12.0, 600)
     y, u = grown(t), np.sin(3 * t)
     assert growth_time(t, y, u) == (pytest.approx(1.0, rel=0.05) if diverges else pytest.approx(np.nan, nan_ok=True))
-    # An input that grows itself explains it.
+    # Growth of the input explains growth of the output.
     assert np.isnan(growth_time(t, y, grown(t)))
 
 

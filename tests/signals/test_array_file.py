@@ -22,7 +22,7 @@ def rig(tmp_path):
 
 
 def opaque(variable, kind):
-    """A version 5 file with one object, laid out as MATLAB does it."""
+    """Return a version 5 file with one object, in MATLAB's layout."""
 
     def element(code, data):
         return struct.pack("<II", code, len(data)) + data + b"\0" * (-len(data) % 8)
@@ -36,7 +36,7 @@ def opaque(variable, kind):
 
 
 def save_v73(path, groups):
-    """A version 7.3 file: HDF5 behind a MATLAB header; arrays lie transposed."""
+    """Write a version 7.3 file: HDF5 after a MATLAB header; arrays are transposed."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, (kind, value) in groups.items():
             item = file.create_group(name) if value is None else file.create_dataset(name, data=value)

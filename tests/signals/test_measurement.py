@@ -1,4 +1,4 @@
-"""Measured files: columns by name, units as labels, windows, and one clear sentence for what cannot be used."""
+"""Measured files: columns by name, units as labels, windows, and clear messages about unusable ones."""
 
 import pytest
 
@@ -32,7 +32,7 @@ def test_three_columns_are_taken_by_position_and_a_note_says_so(write):
     assert measurement.notes == (
         "Columns were taken by their position: 'when' as the time, 'valve' as the input and 'level' as the output.",
     )
-    # what is known is not taken twice
+    # known columns are not assigned twice
     partly = read_measurement(write("level,valve,t\n1,5,0\n2,6,1\n"), output="level")
     assert (partly.time, partly.input, partly.output) == ("t", "valve", "level")
     assert partly.notes == ("Columns were taken by their position: 'valve' as the input.",)
