@@ -1,4 +1,4 @@
-"""Algorithm IV as printed, against a short transcription of its own, and within its bounds on noise."""
+"""Algorithm IV as printed, against a short independent transcription, and within its bounds on noise."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ class Transcription:
         return simulate(TransferFunction(numerator, a, delay), held, self.record.t)[self.used]
 
     def signals(self, record, a, b, delay):
-        """The p^2/A y of (7), the regressors (8), the instruments (9), the output error, and its slope (26)."""
+        """Return p^2/A y of (7), the regressors (8), the instruments (9), the output error, and its slope (26)."""
         y = HeldSignal(record.t, record.y, "foh")
         slow, fast = (self.filtered(y, a, numerator) for numerator in ([1.0], [1.0, 0.0]))
         u = self.filtered(record.input, a, [1.0], delay)

@@ -1,4 +1,4 @@
-"""Estimates of one fraction in the parameters of submodels: values, errors, and where there are none."""
+"""Estimates of one fraction converted to submodel parameters: values, errors, and missing results."""
 
 from dataclasses import dataclass
 
@@ -83,7 +83,7 @@ def test_undefined_errors_are_not_finite():
     fit = fraction_fit()
     fit.covariance[:] = np.nan
     assert np.isnan(list(additive_parameters(fit, TERMS)[1].values())).all()
-    # A numerator that lost its leading coefficient: the parameters do not match those of the model.
+    # A numerator without its leading coefficient: the parameters do not match those of the model.
     fit = fraction_fit(AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])]))
     fit.parameter_names = (*fit.parameter_names, "b3")
     assert np.isnan(list(additive_parameters(fit, TERMS)[1].values())).all()
