@@ -229,7 +229,7 @@ def test_delay_that_the_coefficients_can_imitate_has_no_step():
 
 
 def one_delay(step, determined=1.0):
-    """Return equations of one coefficient and the delay with a given step and fraction of the delay in the curvature."""
+    """Return equations of one coefficient and the delay, with a given step and curvature fraction of the delay."""
     overlap = np.sqrt(1.0 - determined)
     hessian = np.array([[1.0, overlap], [overlap, 1.0]])
     return Equations(hessian, np.array([0.0, step * determined]), hessian, 1.0, 1.0)

@@ -36,7 +36,7 @@ EXACT = [
 ]
 # The fast mode of case 2, with a period of 0.31 s, causes a local minimum 0.13 s before the true delay if the input is
 # white: no local search on unfiltered data passes it from that side, which is the purpose of the low-pass filter.
-# From 0.2 s late, case 2 on its irregular clock depends on rounding: one start in four, 1e-9 s apart, fails.
+# 0.2 s late, case 2 on its irregular clock depends on rounding: of starts 1e-9 s apart, one in four is trapped.
 EXACT += [
     (model, searched(model, lowpass=lowpass, tolerance=1e-12), Start(start))
     for model, lowpass in ((CASE_1, None), (CASE_1, Lowpass(0.202, 2)), (CASE_2, Lowpass(2.685, 2)))
