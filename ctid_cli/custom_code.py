@@ -99,7 +99,7 @@ def is_shipped(kind: str, folder: Path) -> bool:
     file = _file_of(kind.rpartition(":")[0], folder)
     try:
         return file is not None and not file.is_symlink() and file.parent.resolve().is_relative_to(STUDIES)
-    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+    except (OSError, RuntimeError, ValueError):  # circular links, a zero byte
         return False
 
 

@@ -383,9 +383,9 @@ def _without_place(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
     content = {key: _without_place(value) if isinstance(value, dict) else value for key, value in canonical.items()}
-    for name in ("measures", "limits"):  # say what is shown, and what may not be exceeded, not what is computed
+    for name in ("measures", "limits"):  # these do not affect what is computed
         content.pop(name, None)
-    if content.get("inputs") is None:  # results of before there were several inputs stay those of the specification
+    if content.get("inputs") is None:  # keeps hashes of specifications from before several inputs existed
         content.pop("inputs", None)
     if content.get("monte_carlo") is not None:
         content["monte_carlo"] = {"seed": content["monte_carlo"]["seed"]}

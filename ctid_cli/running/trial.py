@@ -208,7 +208,7 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
     except DataError as error:
         at = tuple(error.section.split(".")) if error.section else ()
         return None, [((*at, "kind") if error.section in custom else at, str(error))]
-    except Exception:  # of which a run says more: it is stored with every estimate
+    except Exception:  # a run reports it with every estimate
         return None, []
 
     def excited(r: Any) -> Any:
@@ -234,7 +234,7 @@ def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
     for seed in (0, 1):
         begun = time.monotonic()
         random.seed(seed)
-        np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+        np.random.seed(seed)  # noqa: NPY002 - results must not depend on it
         results.append(compute())
         if time.monotonic() - begun > MAX_SECONDS:
             break
@@ -247,7 +247,7 @@ def _unusable(estimator: Any, data: Any) -> str:
         estimator.prepare(data.record)
     except (DataError, OptionError) as error:
         return str(error)
-    except Exception:  # of which a run says more: it is stored with every estimate
+    except Exception:  # a run reports it with every estimate
         return ""
     return ""
 

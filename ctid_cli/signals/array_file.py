@@ -72,7 +72,7 @@ def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[
 
 def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
     """Write the vectors of a file to a folder, and the reasons why other variables are not vectors."""
-    faulthandler.disable()  # a crash is no news
+    faulthandler.disable()  # a crash is expected here
     told: dict[str, Any]
     try:
         arrays, objects = _arrays(path)
@@ -86,7 +86,7 @@ def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
         told = {"refused": str(error)}
     except PermissionError as error:
         told = {"refused": f"cannot be read: {error.strerror}"}
-    except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
+    except Exception:  # C readers fail on damage in many ways, including memory errors; the caller reports it
         raise SystemExit(1) from None
     (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
 
@@ -101,7 +101,7 @@ def _arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str
     with warnings.catch_warnings():
         # Objects in one file share a placeholder name, which does not affect the arrays.
         warnings.simplefilter("ignore")
-        with suppress(Exception):  # objects have no headers of this kind; what else is wrong the reader itself says
+        with suppress(Exception):  # objects have no such headers; the reader itself reports other errors
             claimed = scipy.io.whosmat(path)
         for name, shape, _ in claimed:
             require_values(repr(name), math.prod(shape))

@@ -120,7 +120,7 @@ def _checked(name: str, value: Any, hint: Any, label: str = "") -> Any:
         parts[1](name, value, *parts[2:], label=label)
     elif origin is Literal:
         require_choice(name, value, parts)
-    elif origin in (Union, types.UnionType) and value is not None:  # what may be absent too
+    elif origin in (Union, types.UnionType) and value is not None:  # optional values
         return _checked(name, value, parts[0])
     elif origin is tuple:
         return tuple(_checked(name, item, parts[0], f"each of the {name}") for item in value)

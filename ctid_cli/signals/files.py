@@ -58,7 +58,7 @@ def is_inside(path: str | os.PathLike[str], folder: Path) -> bool:
     """Return whether a file lies in a folder or below it, after following links."""
     try:
         return Path(path).resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+    except (OSError, RuntimeError, ValueError):  # circular links, a zero byte
         return False
 
 

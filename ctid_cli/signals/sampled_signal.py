@@ -117,7 +117,7 @@ def _selected(table: Table, time: str | None, signal: str | None, *, without_tim
     except DataError as error:
         if without_times:
             raise
-        table.select(asked | {"time": None}, without_times=True)  # says what is wrong with the signal itself
+        table.select(asked | {"time": None}, without_times=True)  # raises if the signal itself is wrong
         raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
 
 

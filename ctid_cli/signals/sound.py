@@ -24,7 +24,7 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float]:
     file = require_file(path)
     try:
         import soundfile
-    except (ImportError, OSError):  # an OSError where the library that it needs is not there
+    except (ImportError, OSError):  # an OSError if its C library is missing
         how = "pip install 'ctid[sound]' adds it, or save the samples as text (.csv)"
         raise DataError(f"{file}: sound is read with the package soundfile: {how}") from None
     try:

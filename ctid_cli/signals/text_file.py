@@ -278,7 +278,7 @@ class _Widened:
 
 def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
     """Read columns by position, and an additional one that is empty unless a line has too many fields."""
-    import pandas as pd  # a second of start-up time that only a command that reads a file should pay
+    import pandas as pd  # takes a second, only when a file is read
 
     width = len(layout.columns)
     options: Any = {"header": 0, "names": range(width + 1), "usecols": [*places, width], "index_col": False}

@@ -69,7 +69,7 @@ def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Com
     try:
         times = sampling.times(stream(seed, "sampling", 0))
         applied = excitation.generate(times, stream(seed, "input", 0))
-    except DataError as error:  # of a case that was not tried
+    except DataError as error:  # in a case that was not tried
         yield ("excitation",), f"{error}; estimates of such data sets are stored as FAILED"
         return
     if applied.hold != "zoh":

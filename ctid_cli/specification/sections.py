@@ -109,7 +109,7 @@ class Section(BaseModel):
     def options(self) -> Any:
         """Build the options; an OptionError names the refused option and the reason."""
         try:
-            with np.errstate(all="ignore"):  # what overflows is refused, or found by the section's own complaints
+            with np.errstate(all="ignore"):  # overflow is refused here or by `complaints`
                 return self.build()
         except (Exception, SystemExit) as error:
             if self.custom and not isinstance(error, (ValueError, CtidError)):
@@ -128,7 +128,7 @@ def place_of(error: Exception, options: Container[str]) -> tuple[str, ...]:
 
 def _part(value: Any) -> Any:
     if isinstance(value, Section):
-        return value.options()  # which nothing has against it: the section was validated before the one it is in
+        return value.options()  # never fails: inner sections are validated before outer ones
     return tuple(map(_part, value)) if isinstance(value, list) else value
 
 

@@ -147,7 +147,7 @@ EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", cust
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Number of data sets, and what counts
+# Number of data sets, and success
 
 
 class UntilSection(Section):
@@ -274,7 +274,7 @@ class LimitsSection(Section):
 
 
 class Spec(Section):
-    """One experiment: simulated or measured data or a signal, estimators, starts, and what counts as success.
+    """One experiment: simulated or measured data or a signal, estimators, starts, and success rule.
 
     Parameters
     ----------

@@ -221,7 +221,7 @@ def _composed(text: str, file: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
-            mark = error.context_mark  # what was never closed is of more use than the end of the file
+            mark = error.context_mark  # the place of the unclosed item is more useful than the end of the file
         raise SpecError([problem_at(mark, (), _syntax_message(error))]) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]

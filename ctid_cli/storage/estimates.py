@@ -295,7 +295,7 @@ class Estimates:
 
     @cached_property
     def results(self) -> dict[Key, dict[str, Any]]:
-        """Return all results by key."""
+        """All results by key."""
         return dict(self.by_key())
 
     def by_key(self) -> Iterator[tuple[Key, dict[str, Any]]]:

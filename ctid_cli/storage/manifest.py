@@ -40,7 +40,7 @@ class Key(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Return the short name of the estimate."""
+        """Short name of the estimate."""
         return hashlib.sha256(f"{self[0]}/{self[1]}/{self[2]}/{self[3]}".encode()).hexdigest()[:12]
 
 
@@ -66,7 +66,7 @@ class Slot(NamedTuple):
 
     @property
     def swept(self) -> dict[str, Any]:
-        """Return the values of the swept fields."""
+        """Values of the swept fields."""
         return {**self.cell["swept"], **self.estimator["swept"]}
 
 

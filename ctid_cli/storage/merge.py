@@ -248,7 +248,7 @@ def shards_text(numbers: Iterable[int], of: int) -> str:
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
 
 
-# --- what can be read of damaged results, copied from the folder that was moved aside --------------------------------
+# --- recovery of readable results from a damaged folder that was moved aside ------------------------------------------
 
 
 @dataclass(frozen=True)

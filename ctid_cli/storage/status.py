@@ -199,7 +199,7 @@ def _in_export(folder: Path) -> Counted:
 
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
-# --- whether what is stored is what was written ----------------------------------------------------------------------
+# --- verification of stored files ------------------------------------------------------------------------------------
 
 #: Findings that are errors; all others are in order.
 WRONG = ("damaged", "missing")

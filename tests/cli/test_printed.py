@@ -52,7 +52,7 @@ def test_json(ctid, home, snapshot, command):
     except ValueError:
         found = [json.loads(line) for line in shown.splitlines()]
     if "result" in found:
-        del found["result"]  # the fit as it is in Python, to be read again
+        del found["result"]  # the fit as in Python
     assert structure(found) == snapshot
 
 

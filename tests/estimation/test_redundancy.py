@@ -137,7 +137,7 @@ def families(draw):
 
 
 def as_printed(start, cost, tables, epsilon):
-    """Algorithm III as in the paper, with the stored path and end; infinities are kept."""
+    """Run algorithm III as in the paper, with the stored path and end; infinities are kept."""
     point, i, failures = start, 0, 0
     while failures < len(tables):
         minima = tables[i][point]

@@ -52,7 +52,7 @@ def fitted(record, start, **options):
 
 
 def published_step(record, model, hold_output):
-    """Equation (29) as printed: a right-hand side for every submodel, and one matrix."""
+    """Solve equation (29) as printed: a right-hand side for every submodel, and one matrix."""
     x = [simulate(TransferFunction(*_of(part), model.delay), record.input, record.t) for part in model.submodels]
     psi, phi, targets = [], [], []
     for part, own in zip(model.submodels, x, strict=True):

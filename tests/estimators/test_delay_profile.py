@@ -64,7 +64,7 @@ def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irreg
             np.testing.assert_allclose(psi[:, k], slope, atol=2e-8 * max(1.0, np.abs(slope).max()))
 
 
-# --- what is estimated with the model --------------------------------------------------------------
+# --- states and offsets ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("irregular", [False, True])

@@ -88,7 +88,7 @@ def test_units_and_the_origin_of_time(name, regular, seconds, shift, input_decad
     two = fitted(name, Record((record.t + shift) * seconds, record.y * output, held), seconds)
     tolerance = ESTIMATORS[name][3]
     for parameter, value in one.parameters.items():
-        if parameter.startswith("x"):  # initial states, in units of their own
+        if parameter.startswith("x"):  # initial states have separate units
             continue
         scale = factor(parameter, one.model, seconds, output / inward, output)
         assert two.parameters[parameter] == pytest.approx(scale * value, rel=tolerance, abs=1e-9 * abs(scale))

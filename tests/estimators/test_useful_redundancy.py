@@ -108,7 +108,7 @@ def test_bandwidth_is_estimated_where_it_is_not_given(regular):
     assert_same_model(fit.model, UsefulRedundancy(**options()).fit(record, Start(9.0)).model, 1e-6)
 
 
-# Of the costs -----------------------------------------------------------------------------------------
+# Costs ------------------------------------------------------------------------------------------------
 
 
 def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bounds():
@@ -126,7 +126,7 @@ def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bound
         assert reference_cost(prepared, bound) == member_costs(prepared, bound).mean()
 
 
-# Of the search ----------------------------------------------------------------------------------------
+# Search -----------------------------------------------------------------------------------------------
 
 
 def test_starts_do_not_influence_one_another():

@@ -57,7 +57,7 @@ def test_experiments_with_noise_have_data_sets_of_their_own():
     assert len(set(seeds)) == 3
 
 
-# What the runs say ---------------------------------------------------------------------------------------
+# Results of the runs -------------------------------------------------------------------------------------
 
 COARSE = ("sampling.interval=0.01",)
 #: Longer averages for the estimators of whole records, which are then fast.
@@ -179,7 +179,7 @@ def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     assert [claim.measured for claim in missed] == ["inf", "inf"]
 
 
-# What is published ---------------------------------------------------------------------------------------
+# Publication ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

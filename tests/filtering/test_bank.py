@@ -27,7 +27,7 @@ DELAYS = st.just(0.0) | st.floats(1e-6, 20)
 
 @st.composite
 def systems(draw):
-    """Stable systems of order 1 to 5 whose poles lie at least 10 % apart."""
+    """Draw stable systems of order 1 to 5 whose poles lie at least 10 % apart."""
     poles, magnitude = [], draw(st.floats(0.1, 0.5))
     order = draw(st.integers(1, 5))
     while len(poles) < order:

@@ -29,7 +29,7 @@ def initial(terms):
 
 
 def by_exponentials(theta, free, terms):
-    """Impulse response of C/(p^l A) of each submodel, from its companion matrix."""
+    """Return the impulse response of C/(p^l A) of each submodel, from its companion matrix."""
     total = np.zeros(ELAPSED.size)
     for part in AdditiveModel.from_theta(theta, terms).submodels:
         n = part.order

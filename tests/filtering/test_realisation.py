@@ -38,7 +38,7 @@ def test_roots_of_a_product_are_its_factors(poles):
 @pytest.mark.parametrize("poles", [*POLES[:-1], [-1.0, -1.0, -1.0], [-1 + 2j, -1 - 2j, -1 + 2j, -1 - 2j]])
 def test_chain_has_the_transfer_functions_of_its_rows(poles):
     # Row k of the map over the states: s^k/A(s) at points off the poles.
-    roots = np.array(sorted(poles, key=lambda p: -abs(p)), complex)  # pairs stay side by side
+    roots = np.array(sorted(poles, key=lambda p: -abs(p)), complex)  # pairs stay adjacent
     dynamics, gain, powers = chain(roots)
     for s in (0.3j, 2.0 + 1j, 7j):
         response = powers @ np.linalg.solve(s * np.eye(roots.size) - dynamics, gain)

@@ -34,7 +34,7 @@ def test_valid_estimates_are_right(options, noise):
     track = options.track(y, INTERVAL)
     error = np.abs(track.frequencies - TRUTH)
     valid = track.valid
-    assert (error[valid] < 0.1).all()  # what certain means here: a tenth of the distance
+    assert (error[valid] < 0.1).all()  # valid means: within a tenth of the distance
     if noise <= 1e-3:
         assert valid[-500:].all()
         assert error[-500:].max() < 1e-2
@@ -59,7 +59,7 @@ def test_no_estimate_from_before_a_step_stays_valid(options, jump):
     track = options.track(np.sin(phase).sum(axis=1), INTERVAL)
     error = np.abs(track.frequencies - true).max(axis=1)
     assert track.valid[2990:3000].all()
-    assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual shows it
+    assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual reveals it
 
 
 def test_rows_of_two_signals_bear_nothing_out():

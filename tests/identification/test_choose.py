@@ -77,7 +77,7 @@ def test_a_record_that_begins_with_its_step_needs_the_level_before():
 
 
 def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
-    # The record rises to the end; a ramp of the output may come from an integrator or a drift.
+    # The output rises to the end; a ramp may be due to an integrator or a drift.
     t = 0.1 * np.arange(600)
     record = record_of(SECOND, u=np.ones(600))
     drifting = Record(record.t, record.y + 0.02 * t, record.input)

@@ -61,7 +61,7 @@ def test_no_degrees_of_freedom_no_covariance():
 
 
 def regressors(count, seed=0, pole=0.95):
-    """Sensitivities of a first-order system with a delay to its pole, gain and delay."""
+    """Return the sensitivities of a first-order system with a delay to its pole, gain and delay."""
     u = np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], count // 10 + 1), 10)[:count]
     x = lfilter([1 - pole], [1, -pole], u)
     return np.column_stack([lfilter([1 - pole], [1, -pole], x), x, np.append(0, np.diff(x)) / (1 - pole)])

@@ -38,7 +38,7 @@ def test_band_of_the_cross_correlation_is_ljungs():
     rng = np.random.default_rng(1)
     e = lfilter([1], [1, -0.9], rng.standard_normal(200_000))
     u = lfilter([1], [1, -0.5], rng.standard_normal(200_000))
-    # It includes all lags, whatever the number of tested ones.
+    # It includes all lags, not only the tested ones.
     band = residual_tests(e, u, lags=1).cross_correlation_band
     assert band == pytest.approx(1.959964 * np.sqrt(1.45 / 0.55 / 200_000), rel=0.02)
     white = rng.standard_normal(200_000)

@@ -12,7 +12,7 @@ from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 @pytest.fixture
 def results(make_results, estimate):
-    """Results at two noise levels from two starts; from 0 s, half of the estimates end in another minimum."""
+    """Return results at two noise levels from two starts; from 0 s, half of the estimates end in another minimum."""
     right = [estimate(delay) for delay in (8.1, 7.9, 8.05, 8.02)]
     wrong = [estimate(delay) for delay in (8.0, 2.1, 2.0, 7.95)]
     failed = [*right[:3], estimate(None, status="FAILED")]

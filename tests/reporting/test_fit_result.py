@@ -39,13 +39,13 @@ def measurement(seed=0, *, n=800, units=("ms", "V", "mA"), notes=()):
 
 
 def with_output(change):
-    """A measurement with another output."""
+    """Return a measurement with another output."""
     one = measurement()
     return replace(one, record=Record(one.record.t, change(one.record.y.copy()), one.record.input, name="file.csv"))
 
 
 def coloured(seed=0):
-    """A measurement with one missing output and noise with a pole."""
+    """Return a measurement with one missing output and noise with a pole."""
     one, e = measurement(seed), 0.1 * np.random.default_rng(10 + seed).standard_normal(800)
     y = one.record.y + lfilter([1.0], [1.0, -0.8], e)
     y[40] = np.nan
@@ -66,7 +66,7 @@ def result_of(*measurements, other=None, poles=2, delay=(0.0, 3.0), **options):
 
 @pytest.fixture(scope="module")
 def results():
-    """Fits in all states with different output."""
+    """Return fits in all states with different output."""
     noise = with_output(lambda y: np.random.default_rng(4).standard_normal(y.size))
     validated = result_of(measurement(notes=("A note.",)), other=measurement(1))
     noisy = result_of(coloured(), other=coloured(1), noise_model="arma:1,0")

@@ -81,7 +81,7 @@ def test_a_setting_finds_its_cell_or_gets_one_of_its_own(make_results, estimate,
 
 @pytest.fixture
 def mixed(make_results, add_estimator, estimate):
-    """One experiment: part of the existing method, ours, and two without a start."""
+    """Return one experiment: part of the existing method, ours, and two without a start."""
     good, bad = estimate(8.0), estimate(5.0, "STALLED")
     results = make_results({(5.0, "0.0"): [good, bad, bad, bad], (5.0, RANDOM): [good, bad], (15.0, "0.0"): [good]})
     add_estimator(results, "other_profile", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})

@@ -107,7 +107,7 @@ def test_differing_settings_are_named(results):
 
 
 def measured(results):
-    """Medians of the tracker and of the estimator of whole records."""
+    """Return the medians of the tracker and of the estimator of whole records."""
     names = ("median_settling_time", "median_settling_after_step", "median_rms_1", "median_rms_2", "false_alarms")
     return [[row.get(name) for name in names] for row in records_of(percentage_frame(results))]
 

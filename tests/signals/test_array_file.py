@@ -45,7 +45,7 @@ def save_v73(path, groups):
         file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0200, 0x4D49))
 
 
-# --- what is read ---------------------------------------------------------------------------------
+# --- accepted files -------------------------------------------------------------------------------
 
 COLUMNS = {"t": T, "u": U, "y": Y}
 V73 = {name: (b"double", value[None, :]) for name, value in COLUMNS.items()}
@@ -96,7 +96,7 @@ def test_numbers_of_other_types_are_converted_and_names_may_be_given(rig):
     assert measurement.record.input.values.tolist() == [-1.0, 1.0, 1.0]
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- refused files --------------------------------------------------------------------------------
 
 LINE = (
     "s = struct('t', z.SamplingInstants, 'u', z.InputData, 'y', z.OutputData); "

@@ -5,7 +5,7 @@ import pytest
 from ctid_cli.errors import DataError
 from ctid_cli.signals.measurement import read_measurement
 
-# --- what is read ---------------------------------------------------------------------------------
+# --- accepted files -------------------------------------------------------------------------------
 
 
 def test_units_in_the_header_are_labels_and_convert_nothing(write):
@@ -61,7 +61,7 @@ def test_other_text_files_are_read_alike(write):
         assert read_measurement(write("t,u,y\n0,1,2\n1,3,4\n", name)).record.n_samples == 2
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- refused files --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -101,10 +101,10 @@ def test_a_sum_of_submodels_is_what_it_is():
     ("denominator", "terms"),
     [
         ([1.0, 2.0, 1.0], (Term(2, 0),)),  # a repeated pole
-        ([1.0, 2.0, 3.0], TERMS),  # not as many poles
+        ([1.0, 2.0, 3.0], TERMS),  # another number of poles
         ([1.0, 2.0, 3.0], (Term(1, 0), Term(1, 0))),  # complex poles in two submodels
         ([1.0, 2.0, 3.0], (Term(1, 0), Term(0, 0, 1))),  # no integrator
-        ([1.0, 2.0, 3.0], None),  # not asked for
+        ([1.0, 2.0, 3.0], None),  # not requested
         ([1.0, 1e200, 1e-200], (Term(2, 0),)),  # no poles in double precision
     ],
 )

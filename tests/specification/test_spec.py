@@ -160,7 +160,7 @@ def test_a_file_of_instants(tmp_path):
     np.testing.assert_array_equal(build_plan(load(tmp_path, text)).data_cells[0].dataset(0).record.y, record.y)
 
 
-# -- what is shipped --------------------------------------------------------------------------------------------------
+# -- shipped files ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("config", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)

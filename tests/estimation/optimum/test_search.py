@@ -1,4 +1,4 @@
-"""Local searches against a general optimiser in the same box, and their reported endings."""
+"""Local searches against a general optimiser in the same box, and their reported statuses."""
 
 import numpy as np
 import pytest
