@@ -13,7 +13,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
 def quadrature(function, breaks, window, frequencies):
-    """Return ``1/T int v exp(-jw(t - t0)) dt`` by Gauss's rule between the breaks: exact to rounding for short pieces."""
+    """Return ``1/T int v exp(-jw(t - t0)) dt`` by Gauss's rule between the breaks: exact up to rounding."""
     start, end = window
     edges = np.unique(np.concatenate((breaks[(breaks > start) & (breaks < end)], window)))
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
