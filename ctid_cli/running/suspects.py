@@ -4,7 +4,7 @@ Jobs in progress when a process dies are suspects: one of them killed its proces
 time. Each is computed again alone. An estimate that exceeds a limit there, or ends a process that has computed nothing
 else, is a failure of its estimator. A cause in the machine (out of memory or descriptors, a process killed from
 outside) is never a result, and a process that was stopped for a while is not charged with that time: such estimates are
-computed once more, one at a time. If the machine prevents them again they are given up, and missing.
+computed once more, one at a time. If they fail again for such a cause they are given up, and missing.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Course:
         self._reason = ending.how or self._reason
         in_work = [key for key in ending.begun if key in left] if ending.how else []
         if tries and ending.how and not in_work:
-            # It died before it began.
+            # The process died before the first estimate.
             in_work = left
         rest = [key for key in left if key not in in_work]
         if rest:
@@ -139,7 +139,7 @@ class Course:
         limits = self._limits
         if ending.late and limits.wall_seconds is not None:
             if tries == 1 and ending.processor < AT_WORK * limits.wall_seconds:
-                # It may have slept, or its process was stopped.
+                # The estimate may have slept, or its process was stopped.
                 self._undecided.append(job)
                 return
             status, reason = "TIMEOUT", limits.too_late(wall=True)

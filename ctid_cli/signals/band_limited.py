@@ -93,7 +93,7 @@ def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:
     weights = np.sinc(lags / FINER) * np.kaiser(lags.size, KAISER)
     points = np.zeros((longer.size - 2 * REACH) * FINER)
     for phase in range(FINER):
-        # Normalised to sum one, so that a constant is preserved; the first phase has one point more at the end.
+        # Normalised to a sum of one, so that a constant is preserved; the first phase has one more point at the end.
         part = weights[phase::FINER]
         points[phase::FINER] = np.convolve(longer, part / part.sum(), "valid")[int(phase > 0) :]
     # 1/sinc(x/2)^2 = 1 + x^2/12 + x^4/240 + ...: in differences, up to the sixth order in x.

@@ -240,9 +240,9 @@ class ArmaNoise(Noise):
     Parameters
     ----------
     numerator : tuple of float
-        Coefficients of C in ascending powers of q^-1, the first not zero.
+        Coefficients of C in rising powers of q^-1, the first not zero.
     denominator : tuple of float
-        Coefficients of D in ascending powers of q^-1, the first not zero, its zeros inside the unit circle.
+        Coefficients of D in rising powers of q^-1, the first not zero, its zeros inside the unit circle.
     innovation_variance : float, optional
         Variance of e [output unit^2].
     variance : float, optional

@@ -101,7 +101,7 @@ def owner(cell: int, replicate: int, cells: int, of: int) -> int:
     """Return the number of the shard of a data set."""
     index = replicate * cells + cell
     # Assigned in turn, if the number of cells has a factor in common with the number of shards, some shards would
-    # always get the same cells; so each pass through both begins one shard later.
+    # always get the same cells; so each pass through both starts one shard later.
     return (index + index // lcm(cells, of)) % of + 1
 
 
