@@ -4,6 +4,6 @@ import lazy_loader
 
 __version__ = "0.1.0"
 
-# The public names, by topic, stand in __init__.pyi. Each is imported when it is first asked for: `ctid --help` must not
+# The public names, by topic, are in __init__.pyi. Each is imported when it is first used: `ctid --help` must not
 # wait for numpy and numba.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

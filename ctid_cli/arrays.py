@@ -1,4 +1,4 @@
-"""Names for the arrays that travel through the package."""
+"""Names of array types used in the package."""
 
 import numpy as np
 from numpy.typing import NDArray

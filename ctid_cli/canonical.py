@@ -1,4 +1,4 @@
-"""Plain data, as JSON can hold it, and the identity of what it describes."""
+"""Canonical JSON of plain data, and its hash as identity."""
 
 import hashlib
 import json
@@ -8,17 +8,17 @@ from typing import Any
 
 
 def canonical_json(content: Any) -> str:
-    """The one JSON text of some content."""
+    """Return the unique JSON text of some content."""
     return json.dumps(content, sort_keys=True, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
 
 
 def content_hash(content: Any) -> str:
-    """Identity of some content."""
+    """Return the hash of some content."""
     return hashlib.sha256(canonical_json(content).encode()).hexdigest()[:16]
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it."""
+    """Return a value as JSON-compatible data."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):

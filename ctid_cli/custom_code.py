@@ -1,7 +1,7 @@
-"""Custom code: classes that a specification names by file or module.
+"""Custom code: classes named in a specification by file or module.
 
-Files are read once and served to imports as they were read, in this process and in its workers: a run ends with the
-code that it began with, whatever happens to the files meanwhile.
+Files are read once, and imports use this content in this process and in its workers: changes of the files during a run
+have no effect.
 """
 
 import ast
@@ -24,12 +24,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Self
 
-#: What Python's parser may raise.
+#: Exceptions that Python's parser may raise.
 _UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)
-#: Letters of the text that names a class.
+#: Maximum length of the text that names a class.
 MAX_LENGTH = 200
 _PACKAGE = Path(__file__).resolve().parent
-#: The folder with configs, studies and published results: part of an installed package, or the checkout.
+#: Folder of configs, studies and published results: in an installed package, or the checkout.
 DATA = _PACKAGE / "_data" if (_PACKAGE / "_data").is_dir() else _PACKAGE.parent
 #: The studies that are shipped with the program.
 STUDIES = DATA / "experiments"
@@ -37,21 +37,21 @@ _STANDARD = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib"))
 
 
 class CustomCodeError(ValueError):
-    """Custom code that cannot be used, and why."""
+    """An error of custom code."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A module's file as it was read."""
+    """Content of a module's file when it was read."""
 
     path: str
     content: bytes
-    #: SHA-256 of each data file that it names in FILES, by name.
+    #: SHA-256 of each data file listed in FILES, by name.
     data: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def read(cls, file: Path) -> Self:
-        """Return a module's file, and what the data files that it names hold now."""
+        """Read a module's file and hash the data files that it lists."""
         if file.exists() and not file.is_file():
             raise CustomCodeError(f"{file.name} is no ordinary file")
         content = file.read_bytes()
@@ -66,19 +66,19 @@ class Source:
 
     @property
     def is_package(self) -> bool:
-        """Whether other modules are inside it."""
+        """Whether it contains other modules."""
         return Path(self.path).name == "__init__.py"
 
 
 def find_class(kind: str, folder: Path) -> type[Any]:
-    """Return the class that ``./file.py:Class``, seen from a folder, or ``package.module:Class`` names."""
+    """Return the class named by ``./file.py:Class``, relative to a folder, or ``package.module:Class``."""
     place, _, name = kind.rpartition(":")
     if not place or not name.isidentifier() or len(kind) > MAX_LENGTH:
         raise CustomCodeError(f"must be './file.py:Class' or 'package.module:Class', not the text {kind[:40]!r}")
     file = _file_of(place, folder)
     module = place if file is None else _serve_file(file, place)
     try:
-        # What it prints must not stand between the lines of a command's output.
+        # Prints of the module must not appear in the output of a command.
         with redirect_stdout(sys.stderr):
             found = getattr(importlib.import_module(module), name, None)
     except KeyboardInterrupt:
@@ -91,25 +91,25 @@ def find_class(kind: str, folder: Path) -> type[Any]:
 
 
 def is_shipped(kind: str, folder: Path) -> bool:
-    """Return whether a kind names a file of the studies that are shipped with the program.
+    """Return whether a kind names a file of the studies shipped with the program.
 
-    Such code is trusted as the program itself is, whatever the specification. A link elsewhere to such a file is
-    not: modules that the file imports would be looked for beside the link.
+    Such code is trusted like the program itself, whatever the specification. A link in another place to such a file is
+    not trusted: imports of the file would be resolved next to the link.
     """
     file = _file_of(kind.rpartition(":")[0], folder)
     try:
         return file is not None and not file.is_symlink() and file.parent.resolve().is_relative_to(STUDIES)
-    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+    except (OSError, RuntimeError, ValueError):  # circular links, a zero byte
         return False
 
 
 def _file_of(place: str, folder: Path) -> Path | None:
-    """Return the file that a kind names; None where it names a module."""
+    """Return the file named by a kind; None if it names a module."""
     return Path(os.path.abspath(folder / place)) if "/" in place or place.endswith(".py") else None
 
 
 def reason(error: BaseException) -> str:
-    """Return an exception in a clause: what it says, and the last line of custom code that it came through."""
+    """Describe an exception in a clause: its message, and the last line of custom code in its traceback."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if is_custom_file(frame.filename)]
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     text = " ".join(str(error).split())
@@ -117,18 +117,18 @@ def reason(error: BaseException) -> str:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Files, served to imports
+# Files used by imports
 
 
 _SERVED: dict[str, Source] = {}
-#: Names that served modules have, by the file and a hash of what is served with it.
+#: Names of modules loaded from files, made from the file name and a hash of the content of all its modules.
 _MADE_NAME = r"custom_\w+_[0-9a-f]{12}(\.\w+)*"
 
 
 class _Loader(SourceLoader):
-    """Loads a module from what was read of its file; it imports its neighbours as they were read with it.
+    """Loader of a module from stored content; it imports neighbouring modules from their stored content.
 
-    These have private names in ``sys.modules``, so that any number of folders may have a ``helpers.py``.
+    Neighbours have private names in ``sys.modules``, so that several folders may have a ``helpers.py``.
     """
 
     def __init__(self, source: Source) -> None:
@@ -152,7 +152,7 @@ class _Loader(SourceLoader):
                     importlib.import_module(full)
             return sys.modules[private if names else f"{main}.{top}"]
 
-        # Where import statements of a module look for what they do.
+        # Import statements of a module call this function.
         module.__dict__["__builtins__"] = {**vars(builtins), "__import__": load}
         super().exec_module(module)
 
@@ -161,7 +161,7 @@ class _Finder(MetaPathFinder):
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         source = _SERVED.get(fullname)
         if source is None:
-            # What Numba has compiled and kept asks for its module by the name that it had before another file changed.
+            # The Numba cache imports a module by its earlier name, which changes with any file of the folder.
             return ModuleSpec(fullname, None, is_package=True) if re.fullmatch(_MADE_NAME, fullname) else None
         return importlib.util.spec_from_file_location(
             fullname, source.path, loader=_Loader(source), submodule_search_locations=[]
@@ -169,12 +169,12 @@ class _Finder(MetaPathFinder):
 
 
 def served() -> dict[str, Source]:
-    """Return what this process has served, which another one must serve before it reads the rest of a job."""
+    """Return all loaded sources, which another process needs before it can read the rest of a job."""
     return dict(_SERVED)
 
 
 def serve(sources: dict[str, Source]) -> None:
-    """Serve modules to imports by their names."""
+    """Make modules importable from their sources by name."""
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())
     for name, source in sources.items():
@@ -182,7 +182,7 @@ def serve(sources: dict[str, Source]) -> None:
 
 
 def _serve_file(path: Path, place: str) -> str:
-    """Return the name of the module that a file is now served as; the neighbours that it imports are inside that."""
+    """Return the module name under which a file is loaded; imported neighbours are submodules of it."""
     try:
         sources = _with_neighbours(path)
     except FileNotFoundError:
@@ -193,14 +193,14 @@ def _serve_file(path: Path, place: str) -> str:
         raise CustomCodeError(f"{place} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     contents = [(name, source.content, source.data) for name, source in sorted(sources.items())]
     digest = hashlib.sha256(repr(contents).encode())
-    # Named by content, so that a changed file is another module.
+    # Named by content, so that a changed file gives another module.
     main = f"custom_{re.sub(r'[^0-9A-Za-z_]', '_', path.stem)}_{digest.hexdigest()[:12]}"
     serve({f"{main}.{name}" if name else main: source for name, source in sources.items()})
     return main
 
 
 def _with_neighbours(path: Path) -> dict[str, Source]:
-    """Return a file, under no name, and the modules in its folder that it imports, directly or not."""
+    """Return a file, with an empty name, and the modules in its folder that it imports, directly or not."""
     found, waiting = {"": Source.read(path)}, [""]
     while waiting:
         name = waiting.pop()
@@ -218,11 +218,11 @@ def _beside(folder: Path, name: str) -> Path | None:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# What a module is made of
+# Content of a module
 
 
 def is_custom_file(file: str | None) -> bool:
-    """Return whether a file is neither part of Python, nor of an installed package, nor of ctid."""
+    """Return whether a file belongs neither to Python, nor to an installed package, nor to ctid."""
     if not file or not os.path.isabs(file):
         return False
     parts = Path(file).parts
@@ -231,10 +231,10 @@ def is_custom_file(file: str | None) -> bool:
 
 
 def source_of(name: str) -> Source | None:
-    """Return what a custom module is made from; None for any other name."""
+    """Return the source of a custom module; None for any other name."""
     if name in _SERVED:
         return _SERVED[name]
-    # What has side effects when it is imported may do anything.
+    # Importing a module may have any side effect.
     with suppress(BaseException):
         spec = importlib.util.find_spec(name)
         if spec is not None and is_custom_file(spec.origin):
@@ -252,14 +252,14 @@ def _is_installed(name: str) -> bool:
 
 
 def imports_of(source: Source, name: str) -> set[str]:
-    """Return the modules, and names that may be modules, that a module imports by a statement anywhere in it."""
+    """Return the names in all import statements of a module, which may be modules."""
     found = _named(source.content, name if source.is_package else name.rpartition(".")[0])
     neighbours = {other: f"{name.partition('.')[0]}.{other}" for other in found}
     return {private if private in _SERVED else other for other, private in neighbours.items()} - {name}
 
 
 def _data_files(content: bytes, place: str) -> tuple[str, ...]:
-    """Return what a module assigns to FILES: names of data files, seen from its folder."""
+    """Return the value of FILES in a module: names of data files, relative to its folder."""
     try:
         body = ast.parse(content).body
     except _UNREADABLE:

@@ -1,15 +1,15 @@
-"""The errors that a user can meet, each with the exit code that the command line answers with."""
+"""Errors for the user, each with the exit code of the command line."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 
-#: Problems of a specification that a message lists.
+#: Maximum number of specification problems listed in a message.
 MAX_SHOWN = 100
 
 
 class ExitCode(IntEnum):
-    """What a command ends with."""
+    """Exit code of a command."""
 
     DONE = 0
     INTERNAL = 1
@@ -25,41 +25,41 @@ class ExitCode(IntEnum):
 
 
 class CtidError(Exception):
-    """Base of every error that ctid raises on purpose; its text is meant for the user."""
+    """Base of all intentional errors of ctid; the text is written for the user."""
 
     exit_code = ExitCode.INTERNAL
 
 
 class UsageError(CtidError):
-    """The request itself cannot be carried out: a bad option, specification or record."""
+    """A request that cannot be carried out: invalid option, specification or record."""
 
     exit_code = ExitCode.BAD_INPUT
 
 
 class DataError(UsageError):
-    """A record (times, input, output) or model that cannot be used, and why.
+    """A record (times, input, output) or model that cannot be used.
 
     Parameters
     ----------
     message : str
         What is wrong.
     field : str, default ""
-        Argument at fault, where it is a single one.
+        Argument at fault, if it is a single one.
     """
 
     def __init__(self, message: str, field: str = "") -> None:
         super().__init__(message)
         self.field = field
-        #: Place in a specification of what is at fault, where that came up in a simulation.
+        #: Section of the specification at fault, for errors during a simulation.
         self.section = ""
 
 
 class BiasedError(DataError):
-    """An estimator that settles elsewhere than at the truth, however many the data; the text is the reason."""
+    """An inconsistent estimator: its error does not vanish with the number of samples; the text is the reason."""
 
 
 class OptionError(ValueError):
-    """An option that has no allowed value."""
+    """An invalid value of an option."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(message)
@@ -69,7 +69,7 @@ class OptionError(ValueError):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong in a specification, with its place in the file."""
+    """One error in a specification, with its place in the file."""
 
     file: str
     line: int
@@ -83,12 +83,12 @@ class Problem:
 
 
 class SpecError(UsageError):
-    """A specification with one or more problems, all of them reported at once.
+    """A specification with one or more problems, all reported at once.
 
     Parameters
     ----------
     problems : iterable of Problem
-        What is wrong, in the order of the file.
+        The problems in the order of the file.
     """
 
     def __init__(self, problems: Iterable[Problem]) -> None:
@@ -99,34 +99,34 @@ class SpecError(UsageError):
 
 
 class RefusedError(CtidError):
-    """The folder holds something that this command must not touch or mix with."""
+    """A folder whose content this command must not change or mix with."""
 
     exit_code = ExitCode.REFUSED
 
 
 class TooManyFailuresError(CtidError):
-    """The run finished, but more estimates failed than the user accepts."""
+    """A finished run in which more estimates failed than the user accepts."""
 
     exit_code = ExitCode.ALL_FAILED
 
 
 class StorageError(CtidError):
-    """Results could not be written or read back; what was finished before is safe."""
+    """Results that could not be written or read; results finished before are safe."""
 
     exit_code = ExitCode.STORAGE
 
 
 class DamageError(StorageError):
-    """A stored file is not what was written."""
+    """A stored file whose content differs from what was written."""
 
 
 class MismatchError(CtidError):
-    """A comparison or verification found a difference."""
+    """A difference found by a comparison or verification."""
 
     exit_code = ExitCode.DIFFERENCE
 
 
 class MachineError(CtidError):
-    """The machine did not let estimates finish (memory, descriptors, killed processes); they are not stored."""
+    """A lack of machine resources (memory, descriptors, killed processes); affected estimates are not stored."""
 
     exit_code = ExitCode.MACHINE

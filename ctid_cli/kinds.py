@@ -1,6 +1,6 @@
-"""Which class each ``kind`` of a specification names: the one list of what there is to choose from.
+"""Classes of all values of ``kind`` in a specification: the single list of available components.
 
-The classes belong to several layers; each is imported when it is first used.
+The classes belong to several layers; each is imported on first use.
 """
 
 import importlib
@@ -10,7 +10,7 @@ _NOISES = {
     "white": "ctid_cli.signals.noise:WhiteNoise",
     "arma": "ctid_cli.signals.noise:ArmaNoise",
 }
-#: Section, or what stands in it, to the kinds that it may have, to where the class of each is: ``module:Class``.
+#: Section or part of it, to allowed kinds, to the place of each class: ``module:Class``.
 KINDS: dict[str, dict[str, str]] = {
     "excitation": {
         "prbs": "ctid_cli.signals.excitation:Prbs",
@@ -54,12 +54,12 @@ KINDS: dict[str, dict[str, str]] = {
 
 
 def resolve(section: str, kind: str) -> type[Any]:
-    """Return the class that a kind names."""
+    """Return the class of a kind."""
     module, _, name = KINDS[section][kind].partition(":")
     found: type[Any] = getattr(importlib.import_module(module), name)
     return found
 
 
 def classes(section: str) -> dict[str, type[Any]]:
-    """Return every class of a section by its kind."""
+    """Return all classes of a section by kind."""
     return {kind: resolve(section, kind) for kind in KINDS[section]}

@@ -1,4 +1,4 @@
-"""The processors that this process may use, and work that compiled kernels do on all of them."""
+"""Number of usable processors, and parallel execution of compiled kernels on them."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -9,14 +9,14 @@ Result = TypeVar("Result")
 
 
 def usable_processors() -> int:
-    """Number of processors that this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
-    """What some work makes of each of some pieces, in their order; work that lets others run is done side by side."""
+    """Apply a function to each piece and return the results in order; work that releases the GIL runs in parallel."""
     threads = min(usable_processors(), len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]

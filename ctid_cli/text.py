@@ -1,4 +1,4 @@
-"""How messages are put together, in every layer: enumerations, paragraphs, hints at names that are nearly right."""
+"""Text of messages, used in every layer: lists, paragraphs, and suggestions for misspelt names."""
 
 import difflib
 import os
@@ -12,25 +12,25 @@ WIDTH = 100
 
 
 def listed(words: Iterable[object]) -> str:
-    """Return words as a sentence lists them: ``a, b and c``, each once."""
+    """Return words as a list in a sentence: ``a, b and c``, without duplicates."""
     *first, end = dict.fromkeys(map(str, words))
     return f"{', '.join(first)} and {end}" if first else end
 
 
 def count(n: int, noun: str) -> str:
-    """A number of things."""
+    """Return a number with a noun in singular or plural."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def probability(p: float) -> str:
-    """A p-value: of a tiny one the digits mean nothing, and of none there is a dash."""
+    """Return a p-value as text: a bound if it is tiny, a dash if it is missing."""
     if p != p:
         return "p = -"
     return f"p = {p:.2g}" if p >= 1e-4 else "p < 0.0001"
 
 
 def wrapped(text: str, indent: str = "", hanging: str | None = None, width: int = WIDTH) -> str:
-    """Return a paragraph, with another indent for all lines but the first if one is given."""
+    """Return a paragraph wrapped to a width, optionally with another indent after the first line."""
     return textwrap.fill(
         text,
         width,
@@ -42,20 +42,20 @@ def wrapped(text: str, indent: str = "", hanging: str | None = None, width: int 
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that was probably meant, whatever its capitals."""
+    """Return the known name closest to a word, ignoring case."""
     names = {name.lower(): name for name in reversed(list(known))}
     near = difflib.get_close_matches(word.lower(), list(names), n=1)
     return names[near[0]] if near else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return the end of a sentence that asks for the known name that was probably meant; empty where none is near."""
+    """Return a suggestion of the closest known name as the end of a sentence; empty if no name is close."""
     near = closest(word, known)
     return f"; did you mean {near!r}?" if near else ""
 
 
 class Shown:
-    """A result that shows itself: as text, as a table of pandas, as a figure, and in a notebook."""
+    """A result with a text summary, a pandas table, a figure, and a notebook display."""
 
     def summary(self) -> str:
         """Return the result as text: the tables that the commands print."""
@@ -73,7 +73,7 @@ class Shown:
         return figure
 
     def _result(self) -> Any:
-        # By name: results know nothing of the layer that shows them.
+        # Imported by name: results do not depend on the reporting layer.
         return import_module("ctid_cli.reporting.result_views").result_of(self)
 
     def _repr_html_(self) -> str:

@@ -1,4 +1,4 @@
-"""Files as ctid writes them, and the names that they may have."""
+"""Atomic writing of files, and allowed names of experiments."""
 
 import itertools
 import os
@@ -8,14 +8,14 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-#: What else lies in the folder of an experiment; experiments lie in folders too, and must not be called like this.
+#: Other file names in the folder of an experiment; nested experiments must not have such a name.
 TAKEN = (
     *("journal.sqlite", "journal.sqlite-wal", "journal.sqlite-shm", "journal.sqlite-journal", "runs.h5", "spec.yaml"),
     *("running.json", "figures", "report.html"),
 )
-#: What the name of an experiment matches; parts of it are folders.
+#: Pattern of experiment names; parts are folders.
 EXPERIMENT = r"(?!.*\.\.)(?=.{1,200}\Z)[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*"
-#: Names of devices on Windows, with any ending.
+#: Device names on Windows, with any suffix.
 _DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)", re.IGNORECASE)
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 _TEMPORARY = ".tmp"
@@ -24,7 +24,7 @@ _numbers = itertools.count(1)
 
 def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
     """Replace a file atomically: readers, and a crash or a full disk at any moment, find the old or the new content."""
-    # A link stays one, and what is no file, such as /dev/stdout, is written to.
+    # Links are kept, and special files such as /dev/stdout are written directly.
     path = Path(os.path.realpath(path))
     before = path.stat().st_mode if path.exists() else None
     if before is not None and not stat.S_ISREG(before):
@@ -32,7 +32,7 @@ def write_file(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
         return
     temporary = path.with_name(f".{path.name[:40]}-{os.getpid()}-{next(_numbers)}{_TEMPORARY}")
     try:
-        # No file of another program is written to.
+        # Never write to a file of another program.
         temporary.touch(exist_ok=False)
         _write(temporary, data)
         if before is not None:
@@ -60,12 +60,12 @@ def _write(path: Path, data: bytes | memoryview | Iterable[bytes]) -> None:
 
 
 def is_leftover(name: str) -> bool:
-    """Whether a file is what a process that was killed has left behind."""
+    """Return whether a file was left behind by a killed process."""
     return name.endswith(_TEMPORARY)
 
 
 def why_unusable(name: str) -> str | None:
-    """Why no experiment may have a name, as the end of a sentence; None if it may."""
+    """Return why a name is not allowed for an experiment, as the end of a sentence; None if it is allowed."""
     for part in name.split("/"):
         low = part.lower()
         if low in TAKEN or is_leftover(low):

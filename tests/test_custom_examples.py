@@ -1,4 +1,4 @@
-"""The examples of custom components run as documented, and permission is asked for where it is needed."""
+"""The examples of custom components run as documented, and require permission."""
 
 import json
 import re
@@ -36,7 +36,7 @@ def test_the_study(out):
     by_name = {name: [row for row in rows if row["estimator"] == name] for name in ("mine", "external", "srivc")}
     assert {row["status"] for row in by_name["external"]} == {"LEAST_SQUARES"}
     for mine, ours in zip(by_name["mine"], by_name["srivc"], strict=True):
-        # Both minimise the output error, one of them from the time on that the greatest delay leaves.
+        # Both minimise the output error, one of them from the time of the greatest delay on.
         assert mine["status"] == "CONVERGED"
         assert mine["delay"] == pytest.approx(ours["delay"], abs=2 * ours["standard_errors"]["delay"])
         assert mine["standard_errors"]["delay"] == pytest.approx(ours["standard_errors"]["delay"], rel=0.2)

@@ -1,4 +1,4 @@
-"""Files on disks that are read-only, links, and the names that they may have."""
+"""Files on read-only disks, links, and allowed file names."""
 
 import sqlite3
 from pathlib import Path

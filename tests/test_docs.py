@@ -1,4 +1,4 @@
-"""What the documentation's Python examples print is what the pages show."""
+"""The documentation's Python examples print what the pages show."""
 
 import dataclasses
 import re
@@ -34,7 +34,7 @@ def test_examples_print_what_is_shown(page):
         assert done.stdout == shown
 
 
-#: What the tables of docs/signals.md are made from.
+#: Sources of the tables of docs/signals.md.
 SIGNALS = [
     (kind, target)
     for section in ("excitation", "sampling", "noise")
@@ -52,7 +52,7 @@ def options_of(target):
 
 @pytest.mark.parametrize(("kind", "target"), SIGNALS, ids=[kind for kind, _ in SIGNALS])
 def test_the_tables_of_signals_are_made_from_the_classes(kind, target):
-    """Where this fails, the row that it asks for is in the message."""
+    """On failure, the message contains the expected row."""
     summary = target.__doc__.strip().splitlines()[0].replace("``", "`")
     row = f"| `{kind}` | {summary} | {', '.join(options_of(target))} |"
     assert row in (ROOT / "docs" / "signals.md").read_text(encoding="utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""Every argument of every public function, method and class is documented, and nothing else is."""
+"""The arguments of every public function, method and class are documented, and no other names."""
 
 import enum
 import importlib
@@ -23,20 +23,20 @@ from ctid_cli.specification.spec import Spec
 
 
 def members_of(name, member):
-    """A callable and, of a class, its public methods, by name; a method of a base class is documented there."""
+    """Yield a callable and, for a class, its public methods, by name, except inherited ones."""
     yield name, member
     if inspect.isclass(member):
         for method_name, method in vars(member).items():
             inherited = any(method_name in vars(base) for base in member.__mro__[1:])
             if not method_name.startswith("_") and not inherited and callable(getattr(member, method_name)):
                 plain = inspect.unwrap(getattr(method, "__func__", method))
-                # Methods that a library put into the class, such as pydantic's, are documented there.
+                # Methods that a library adds to the class, such as pydantic's, are documented there.
                 if inspect.isfunction(plain) and plain.__module__ == member.__module__:
                     yield f"{name}.{method_name}", plain
 
 
 def public_callables():
-    """What `ctid_cli` exports, and every class whose options a specification gives."""
+    """Yield the exports of `ctid_cli`, and every class with options of a specification."""
     for name in ctid_cli.__all__:
         member = getattr(ctid_cli, name)
         if callable(member):
@@ -53,7 +53,7 @@ def public_callables():
 
 
 def written_sections(base=Section):
-    """The sections of a specification that are written as classes, not made from option dataclasses."""
+    """Yield the sections of a specification written as classes, not made from option dataclasses."""
     for member in base.__subclasses__():
         if vars(sys.modules[member.__module__]).get(member.__name__) is member and not member.__name__.startswith("_"):
             yield member
@@ -61,7 +61,7 @@ def written_sections(base=Section):
 
 
 def internal_docstrings():
-    """The docstring of every other function, method and class of the package."""
+    """Yield the docstring of every other function, method and class of the package."""
     public = {id(inspect.unwrap(member)) for member in CALLABLES.values()}
     for info in pkgutil.walk_packages(ctid_cli.__path__, "ctid_cli."):
         module = importlib.import_module(info.name)
@@ -73,14 +73,14 @@ def internal_docstrings():
 
 
 def documented(text):
-    """Names in the Parameters section: the lines ``name : type`` or ``one, two : type``."""
+    """Return the names in the Parameters section: the lines ``name : type`` or ``one, two : type``."""
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n-{3,}$|\Z)", text, re.DOTALL | re.MULTILINE)
     entries = re.findall(r"^(\S[^:\n]*?)(?: : .*)?$", section.group(1) if section else "", re.MULTILINE)
     return [name.strip().lstrip("*") for entry in entries for name in entry.split(",")]
 
 
 def described_in_place(annotation):
-    """Whether the annotation itself carries the text, as command line options and specification fields do."""
+    """Return whether the annotation contains the text, as for command line options and specification fields."""
     metadata = typing.get_args(annotation)[1:] if typing.get_origin(annotation) is typing.Annotated else ()
     return any(getattr(item, "help", None) or getattr(item, "description", None) for item in metadata)
 
@@ -109,7 +109,7 @@ def test_docstring_names_exactly_the_arguments(name):
     text = inspect.getdoc(CALLABLES[name]) or ""
     assert text, f"{name} has no docstring"
     if "options are those of :class:`" in text:
-        # Options that several estimators share are documented once, in their bases.
+        # Options shared by several estimators are documented once, in their bases.
         shared = {option for base in CALLABLES[name].__mro__ for option in documented(inspect.getdoc(base) or "")}
         assert shared >= set(expected(CALLABLES[name]))
         assert set(documented(text)) <= set(expected(CALLABLES[name]))

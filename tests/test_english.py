@@ -35,7 +35,7 @@ LATER = ("ctid_cli/tones",)
 
 
 def words_of(path):
-    """Line numbers and texts of a page, or of the comments and strings of a module."""
+    """Yield line numbers and texts of a page, or of the comments and strings of a module."""
     text = path.read_text(encoding="utf-8")
     if path.suffix != ".py":
         yield from enumerate(text.splitlines(), 1)

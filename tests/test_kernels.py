@@ -1,4 +1,4 @@
-"""Compiled functions are never stale: what their caches on disk cannot see they do not use."""
+"""Compiled functions are never outdated: they use nothing that their disk caches cannot see."""
 
 import ast
 import importlib
@@ -19,26 +19,26 @@ import ctid_cli
 from ctid_cli.frequency import delay_kernels
 from ctid_cli.frequency.flags import Flag
 
-#: Packages that a kernel may use: Numba compiles what it knows of them into it.
+#: Packages that a kernel may use, as far as Numba compiles their functions into it.
 PUBLIC = {"cmath", "math", "numba", "numpy"}
-#: Names of annotations that say nothing of what is compiled. A named tuple does: the order of its fields.
+#: Names in annotations without effect on compiled code. A named tuple has one: the order of its fields.
 PLAIN = {"Array", "BoolArray", "ComplexArray", "IndexArray", "IntArray", "NDArray", "NamedTuple"}
 
 
 def kernels_of(module):
-    """Compiled functions that a module defines."""
+    """Return the compiled functions defined by a module."""
     found = (getattr(value, "py_func", None) for value in vars(module).values())
     return [function for function in found if inspect.isfunction(function) and function.__module__ == module.__name__]
 
 
 def names_of(node):
-    """All names in a part of a syntax tree."""
+    """Return all names in a part of a syntax tree."""
     return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
 
 
 @cache
 def origins_of(module):
-    """Packages that the names of a module are imported from, names that its other ones are made of, and annotations."""
+    """Return the packages of imported names, the names used in definitions of other names, and the annotations."""
     imported, made_of, annotations = {}, {}, {}
     for node in ast.walk(ast.parse(inspect.getsource(module))):
         if isinstance(node, ast.Import):
@@ -58,13 +58,13 @@ def origins_of(module):
 
 
 def names_in(code):
-    """Names that a function reads, those of functions within it too."""
+    """Return the names that a function reads, including those of inner functions."""
     inner = (names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*inner)
 
 
 def foreign_names(function, module):
-    """What a function reads of other files of ours, directly or through a constant or a type of its own."""
+    """Return the names from other files of the package that a function reads, directly or by a constant or type."""
     imported, made_of, annotations = origins_of(module)
     waiting = (names_in(function.__code__) & function.__globals__.keys()) | annotations[function.__name__]
     seen = set()
@@ -77,7 +77,7 @@ def foreign_names(function, module):
 
 
 def test_kernels_read_nothing_of_other_files():
-    """Numba compares what it has on disk with the file of the function alone: of other files nothing may be read."""
+    """Numba compares its disk cache only with the file of the function, so kernels must not read other files."""
     names = [name for _, name, _ in pkgutil.walk_packages(ctid_cli.__path__, "ctid_cli.")]
     modules = [importlib.import_module(name) for name in names]
     found = {function: foreign_names(function, module) for module in modules for function in kernels_of(module)}
@@ -132,7 +132,7 @@ def test_flags_of_kernels_are_those_of_estimates():
     assert [getattr(delay_kernels, flag.name) for flag in bits] == bits
 
 
-#: A kernel that calls another one of its file, which reads a constant of it.
+#: A kernel that calls another one in its file, which reads a constant.
 SHORT_WORK = """
 import sys
 from ctid_cli.filtering import kernels
@@ -144,13 +144,13 @@ CONSTANT = ("math.factorial(k + 4)", "math.factorial(k + 5)")
 
 
 def copied_package(root):
-    """Copy the package without anything that was compiled."""
+    """Copy the package without compiled files."""
     shutil.copytree(Path(ctid_cli.__file__).parent, root / "ctid_cli", ignore=shutil.ignore_patterns("__pycache__"))
     return root / "ctid_cli" / "filtering"
 
 
 def computed(root, home):
-    """What the copy computes in a new process, with the caches that earlier ones have left."""
+    """Return the results of the copy in a new process, with the caches of earlier ones."""
     environment = os.environ | {"PYTHONPATH": str(root), "HOME": str(home)}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         environment.pop(name, None)
@@ -159,7 +159,7 @@ def computed(root, home):
 
 
 def replaced(file, old, new, *, same_stamp=False):
-    """Edit a source; as an installer may, without a change of its size and time, the bytecode made anew."""
+    """Edit a source; optionally without changing its size and time stamp, as an installer may, with new bytecode."""
     text, stat = file.read_text(), file.stat()
     assert text.count(old) == 1
     file.write_text(text.replace(old, new))
@@ -172,10 +172,10 @@ def replaced(file, old, new, *, same_stamp=False):
 
 @pytest.mark.parametrize("place", ["edited in place", "upgraded by an installer", "read-only"])
 def test_changes_of_callees_and_constants_are_computed_with(place, tmp_path):
-    """Whatever changes in a source, the next process computes with it, and nobody deletes anything."""
+    """After any change of a source, the next process uses it, without deleting caches."""
     folder, home = copied_package(tmp_path / "site-packages"), tmp_path / "home"
     if place == "read-only":
-        # Permissions do not stop root: where a file is in the way, nobody can make the folder of the caches.
+        # Permissions do not restrict root: a file at the path prevents the creation of the cache folder.
         for inner in {path.parent for path in (tmp_path / "site-packages").rglob("*.py")}:
             (inner / "__pycache__").touch()
     first = computed(tmp_path / "site-packages", home)

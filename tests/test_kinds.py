@@ -1,4 +1,4 @@
-"""The registry of kinds names every option class of the package, and nothing else."""
+"""The registry of kinds contains every option class of the package, and nothing else."""
 
 import dataclasses
 import importlib
@@ -18,7 +18,7 @@ def test_every_class_with_a_kind_is_in_the_registry():
                 found.add(member)
     registered = {member for section in KINDS for member in classes(section).values()}
     assert registered <= found
-    # Another class may stand for the same kind where it is used in another way.
+    # Another class may have the same kind in another section.
     assert {member.kind for member in found} == {member.kind for member in registered}
     assert len(found) >= 25
 

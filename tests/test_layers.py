@@ -1,4 +1,4 @@
-"""No two modules of the package import each other in a circle, by imports of every kind."""
+"""No circular imports between modules of the package, by any kind of import statement."""
 
 import ast
 from pathlib import Path
@@ -9,7 +9,7 @@ ROOT = Path(ctid_cli.__file__).parent
 
 
 def modules():
-    """Name of every module to the text of its file."""
+    """Return the text of every module by its name."""
     return {
         ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__"): path.read_text("utf-8")
         for path in sorted(ROOT.rglob("*.py"))
@@ -17,7 +17,7 @@ def modules():
 
 
 def imported(text, names):
-    """Modules among the names that a text imports, wherever in it."""
+    """Return the modules among the names that are imported anywhere in a text."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in names)
@@ -27,7 +27,7 @@ def imported(text, names):
 
 
 def circle(graph):
-    """The names of a circle, its first one at both ends; empty if there is none."""
+    """Return the names in a circle, with the first one at both ends; empty if there is none."""
     clear = set()
 
     def walk(name, path):

@@ -1,4 +1,4 @@
-"""The notebook of the documentation runs, and is kept without what it shows."""
+"""The notebook of the documentation runs, and is stored without output."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def test_the_notebook_runs_and_shows_what_it_speaks_of(tmp_path):
     shown = [output for cell in cells for output in cell.outputs]
     assert [output.text for output in shown if output.output_type == "stream"] == ["fit_percent [%]\n"]
     answers = [output.data for output in shown if output.output_type == "execute_result"]
-    # Every cell that ends in a result shows it, figures as pictures and all else as tables.
+    # Every cell with a result at its end shows it: figures as pictures, everything else as tables.
     assert sum("image/svg+xml" in answer for answer in answers) == 2
     assert sum("<td" in answer.get("text/html", "") for answer in answers) == 6
     assert answers[-1]["text/plain"] == "[]"

@@ -1,4 +1,4 @@
-"""Work in threads gives what it gives without them, in order."""
+"""Work in threads has the same results as without threads, in order."""
 
 import pytest
 

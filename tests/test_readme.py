@@ -1,4 +1,4 @@
-"""The README's commands, Python and experiment run in an empty folder, and print what it shows."""
+"""The README's commands, Python code and experiment run in an empty folder, with the output that it shows."""
 
 import contextlib
 import io
@@ -24,7 +24,7 @@ def blocks(language):
 
 @pytest.fixture(scope="module")
 def printed(tmp_path_factory):
-    """What each command prints, by its words, and the folder in which all were run in turn."""
+    """Return the output of each command by its words, and the folder in which all were run in order."""
     folder = tmp_path_factory.mktemp("readme")
     (specification,) = blocks("yaml")
     (folder / "study.yaml").write_text(specification, encoding="utf-8")
@@ -54,7 +54,7 @@ def test_the_commands_write_what_the_python_example_reads(printed):
 
 
 def test_the_table_is_the_one_shown(printed):
-    """Processor times differ, and a data set at the limit of a success may be one on another processor."""
+    """Processor times differ, and an estimate at the limit of the success rule may differ on another processor."""
     shown = blocks("text")[1].splitlines()
     table = printed[1]["table study"].splitlines()[: len(shown)]
     assert [line.split()[:4] for line in table[:4]] == [line.split()[:4] for line in shown[:4]]

@@ -1,4 +1,4 @@
-"""The scoreboard's page is what its script makes, as far as that is read from committed results."""
+"""The scoreboard page equals the output of its script, as far as it is read from committed results."""
 
 from pathlib import Path
 

@@ -1,1 +1,1 @@
-"""From a specification to its estimates: plan, engine, pool and workers."""
+"""Execution of a specification: plan, engine, pool and workers."""

@@ -1,8 +1,8 @@
-"""The workers of a dask scheduler, on this machine or on many.
+"""Workers of a dask scheduler, on one or several machines.
 
-Jobs go through `distributed.Client.get_executor`. A worker must have one thread, and the same code, packages and
-arithmetic as this process: it compares them before its first job. When a worker dies dask gives the job to others, and
-gives it up when these die too; such a job is a suspect, and is computed again in a process of its own below a worker.
+Jobs are submitted by `distributed.Client.get_executor`. A worker must have one thread, and the same code, packages and
+arithmetic as this process, which it checks before its first job. When a worker dies, dask moves its job to others, and
+gives up if these die too; such a job is a suspect, and is computed again in a separate process started by a worker.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ctid_cli.running.workers import Ending, Results, Task, compute, compute_alo
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.identity import Origin, origin_differences, origin_of
 
-#: How long a worker is waited for where there is none [s], and how often that is looked at.
+#: Longest time without any worker [s], and interval between checks.
 PATIENCE = 120.0
 LOOK = 1.0
 
@@ -48,7 +48,7 @@ class DaskWorkers:
             advice = "start one with: dask scheduler"
             raise UsageError(f"no scheduler of dask answers at {address} ({error}); {advice}") from None
         self._expected = packed(origin, computing_parts(plan))
-        # A task, because what is scattered to workers is lost with them.
+        # Submitted as a task, because data scattered to workers are lost with them.
         self._files = self._client.submit(dict, contents, pure=False)
         self._executor = self._client.get_executor(pure=False)
         self.count, self.trouble = 1, ""
@@ -56,7 +56,7 @@ class DaskWorkers:
         self._look()
 
     def _look(self) -> int:
-        """Count the workers now and then; a run that is without any for long ends."""
+        """Return the number of workers, checked at intervals; raise an error after a long time without any."""
         now = time.monotonic()
         if now - self._looked >= LOOK:
             self._looked = now
@@ -71,11 +71,11 @@ class DaskWorkers:
         return max(self.count, 1)
 
     def results(self, jobs: Iterator[Job], stopping: StopRequest) -> Results:
-        """Compute jobs and yield what comes of them, in any order; None where nothing has come for a while."""
+        """Compute jobs and yield their results in any order; None after a while without results."""
         return self._computed(jobs, compute_there, self._look, stopping)
 
     def alone(self, jobs: Iterator[Job], at_once: int, stopping: StopRequest) -> Results:
-        """Compute jobs each in a process of its own, some at the same time."""
+        """Compute each job in a separate process, several at a time."""
         return self._computed(jobs, compute_alone, lambda: min(at_once, self._look()), stopping)
 
     def _computed(
@@ -105,14 +105,14 @@ class DaskWorkers:
 
 
 def _died(job: Job, error: Exception) -> Ending:
-    """Return what came of a job whose workers died: all of it is suspect, what a worker knows is lost with it."""
+    """Return the ending of a job whose workers died: all estimates are suspects, since the worker's record is lost."""
     if isinstance(error, RefusedError):
         raise error
     return Ending([Begun(job.keys)], f"{type(error).__name__}: the workers that had it died or were lost")
 
 
 def _contents(plan: Plan) -> dict[str, bytes]:
-    """Return the content of each file that data sets are made from, by its SHA-256."""
+    """Return the content of each file used for data sets, by its SHA-256."""
     contents = {}
     for path, sha256 in plan.files:
         try:
@@ -129,7 +129,7 @@ def _contents(plan: Plan) -> dict[str, bytes]:
 def on_worker(
     function: Callable[..., Ending], task: Task, limits: Limits, expected: bytes, files: dict[str, bytes]
 ) -> Ending:
-    """Compute a job on a worker that is as the process of the run."""
+    """Compute a job on a worker after checking that it has the same origin as the process of the run."""
     _require_same(expected)
     for sha256 in files.keys() - COPIES.keys():
         copy = Path(_kept().name) / sha256
@@ -146,13 +146,13 @@ def compute_there(task: Task, limits: Limits, folder: Path) -> Ending:
 
 @cache
 def _kept() -> TemporaryDirectory[str]:
-    """Return the folder of the files that were sent, for as long as this worker lives."""
+    """Return the folder of the transferred files, which exists as long as this worker."""
     return TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
 
 
 @cache
 def _require_same(expected: bytes) -> None:
-    """Refuse to compute with several threads, or where estimates would come from another origin."""
+    """Refuse to compute with several threads, or with another origin."""
     from distributed import get_worker
 
     ours, parts = unpacked(expected)

@@ -1,7 +1,7 @@
-"""Running an experiment: compute what is missing, store it as it comes, export it at the end.
+"""Execution of an experiment: compute missing estimates, store them as they arrive, and export at the end.
 
-The same call starts, resumes and re-verifies an experiment. Only this process writes; workers return results. An
-estimate is reported as done after the journal has it safely.
+The same call starts, resumes and verifies an experiment. Only this process writes; workers return results. An estimate
+is reported as done after it is durable in the journal.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ctid_cli.storage.manifest import Key, Outcome
 from ctid_cli.storage.merge import keep_readable as keep_readable_of
 from ctid_cli.storage.sqlite_file import FILE_NAME, announce, retract
 
-#: Finished estimates are committed after this time [s], or when there are this many of them.
+#: Finished estimates are committed after this time [s], or at this number.
 COMMIT_SECONDS = 0.2
 COMMIT_ESTIMATES = 200
 
@@ -42,23 +42,23 @@ STOPPED = 5
 
 
 class Progress(NamedTuple):
-    """How far a run is; it is told when what it tells of is safely stored."""
+    """Progress of a run; reported after the results are stored durably."""
 
-    #: Data sets, and estimates of this run that failed.
+    #: Finished data sets, all data sets, and failed estimates of this run.
     done: int
     total: int
     failed: int
-    #: Estimates that were stored since the last call.
+    #: Estimates stored since the last call.
     stored: Sequence[Key] = ()
-    #: What else happened, as a sentence; empty for nothing.
+    #: Any other event as a sentence; empty if none.
     message: str = ""
-    #: How well the data cells are known, where a block of data sets has just been finished.
+    #: Precision of the data cells, after a block of data sets has been finished.
     precision: tuple[CellPrecision, ...] = ()
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """How a run ended."""
+    """Result of a run."""
 
     experiment: str
     folder: Path
@@ -74,15 +74,15 @@ class RunSummary:
     stopped_by: str | None
     #: Settings of the run before, as in its plan; None without results of one.
     former: dict[str, Any] | None = None
-    #: How well each data cell is known; empty where the number of data sets was given.
+    #: Precision of each data cell; empty if the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()
-    #: Estimator and replicate of estimates that the machine did not let finish, and what was in their way.
+    #: Estimator and replicate of estimates that could not be finished for lack of resources, and the cause.
     given_up: tuple[str, ...] = ()
     hindrance: str = ""
 
     @property
     def missing(self) -> int:
-        """Estimates that are still to be computed."""
+        """Number of estimates still to compute."""
         return self.planned - self.reused - self.computed
 
     @property
@@ -103,7 +103,7 @@ class RunSummary:
 
 
 def compile_kernels(plan: Plan) -> None:
-    """Compile the kernels that a plan needs, or load them from the cache on disk, so that no two workers do."""
+    """Compile the kernels of a plan, or load them from the disk cache, so that each is compiled only once."""
     from ctid_cli.estimation import compilation
     from ctid_cli.signals.sampling import RegularSampling
     from ctid_cli.simulation.components import CustomEstimation
@@ -117,7 +117,7 @@ def compile_kernels(plan: Plan) -> None:
         return
     ours = [estimator for estimator in estimators if not isinstance(estimator, CustomEstimation)]
     clocks = [(getattr(cell.source, "sampling", None), getattr(cell.source, "loop", None)) for cell in plan.data_cells]
-    # A clock that is not known before the data are read is taken as regular.
+    # A clock that is unknown before the data are read is taken as regular.
     for regular, closed in {(isinstance(clock, RegularSampling | None), loop is not None) for clock, loop in clocks}:
         compilation.compile_kernels(ours, regular=regular, closed=closed)
 
@@ -136,10 +136,10 @@ def run_experiment(
     dask: str | None = None,
     warm: Callable[[Plan], object] = compile_kernels,
 ) -> RunSummary:
-    """Compute the missing estimates of a plan and export all of them.
+    """Compute the missing estimates of a plan and export all estimates.
 
-    They are computed by `jobs` processes of this machine, or by the workers of the dask scheduler at an address. Stored
-    failures of a status in `retry` are computed again; so are those that exceeded a limit which is higher now.
+    They are computed by `jobs` processes on this machine, or by the workers of the dask scheduler at an address. Stored
+    failures with a status in `retry` are computed again; so are failures that exceeded a limit which is now higher.
     """
     begun = time.monotonic()
     stopping = stop or StopRequest()
@@ -184,7 +184,7 @@ def run_experiment(
 
 
 class _Run:
-    """One run, from the first entry in the journal to ``runs.h5``."""
+    """One run, from its first journal entry to ``runs.h5``."""
 
     def __init__(
         self,
@@ -202,12 +202,12 @@ class _Run:
         self.given_up: list[str] = []
         self.hindrance = ""
         self.precision: tuple[CellPrecision, ...] = ()
-        #: Estimates left of the data sets in work.
+        #: Number of unfinished estimates of each data set in progress.
         self.unfinished: dict[tuple[str, int], int] = {}
         self.started = now()
 
     def start(self, origin: Origin, circumstances: dict[str, Any], kept: str) -> None:
-        """Note the beginning of the run, and say what it has to do."""
+        """Record the start of the run, and report its workload."""
         with place.writing(self.folder):
             self.log.write_spec(self.plan.spec.text.encode())
         info = session_info(self.plan.spec.text) | circumstances
@@ -217,7 +217,7 @@ class _Run:
             self._tell(message=kept)
 
     def needs_more(self) -> bool:
-        """Return whether the finished block leaves data cells that are not known well enough; plan their next one."""
+        """Return whether data cells need more data sets after the finished block; if so, plan their next block."""
         self.precision = stored_precisions(self.plan.manifest(), self.log)
         needed = tuple(cell.needed for cell in self.precision)
         if needed in ((), self.plan.replicates):
@@ -229,7 +229,7 @@ class _Run:
         return True
 
     def compute(self, workers: Any, limits: Limits, stopping: StopRequest) -> None:
-        """Compute what is missing: store it and tell of it, in whichever order it comes."""
+        """Compute missing estimates, and store and report them in order of arrival."""
         batch: list[Outcome] = []
         since = time.monotonic()
         told = False
@@ -263,7 +263,7 @@ class _Run:
             yield job
 
     def _commit(self, batch: list[Outcome]) -> list[Outcome]:
-        """Store estimates, then tell of them; nothing is left of the batch."""
+        """Store estimates, report them, and return an empty batch."""
         if not batch:
             return batch
         self.log.add(batch, self.session)
@@ -286,7 +286,7 @@ class _Run:
         self.progress(Progress(self.done, self.total, self.failures, **what))
 
     def finish(self, reason: str | None, moved: Path | None, begun: float) -> RunSummary:
-        """Write ``runs.h5``, and note how the run ended."""
+        """Write ``runs.h5``, and record how the run ended."""
         write_runs(self.folder, self.log)
         left = self.states.workload(self.plan)
         reason = reason or (MACHINE if self.given_up else None)
@@ -312,7 +312,7 @@ class _Run:
 def preview(
     plan: Plan, folder: Path, *, fresh: bool = False, allow_mixed: bool = False, retry: Collection[str] = ()
 ) -> Workload:
-    """Return what a run would do, without doing or writing anything."""
+    """Return the workload of a run without computing or writing anything."""
     if fresh or not folder.exists():
         return States().workload(plan)
     with place.lock(folder, shared=True):

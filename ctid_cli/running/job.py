@@ -1,7 +1,7 @@
-"""Jobs: one data set and the estimates wanted of it, computed to numbers that can be stored.
+"""Jobs: one data set and its requested estimates, computed to storable numbers.
 
-Nothing here raises. Whatever goes wrong with an estimate becomes its result, with status ``FAILED``; only where the
-machine was short of something (memory, descriptors, space on a disk) there is no result at all.
+Nothing here raises. Any error of an estimate becomes its result, with status ``FAILED``; only if a resource of the
+machine is exhausted (memory, descriptors, disk space) is there no result.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ctid_cli.simulation.frequency_measures import SignalSource
     from ctid_cli.simulation.start_points import StartPoint
 
-#: Frames of a traceback that are kept, the innermost ones, and characters of a message.
+#: Number of innermost traceback frames stored, and of characters of a message.
 TRACEBACK_FRAMES = 6
 MESSAGE_LENGTH = 2000
 
@@ -45,7 +45,7 @@ class DataCell:
     hash: str
     swept: dict[str, Any]
     source: Source | SignalSource
-    #: Custom measures of its estimates, with their names.
+    #: Custom measures of its estimates, by name.
     measures: tuple[tuple[str, Measure], ...] = ()
 
     def dataset(self, replicate: int) -> Any:
@@ -55,7 +55,7 @@ class DataCell:
 
 @dataclass(frozen=True, eq=False)
 class EstimatorCell:
-    """One estimator with one combination of its swept options."""
+    """One estimator with one combination of swept options."""
 
     name: str
     kind: str
@@ -70,7 +70,7 @@ Wanted = tuple[Key, EstimatorCell, "StartPoint"]
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """One data set and the estimates wanted of it: what is sent to a worker."""
+    """One data set and its requested estimates, sent to a worker."""
 
     cell: DataCell
     replicate: int
@@ -80,30 +80,30 @@ class Job:
 
     @property
     def keys(self) -> tuple[Key, ...]:
-        """The estimates wanted."""
+        """Keys of the requested estimates."""
         return tuple(key for key, _, _ in self.wanted)
 
     def names(self, keys: Collection[Key]) -> list[str]:
-        """Return what some of the estimates are called in messages."""
+        """Return the names of some estimates for messages."""
         return [f"{cell.name} on replicate {key.replicate}" for key, cell, _ in self.wanted if key in keys]
 
     def only(self, keys: Collection[Key]) -> Job:
-        """Return the job of some of the estimates."""
+        """Return the job restricted to some estimates."""
         return replace(self, wanted=tuple(one for one in self.wanted if one[0] in keys))
 
 
 class Begun(NamedTuple):
-    """Estimates that are in work: one, or several of them with what they share."""
+    """Estimates in progress: one, or several during their shared computation."""
 
     keys: tuple[Key, ...]
-    #: Time and processor time that count as theirs already [s].
+    #: Wall and processor time already charged to them [s].
     spent: tuple[float, float] = (0.0, 0.0)
-    #: Processor time that their process had used before [s].
+    #: Processor time of their process before they began [s].
     since: float = 0.0
 
 
 class Short(NamedTuple):
-    """Estimates that the machine was short of something for."""
+    """Estimates that could not be computed because of an exhausted resource."""
 
     keys: tuple[Key, ...]
     reason: str
@@ -113,7 +113,7 @@ Entry = Begun | Outcome | Short
 
 
 def run_job(job: Job, limits: Limits | None = None) -> Iterator[Entry]:
-    """Compute the wanted estimates of one data set, and say which is begun, so that the caller can set its limits."""
+    """Compute the estimates of one data set, and yield which one begins, so that the caller can set its limits."""
     limits = limits or Limits()
     yield Begun(job.keys)
     try:
@@ -126,7 +126,7 @@ def run_job(job: Job, limits: Limits | None = None) -> Iterator[Entry]:
 
 
 def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Limits) -> Iterator[Entry]:
-    """Compute the estimates of one estimator, which share the preparation of the record."""
+    """Compute the estimates of one estimator, which share the preprocessing of the record."""
     keys, estimator = tuple(key for key, _, _ in wanted), wanted[0][1].estimator
     yield Begun(keys)
     begun = _clocks()
@@ -148,7 +148,7 @@ def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Lim
             values, reasons = measured(job.cell.measures, fit, data, limits)
             lines = [result["message"], *(f"Measure {name}: {why}" for name, why in reasons.items())]
             result |= {"custom_measures": values or None, "message": "\n".join(lines)}
-            # What cannot be stored is not a result.
+            # Results that cannot be stored are failures.
             canonical_json(result).encode()
         except BaseException as error:
             yield from ended((key,), error, limits)
@@ -159,7 +159,7 @@ def _of_one_estimator(job: Job, data: Any, wanted: Sequence[Wanted], limits: Lim
 def measured(
     measures: Iterable[tuple[str, Measure]], fit: Any, data: Any, limits: Limits
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return values of custom measures, and why some have none, by their names."""
+    """Return values of custom measures by name, and the reasons for missing values by name."""
     from ctid_cli.simulation.components import value_of
 
     values: dict[str, Any] = {}
@@ -177,7 +177,7 @@ def measured(
 
 
 def ended(keys: Collection[Key], error: BaseException, limits: Limits) -> Iterator[Outcome | Short]:
-    """Tell what becomes of estimates that an exception ended; under a limit of memory, lacking it is their failure."""
+    """Yield the results of estimates ended by an exception; under a memory limit, lack of memory is their failure."""
     lacking = shortage(error)
     if lacking is None:
         result = failure(error)
@@ -191,18 +191,18 @@ def ended(keys: Collection[Key], error: BaseException, limits: Limits) -> Iterat
 
 
 def _clocks() -> Array:
-    """Return wall time and processor time, that of finished child processes too [s]."""
+    """Return wall time and processor time, including finished child processes [s]."""
     times = os.times()
-    # The clock of the process itself ticks faster than that of `os.times`.
+    # The clock of the process has a finer resolution than `os.times`.
     processor = time.process_time() + times.children_user + times.children_system
     return np.array([time.perf_counter(), processor])
 
 
 def failure(error: BaseException) -> dict[str, Any]:
-    """Return the result of an estimate that an exception ended.
+    """Return the result of an estimate ended by an exception.
 
-    The message is part of the stored results, which must not differ between two runs. Hence file names without their
-    folders, and no memory addresses.
+    The message is part of the stored results, which must be identical in two runs. Hence file names are without
+    folders, and memory addresses are removed.
     """
     frames = traceback.extract_tb(error.__traceback__)[-TRACEBACK_FRAMES:]
     places = [f"  {Path(frame.filename).name}:{frame.lineno} in {frame.name}" for frame in frames]
@@ -211,7 +211,7 @@ def failure(error: BaseException) -> dict[str, Any]:
 
 
 def _repeatable(text: str) -> str:
-    """Leave out memory addresses, which are others in every run."""
+    """Remove memory addresses, which differ in every run."""
     return re.sub(r"\b0x[0-9a-fA-F]+", "0x…", text)
 
 
@@ -224,5 +224,5 @@ def _said(error: BaseException) -> str:
 
 
 def _readable(text: str) -> str:
-    """Escape what files, tables and terminals cannot hold: halves of characters, and control characters."""
+    """Escape characters that files, tables and terminals cannot hold: surrogates and control characters."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)

@@ -1,7 +1,7 @@
-"""What one estimate may take of the machine, what the machine may lack, and when a run is to stop.
+"""Limits of one estimate, exhausted resources of the machine, and requests to stop a run.
 
-Limits are those of the operating system, which keeps them whatever the estimator does, in Python or in C: a timer of
-processor time, a watchdog that ends the process after some wall time, and a limit of memory that lets allocations fail.
+The operating system enforces the limits in Python and in C code: a timer of processor time, a watchdog that ends the
+process after a wall time, and a memory limit that makes allocations fail.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from typing import Any, BinaryIO, Self
 from ctid_cli.errors import UsageError
 
 _MEGABYTE = 1e6
-#: Least time that a limit is set to [s]: zero would be none.
+#: Shortest timer interval [s]: zero would mean no limit.
 _LEAST = 1e-3
-#: Errors of the operating system that another machine, or another moment, would not have.
+#: Operating system errors that depend on the machine and the moment.
 SHORTAGES = frozenset(
     getattr(errno, name)
     for name in ("EMFILE", "ENFILE", "ENOMEM", "EAGAIN", "ENOSPC", "EDQUOT", "EIO", "ENOLCK", "ESTALE", "ENOBUFS")
@@ -38,28 +38,28 @@ SHORTAGES = frozenset(
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a single estimate; None where there is none."""
+    """Limits of a single estimate; None for no limit."""
 
     #: Processor time, and wall time [s].
     cpu_seconds: float | None = None
     wall_seconds: float | None = None
-    #: Memory beyond what the process held before [MB].
+    #: Memory beyond that of the process before the estimate [MB].
     memory_mb: float | None = None
 
     @classmethod
     def of(cls, content: Mapping[str, Any]) -> Self:
-        """Read the limits in the canonical form of a specification, or in what is known of a run."""
+        """Read the limits from the canonical form of a specification, or from the data of a run."""
         return cls(**(content.get("limits") or {}))
 
     def require_support(self) -> None:
-        """Refuse limits that this operating system does not keep."""
+        """Refuse limits that this operating system does not support."""
         if sys.platform != "linux" and (self.cpu_seconds or self.memory_mb):
             raise UsageError(
                 "limits.cpu_seconds and limits.memory_mb need Linux; use wall_seconds, which works everywhere"
             )
 
     def rose_since(self, other: Limits, status: str) -> bool:
-        """Return whether an estimate that ended with a status under other limits may take more now."""
+        """Return whether the limit that ended an estimate with a status under other limits is now higher."""
         names = {"TIMEOUT": ("cpu_seconds", "wall_seconds"), "MEMORY": ("memory_mb",)}.get(status, ())
         pairs = [(getattr(other, name), getattr(self, name)) for name in names]
         return any(old is not None and (new is None or new > old) for old, new in pairs)
@@ -69,7 +69,7 @@ class Limits:
         if self.wall_seconds is not None:
             faulthandler.dump_traceback_later(max(self.wall_seconds - spent[0], _LEAST), exit=True, file=watched)
         if self.cpu_seconds is not None:
-            # Unlike RLIMIT_CPU it counts from now on, in fractions of a second, and is not what a batch system sets.
+            # Unlike RLIMIT_CPU it counts from now, in fractions of a second, and is independent of batch systems.
             signal.setitimer(signal.ITIMER_PROF, max(self.cpu_seconds - spent[1], _LEAST))
         if self.memory_mb is not None:
             _limit_memory(_data_bytes() + int(self.memory_mb * _MEGABYTE))
@@ -84,20 +84,20 @@ class Limits:
             _limit_memory(None)
 
     def too_late(self, *, wall: bool) -> str:
-        """Return what is said of an estimate that needs more time than it may have."""
+        """Return the message of an estimate that exceeded a time limit."""
         if wall:
             return f"not finished after {self.wall_seconds:g} s (limits.wall_seconds)"
         return f"not finished after {self.cpu_seconds:g} s of processor time (limits.cpu_seconds)"
 
 
 def _data_bytes() -> int:
-    """Return the private memory of this process, which RLIMIT_DATA counts; the code of libraries is not in it."""
+    """Return the private memory of this process as counted by RLIMIT_DATA, without the code of libraries."""
     return int(Path("/proc/self/statm").read_bytes().split()[5]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @cache
 def _given_memory() -> tuple[int, int]:
-    """Return the limit of memory that this process began with, and the most that it may be."""
+    """Return the initial memory limit of this process, and its allowed maximum."""
     return resource.getrlimit(resource.RLIMIT_DATA)
 
 
@@ -108,7 +108,7 @@ def _limit_memory(size: int | None) -> None:
 
 
 def shortage(error: BaseException) -> BaseException | None:
-    """Return the exception that tells what the machine was short of; None if there is none behind an error."""
+    """Return the exception that names an exhausted resource; None if an error has another cause."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, MemoryError) or (isinstance(seen, OSError) and seen.errno in SHORTAGES):
@@ -118,7 +118,7 @@ def shortage(error: BaseException) -> BaseException | None:
 
 
 _FEWER = "use fewer worker processes (--jobs)"
-#: What a reason mentions, and what helps.
+#: Words in a reason, and the advice for them.
 _ADVICE = (
     (
         r"SIGKILL|[Oo]ut of memory|Cannot allocate",
@@ -134,7 +134,7 @@ _ANY = f"look whether something ends processes here, {_FEWER}, or try another ma
 
 
 def advice(reason: str) -> str:
-    """Return what helps against something that stood in the way of estimates."""
+    """Return the advice for an exhausted resource."""
     return next((text for pattern, text in _ADVICE if re.search(pattern, reason)), _ANY)
 
 

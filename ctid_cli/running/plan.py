@@ -1,4 +1,4 @@
-"""Plans: the data sets that a specification asks for, and the estimates wanted of each."""
+"""Plans: the data sets of a specification, and the estimates requested of each."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from ctid_cli.storage.columns import reserved_names
 from ctid_cli.storage.identity import Origin, origin_of
 from ctid_cli.storage.manifest import Key, Manifest, Shard
 
-#: Data sets that one experiment may ask for; beyond this its plan alone would fill the memory.
+#: Maximum number of data sets of one experiment; the plan of more would fill the memory.
 MAX_DATA_SETS = 1_000_000
 
 
@@ -49,7 +49,7 @@ class Plan:
     #: Number of data sets of each data cell.
     replicates: tuple[int, ...]
     spec_hash: str
-    #: Whose data sets are computed; None for all.
+    #: Shard that is computed; None for all data sets.
     shard: Shard | None = None
 
     @property
@@ -59,16 +59,16 @@ class Plan:
 
     @cached_property
     def monte_carlo(self) -> Mapping[str, Any]:
-        """The section on the number of data sets and their seed; empty where nothing is random."""
+        """The section on number and seed of data sets; empty if nothing is random."""
         return self.spec.canonical().get("monte_carlo") or {}
 
     @property
     def runs(self) -> int:
-        """Number of data sets of the data cell that has most."""
+        """Largest number of data sets of any data cell."""
         return max(self.replicates)
 
     def asked(self, cell: int) -> BoolArray:
-        """Return which replicates of a data cell are asked for: all, or those of the shard."""
+        """Return which replicates of a data cell are requested: all, or those of the shard."""
         own, shard, cells = self.replicates[cell], self.shard, len(self.data_cells)
         if shard is None:
             return np.ones(own, dtype=bool)
@@ -81,11 +81,11 @@ class Plan:
 
     @property
     def estimates_each(self) -> int:
-        """Number of estimates of every data set."""
+        """Number of estimates per data set."""
         return len(self.keys(0, 0))
 
     def part(self, shard: Shard) -> Plan:
-        """Return the part of the plan that one shard computes."""
+        """Return the part of the plan for one shard."""
         section = self.spec.monte_carlo
         if section is not None and section.until is not None:
             raise UsageError(
@@ -97,13 +97,13 @@ class Plan:
 
     @property
     def files(self) -> list[tuple[str, str]]:
-        """Path and SHA-256 of each file that data sets are made from."""
+        """Path and SHA-256 of each file used for data sets."""
         sections: list[Any] = [self.spec.data, self.spec.sampling, *self.spec.generators.values()]
         read = [one for one in sections if getattr(one, "sha256", None) is not None and not one.custom]
         return [(joined(self.spec.folder.resolve(), section.file), section.sha256) for section in read]
 
     def keys(self, cell: int, replicate: int) -> list[Wanted]:
-        """Return the estimates wanted of a data set."""
+        """Return the requested estimates of a data set."""
         data_hash = self.data_cells[cell].hash
         return [
             (Key(data_hash, replicate, part.hash, start.label), part, start)
@@ -112,20 +112,20 @@ class Plan:
         ]
 
     def job(self, cell: int, replicate: int, wanted: BoolArray | None = None) -> Job:
-        """Return a data set and those of its estimates that are wanted; by default all."""
+        """Return the job of a data set with the requested estimates; by default all."""
         keys = self.keys(cell, replicate)
         asked = tuple(keys if wanted is None else itertools.compress(keys, wanted))
         return Job(self.data_cells[cell], replicate, self.monte_carlo.get("seed"), asked, self.terms)
 
     @cached_property
     def terms(self) -> tuple[Term, ...] | None:
-        """Structure of the submodels that estimates of one fraction are also given as; None for none."""
+        """Structure of the submodels into which estimates of one fraction are also decomposed; None for none."""
         return structure(self.data_cells[0].source, [cell.estimator for cell in self.estimators])
 
     def manifest(self) -> Manifest:
         """Return the plan as plain data."""
         canonical, wanted = dict(self.spec.canonical()), self.keys(0, 0)
-        # Limits end estimates; they are no part of what the results are of.
+        # Limits end estimates; they do not affect other results.
         canonical.pop("limits", None)
         return {
             "experiment": self.experiment,
@@ -155,12 +155,12 @@ class Plan:
 
 
 def starts_of(kind: str | None, starts: tuple[StartPoint, ...]) -> tuple[StartPoint, ...]:
-    """Return the starts that an estimator which takes one of a kind begins from."""
+    """Return the starts used by an estimator that takes starts of a kind."""
     return tuple(start for start in starts if start.of == kind) or (NO_START,)
 
 
 def structure(source: Source | SignalSource, estimators: Iterable[Any]) -> tuple[Term, ...] | None:
-    """Return the submodels of the simulated system by rising frequency, or else of the first estimator."""
+    """Return the submodels of the simulated system by ascending frequency, or those of the first estimator."""
     if isinstance(source, SimulatedSource) and isinstance(source.system, AdditiveModel):
         return source.system.sorted().terms
     found = (getattr(estimator, "terms", None) for estimator in estimators)
@@ -168,7 +168,7 @@ def structure(source: Source | SignalSource, estimators: Iterable[Any]) -> tuple
 
 
 def build_plan(spec: Spec, runs: int | None = None) -> Plan:
-    """Plan an experiment."""
+    """Build the plan of an experiment."""
     if runs is not None and runs < 1:
         raise UsageError(f"the number of data sets must be 1 or more, not {runs}")
     count = first = 1
@@ -198,7 +198,7 @@ def simulate_dataset(
     overrides: Sequence[str] = (),
     allow_code: bool = False,
 ) -> DataSet | SignalDataSet:
-    """Make one data set of an experiment: the very one that its estimators are given.
+    """Simulate one data set of an experiment, identical to that given to its estimators.
 
     Parameters
     ----------
@@ -208,30 +208,30 @@ def simulate_dataset(
         Case and replicate, both from 0. The swept values of the data combine to cases, the last of them changing
         fastest, in the order of the sections system, excitation, loop, sampling, noise, signal, disturbance, inputs.
     overrides : sequence of str, default ()
-        Values in the place of the specification's own, such as ``"noise.snr_db=15"``: another way to choose a case.
+        Values that replace those of the specification, such as ``"noise.snr_db=15"``: another way to choose a case.
     allow_code : bool, default False
-        Run the code that the specification names as a kind.
+        Run the code named by kinds in the specification.
 
     Returns
     -------
     DataSet or SignalDataSet
-        Its ``record`` is what estimators are given, its ``true_model`` the simulated system, if that is one of ctid's.
+        Its ``record`` is given to estimators; its ``true_model`` is the simulated system, if that is one of ctid's.
 
     Raises
     ------
     SpecError
-        If the specification has mistakes; all of them are named.
+        If the specification has errors; all of them are listed.
     RefusedError
-        If it names code that may not be run.
+        If it names code that must not be run.
     UsageError
-        If there is no such case or replicate.
+        If the case or replicate does not exist.
     DataError
-        If the data set cannot be made.
+        If the data set cannot be simulated.
 
     Notes
     -----
-    A data set is a function of its case, the seed and the replicate. Random numbers of the sampling, the input and
-    the noise come from streams of their own, so that cases which differ in the noise have the same input.
+    A data set is a function of its case, the seed and the replicate. Sampling, input and noise have separate streams of
+    random numbers, so that cases which differ in the noise have the same input.
 
     Examples
     --------
@@ -267,14 +267,14 @@ def simulate_dataset(
 
 
 def data_parts(spec: Spec) -> dict[KeyPath, list[Variant]]:
-    """Return the variants of the sections that data are made from; of a measured record only those of its loop."""
+    """Return the variants of the sections of the data; only those of the loop for a measured record."""
     return {path: variants(section) for path, section in spec.of_data.items()}
 
 
 def data_cells(
     spec: Spec, parts: Mapping[KeyPath, list[Variant]], names: Mapping[KeyPath, str] | None = None
 ) -> Iterator[DataCell]:
-    """Yield every combination of the variants of the sections; swept fields have the names of their columns."""
+    """Yield every combination of the variants of the sections; swept fields are named by their columns."""
     names = _column_names(parts) if names is None else names
     seed = None if spec.monte_carlo is None else spec.monte_carlo.seed
     measures = {name: variants(section)[0] for name, section in spec.custom_measures.items()}
@@ -284,17 +284,17 @@ def data_cells(
         content = _nested({path: _without_place(variant.values) for path, variant in chosen.items()})
         if spec.signal is not None:
             content |= {"disturbance": content.get("disturbance"), "seed": seed}
-            # What is measured of an estimate is stored with it, so that it belongs to its identity.
+            # Measures of an estimate are stored with it, and therefore part of its identity.
             content["measuring"] = dataclasses.asdict(_measuring(spec))
         elif spec.data is not None:
-            # The seed decides where random starts lie; the record itself is in the content as a hash.
+            # The seed affects random starts; the content hash of the record is included.
             content = {"data": _without_place(spec.data.model_dump(mode="json")), **content, "seed": seed}
         else:
             content |= {"noise": content.get("noise"), "seed": seed}
             system = chosen.get(("system",))
             if system is not None and is_custom(system.options):
                 content["system"]["truth"] = truth_of(system)
-            # What is measured of an estimate is stored with it, so that it belongs to its identity.
+            # Measures of an estimate are stored with it, and therefore part of its identity.
             content |= {"fresh_fit": True} if "fresh_fit" in (spec.measures or ()) else {}
         if measures:
             content["custom_measures"] = {
@@ -306,7 +306,7 @@ def data_cells(
 
 
 def _nested(values: Mapping[KeyPath, Any]) -> dict[str, Any]:
-    """Return values by their key paths as mappings of mappings."""
+    """Return values by key path as nested mappings."""
     found: dict[str, Any] = {}
     for path, value in values.items():
         inner = found
@@ -317,10 +317,10 @@ def _nested(values: Mapping[KeyPath, Any]) -> dict[str, Any]:
 
 
 def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
-    """Return what makes the data sets of one combination of the options of the sections."""
-    # Absolute, because worker processes may have been started in another working directory.
+    """Return the source of the data sets for one combination of section options."""
+    # Absolute, because workers may have another working directory.
     folder = spec.folder.resolve()
-    # Any seed will do where nothing is random.
+    # The seed has no effect if nothing is random.
     seed = 0 if spec.monte_carlo is None else spec.monte_carlo.seed
     if spec.signal is not None:
         given = options["signal"], options.get("disturbance"), options["sampling"]
@@ -342,7 +342,7 @@ def source_of(spec: Spec, options: Mapping[str, Any]) -> Source | SignalSource:
 
 
 def _measuring(spec: Spec) -> Measuring:
-    """What is measured of the frequencies of a signal."""
+    """Return what is measured of the frequencies of a signal."""
     if spec.success is None:
         return Measuring()
     window = spec.success.window
@@ -356,14 +356,14 @@ def _estimator_cell(name: str, variant: Variant, names: Mapping[KeyPath, str]) -
 
 
 def estimation(variant: Variant) -> Any:
-    """Return what prepares a record and fits to it."""
+    """Return the estimator of a variant, including its preprocessing of the record."""
     if isinstance(variant.options, FrequencyEstimator):
         return FrequencyEstimation(variant.options)
     return CustomEstimation(variant.options) if is_custom(variant.options) else variant.options
 
 
 def _column_names(parts: Mapping[KeyPath, Iterable[Variant]]) -> dict[KeyPath, str]:
-    """Name of the column of every swept field: its last word, or more of its path where that is taken."""
+    """Return the column name of every swept field: its last key, or more of its path if that name is taken."""
     distinct = list(dict.fromkeys((*place, *path) for place, cases in parts.items() for v in cases for path in v.swept))
     last, reserved = [path[-1] for path in distinct], reserved_names()
     return {
@@ -373,7 +373,7 @@ def _column_names(parts: Mapping[KeyPath, Iterable[Variant]]) -> dict[KeyPath, s
 
 
 def _without_place(content: Mapping[str, Any]) -> dict[str, Any]:
-    """A section without the name of its file, whose content hash says what matters."""
+    """Return a section without its file name; the content hash identifies the file."""
     return {
         key: _without_place(value) if isinstance(value, dict) else value
         for key, value in content.items()
@@ -383,9 +383,9 @@ def _without_place(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
     content = {key: _without_place(value) if isinstance(value, dict) else value for key, value in canonical.items()}
-    for name in ("measures", "limits"):  # say what is shown, and what may not be exceeded, not what is computed
+    for name in ("measures", "limits"):  # these do not affect what is computed
         content.pop(name, None)
-    if content.get("inputs") is None:  # results of before there were several inputs stay those of the specification
+    if content.get("inputs") is None:  # keeps hashes of specifications from before several inputs existed
         content.pop("inputs", None)
     if content.get("monte_carlo") is not None:
         content["monte_carlo"] = {"seed": content["monte_carlo"]["seed"]}
@@ -393,17 +393,17 @@ def _without_circumstances(canonical: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def current_origin(plan: Plan) -> Origin:
-    """Return where the estimates of a plan would come from now."""
+    """Return the origin that estimates of the plan would have now."""
     return origin_of(*computing_parts(plan))
 
 
 def current_version(plan: Plan) -> str:
-    """Return the code version of these estimates, on whichever processor."""
+    """Return the code version of the estimates, independent of the processor."""
     return current_origin(plan).code_version
 
 
 def computing_parts(plan: Plan) -> list[Any]:
-    """Return what computes the estimates of a plan: the source of its data sets, its estimators and custom measures."""
-    # All data cells are made by the same classes; only the values of their fields differ.
+    """Return the computing parts of a plan: the source of its data sets, its estimators and custom measures."""
+    # All data cells have the same classes; only field values differ.
     first = plan.data_cells[0]
     return [first.source, first.measures, *(cell.estimator for cell in plan.estimators)]

@@ -1,4 +1,4 @@
-"""Which estimates are stored, how many are needed, and what is still to be computed."""
+"""States of estimates, number of data sets needed, and estimates to compute."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from ctid_cli.storage.manifest import Key, Manifest, true_values
 from ctid_cli.storage.truth import arrays_of_rows, found_under, judged
 from ctid_cli.text import count
 
-#: States of an estimate: not stored, stored, stored as a failure, and a failure that is to be computed once more.
+#: States of an estimate: not stored, stored, stored as a failure, and a failure to compute again.
 ABSENT, STORED, FAILED, AGAIN = range(4)
 _TO_COMPUTE = (ABSENT, AGAIN)
-#: Data set, estimator and start of estimates that differ in the replicate only.
+#: Data set, estimator and start, shared by estimates that differ only in the replicate.
 Place = tuple[str, str, str]
 
 
 class Workload(NamedTuple):
-    """What of a plan is stored, and what is to be computed."""
+    """Numbers of stored estimates and of those to compute."""
 
     data_sets: int
     estimates: int
-    #: Stored ones that stay, failures among all stored ones, failures to compute again, stored ones of other plans.
+    #: Stored estimates that are kept; failures among all stored; failures to compute again; estimates of other plans.
     reused: int
     failed: int
     again: int
     left_aside: int
-    #: Most data sets of a data cell, where it gets as many as a precision needs.
+    #: Maximum number of data sets of a data cell, if a precision determines their number.
     at_most: int | None = None
 
     def __str__(self) -> str:
@@ -51,16 +51,16 @@ class Workload(NamedTuple):
 
 
 class States:
-    """The state of every estimate, a byte for each."""
+    """State of every estimate, one byte each."""
 
     def __init__(self) -> None:
         self._states: dict[Place, bytearray] = defaultdict(bytearray)
-        #: How many are stored.
+        #: Number of stored estimates.
         self.stored = 0
 
     @classmethod
     def read(cls, log: JournalReader | None, retry: Collection[str], limits: Limits) -> States:
-        """Read what a journal holds; failures are unwanted of some statuses, and where a limit has risen since."""
+        """Read a journal; failures with a status in `retry`, or under a limit since increased, are computed again."""
         states = cls()
         if log is None:
             return states
@@ -72,14 +72,14 @@ class States:
         return states
 
     def note(self, key: Key, status: str) -> None:
-        """Note that an estimate was stored."""
+        """Record that an estimate was stored."""
         known = self._of(key)
         known.extend(bytes(max(0, key.replicate + 1 - len(known))))
         self.stored += known[key.replicate] == ABSENT
         known[key.replicate] = FAILED if status in FAILURES else STORED
 
     def _of(self, key: Key) -> bytearray:
-        """Return the states of an estimate on all replicates."""
+        """Return the states of an estimate for all replicates."""
         return self._states[key.data_hash, key.estimator_hash, key.start]
 
     def _table(self, plan: Plan, cell: int) -> IndexArray:
@@ -89,12 +89,12 @@ class States:
         return np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), own).astype(int)
 
     def missing(self, plan: Plan) -> list[BoolArray]:
-        """Return for every data cell which estimates are to be computed, shape (estimates, replicates)."""
+        """Return the mask of estimates to compute for every data cell, shape (estimates, replicates)."""
         cells = range(len(plan.data_cells))
         return [np.isin(self._table(plan, cell), _TO_COMPUTE) & plan.asked(cell) for cell in cells]
 
     def workload(self, plan: Plan) -> Workload:
-        """Return what of a plan is stored, and what is to be computed."""
+        """Return the numbers of stored estimates of a plan and of those to compute."""
         found = np.zeros(4, dtype=int)
         for cell in range(len(plan.data_cells)):
             found += np.bincount(self._table(plan, cell)[:, plan.asked(cell)].ravel(), minlength=4)
@@ -111,14 +111,14 @@ class States:
 
 
 def data_sets(missing: list[BoolArray]) -> int:
-    """Return the number of data sets that lack an estimate."""
+    """Return the number of data sets with missing estimates."""
     return sum(int(lacking.any(axis=0).sum()) for lacking in missing)
 
 
 def jobs_of(plan: Plan, missing: list[BoolArray]) -> Iterator[Job]:
-    """Yield the jobs of a plan when they are asked for, replicate by replicate.
+    """Yield the jobs of a plan lazily, replicate by replicate.
 
-    So a run that is stopped has as many data sets of one cell as of another.
+    Thus a stopped run has about the same number of data sets in every cell.
     """
     for replicate in range(plan.runs):
         for cell, lacking in enumerate(missing):
@@ -126,37 +126,36 @@ def jobs_of(plan: Plan, missing: list[BoolArray]) -> Iterator[Job]:
                 yield plan.job(cell, replicate, lacking[:, replicate])
 
 
-# --- how many data sets are needed ------------------------------------------------------------------------------------
+# --- number of data sets needed ---------------------------------------------------------------------------------------
 #
-# What is decided follows from the stored estimates alone, from those of the data sets before the end of each block. So
-# a run that was interrupted, or that has other workers, decides the same; so does one that finds more estimates than
-# it needs, of an earlier plan.
+# The decision depends only on the stored estimates of the data sets before the end of each block. It is therefore the
+# same after an interruption, with other workers, and if there are more estimates than needed from an earlier plan.
 
 #: Stored results by estimate.
 Found = Mapping[Key, Mapping[str, Any]]
 
 
 def cell_precisions(manifest: Manifest, found: Found) -> tuple[CellPrecision, ...]:
-    """How well every data cell is known; nothing where the number of data sets is given."""
+    """Return the precision of every data cell; empty if the number of data sets is given."""
     section = _asked(manifest)
     return () if section is None else tuple(_cell(manifest, cell, section, found) for cell in manifest["data_cells"])
 
 
 def stored_precisions(manifest: Manifest, log: JournalReader) -> tuple[CellPrecision, ...]:
-    """The same from what a journal holds."""
+    """Return the precision of every data cell from a journal."""
     if _asked(manifest) is None:
         return ()
     return cell_precisions(manifest, {row.key: row.content for row in log.rows()})
 
 
 def as_needed(plan: Plan, log: JournalReader | None) -> Plan:
-    """The plan with as many data sets as are known to be needed."""
+    """Return the plan with the number of data sets known to be needed."""
     cells = () if log is None else stored_precisions(plan.manifest(), log)
     return replace(plan, replicates=tuple(cell.needed for cell in cells)) if cells else plan
 
 
 def _asked(manifest: Manifest) -> Mapping[str, Any] | None:
-    """The section that asks for a precision."""
+    """Return the section with the required precision."""
     section: Mapping[str, Any] = manifest["spec"].get("monte_carlo") or {}
     return section if section.get("until") else None
 
@@ -179,12 +178,12 @@ def _replications(
     success: Mapping[str, Any] | None,
     truth: Mapping[str, float],
 ) -> Replications:
-    """Return what an estimator gave, from the first data set to the last before one that is missing."""
+    """Return the results of an estimator from the first data set to the last before a missing one."""
     keys = (Key(data, replicate, part["hash"], start) for replicate in itertools.count())
     results = [found[key] for key in itertools.takewhile(found.__contains__, keys)]
     arrays = arrays_of_rows(results)
     values = found_under(tuple(truth), arrays, len(results)).values
-    # Without a rule, or without true values to compare with, an estimate neither converges nor fails to.
+    # Without a rule or true values, convergence is undefined.
     hits = judged(success, truth, arrays, values, [row.get("measures") for row in results])
     errors = values - np.array([*truth.values()], dtype=float)
     return Replications(hits, errors, tuple(truth), part["name"], part["swept"], start)

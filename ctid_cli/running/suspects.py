@@ -1,10 +1,10 @@
-"""From jobs to estimates, whatever happens to the processes that compute them.
+"""From jobs to estimates, including recovery from dead worker processes.
 
-What was in work when a process died is a suspect: one of them killed its process, the others were in work beside it.
-Each is computed again alone. What exceeds a limit there, or ends a process that has computed nothing else, is a failure
-of its estimator. What the machine did (out of memory, no more descriptors, a process killed from outside) is never a
-result, and a process that was stopped for a while is not charged with the time: such estimates are computed once
-more, one at a time. What the machine does not let finish then is given up, and missing.
+Jobs in progress when a process dies are suspects: one of them killed its process, the others were running at the same
+time. Each is computed again alone. An estimate that exceeds a limit there, or ends a process that has computed nothing
+else, is a failure of its estimator. A cause in the machine (out of memory or descriptors, a process killed from
+outside) is never a result, and a process that was stopped for a while is not charged with that time: such estimates are
+computed once more, one at a time. If they fail again for such a cause they are given up, and missing.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from ctid_cli.running.dask_cluster import DaskWorkers
     from ctid_cli.running.workers import LocalWorkers
 
-#: After this number of rounds without a finished estimate the run ends; before each next round it waits in proportion
-#: to their number [s]. A round ends early when the machine was short of something this often.
+#: After this number of rounds without a finished estimate the run ends; the pause before each further round is
+#: proportional to the round number [s]. A round ends early after this number of exhausted resources.
 PATIENCE, PAUSE = 4, 0.3
 SHORTAGES = 8
-#: Share of a limit of wall time that a process must have had the processor for, to be charged with exceeding it [-].
+#: Minimum share of processor time in an exceeded wall time limit for which a process is charged with exceeding it [-].
 AT_WORK = 0.5
-#: Estimates given up that are named.
+#: Number of given-up estimates named in a message.
 NAMED = 3
-#: Signals that no estimate sends itself by mistake: something else ended its process.
+#: Signals that no estimate sends to itself by mistake, so that another program ended its process.
 _FROM_OUTSIDE = {"SIGKILL", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT", "SIGXCPU", "SIGXFSZ"}
 
 
 class Course:
-    """Jobs on their way to estimates."""
+    """Jobs in progress, from submission to estimates."""
 
     def __init__(
         self,
@@ -51,24 +51,24 @@ class Course:
         tell: Callable[[str], object],
     ) -> None:
         self._jobs, self._workers, self._limits, self._stopping, self._tell = jobs, workers, limits, stopping, tell
-        #: Estimates that the machine did not let finish, by name, and what was in their way.
+        #: Estimates that could not be finished for lack of resources, by name, and the cause.
         self.given_up: list[str] = []
         self.hindrance = ""
-        #: Whether the machine is fit for no estimate.
+        #: Whether the machine cannot finish any estimate.
         self.hopeless = False
-        #: What is left of jobs whose process died, and is not suspect.
+        #: Remaining jobs of dead processes that are not suspects.
         self._again: deque[Job] = deque()
         self._suspects: list[Job] = []
-        #: What is computed once more, one at a time.
+        #: Jobs computed once more, one at a time.
         self._undecided: list[Job] = []
         self._exhausted = False
-        #: Since the last finished estimate: how often the machine was short of something, and rounds.
+        #: Since the last finished estimate: number of exhausted resources, and of rounds.
         self._short = self._vain = 0
-        #: What the last process died of, or the machine was short of.
+        #: Cause of death of the last process, or exhausted resource.
         self._reason = ""
 
     def outcomes(self) -> Generator[list[Outcome]]:
-        """Yield finished estimates; an empty list now and then."""
+        """Yield finished estimates; an empty list at intervals."""
         while not self._stopping() and not (self._exhausted and not self._again):
             self._vain += 1
             yield from self._round()
@@ -79,7 +79,7 @@ class Course:
             time.sleep(PAUSE * self._vain)
 
     def _round(self) -> Generator[list[Outcome]]:
-        """Compute until all is done or a process dies; then each of the suspects alone."""
+        """Compute until all jobs are done or a process dies; then compute each suspect alone."""
         with closing(self._workers.results(self._handed_out(), self._stopping)) as results:
             yield from self._settled(results, tries=0)
         while (self._suspects or self._undecided) and not self._stopping():
@@ -105,12 +105,12 @@ class Course:
             yield job
 
     def _settled(self, results: Iterator[tuple[Job, Ending] | None], tries: int) -> Generator[list[Outcome]]:
-        """Decide on jobs that ended, in the pool at first, then alone, then alone on the machine."""
+        """Process the endings of jobs: first in the pool, then alone, then as the only job on the machine."""
         for result in results:
             yield [] if result is None else self._settle(*result, tries)
 
     def _settle(self, job: Job, ending: Ending, tries: int) -> list[Outcome]:
-        """Return what a job has finished, and decide on the rest of it."""
+        """Return the finished estimates of a job, and process the rest of it."""
         outcomes = [entry for entry in ending.entries if isinstance(entry, Outcome)]
         left = [key for key in job.keys if key not in {outcome.key for outcome in outcomes}]
         if outcomes:
@@ -123,7 +123,7 @@ class Course:
         self._reason = ending.how or self._reason
         in_work = [key for key in ending.begun if key in left] if ending.how else []
         if tries and ending.how and not in_work:
-            # It died before it began.
+            # The process died before the first estimate.
             in_work = left
         rest = [key for key in left if key not in in_work]
         if rest:
@@ -135,11 +135,11 @@ class Course:
         return outcomes
 
     def _decided(self, job: Job, ending: Ending, tries: int) -> Iterator[Outcome]:
-        """Decide on estimates that ended a process which had computed nothing else."""
+        """Process estimates that ended a process which had computed nothing else."""
         limits = self._limits
         if ending.late and limits.wall_seconds is not None:
             if tries == 1 and ending.processor < AT_WORK * limits.wall_seconds:
-                # It may have slept, or its process was stopped.
+                # The estimate may have slept, or its process was stopped.
                 self._undecided.append(job)
                 return
             status, reason = "TIMEOUT", limits.too_late(wall=True)
@@ -155,7 +155,7 @@ class Course:
         yield from (Outcome(key, failed(reason, status), None) for key in job.keys)
 
     def _hindered(self, job: Job, reason: str, tries: int) -> None:
-        """Give up what the machine did not let finish, or compute it once more."""
+        """Give up the estimates of a job, or compute it once more."""
         self._reason = reason
         if tries < 2:
             self._undecided.append(job)

@@ -1,4 +1,4 @@
-"""Variances and standard errors that theory gives the estimates of a plan."""
+"""Theoretical variances and standard errors of the estimates of a plan."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from ctid_cli.storage.manifest import true_values
 
 
 def readable_plan(settings: Mapping[str, Any]) -> Plan | None:
-    """Return the plan of stored results, unless it names code, which is not run to read, or is of another version."""
+    """Return the plan of stored results; None if it names custom code, which is not run, or is of another version."""
     try:
-        # Custom measures are stored, and no part of the theory.
+        # Custom measures are stored, and not part of the theory.
         return build_plan(spec_from_canonical({**settings, "measures": None}))
     except (CtidError, ValueError):
         return None
 
 
-# Tables, sentences and figures of one page ask for the same; theory for coloured noise takes a second.
+# Tables, sentences and figures of one page use the same values; theory for coloured noise takes a second.
 @lru_cache(maxsize=1024)
 def least_variances(plan: Plan, cell: int, estimator: int) -> dict[str, float]:
-    """Return the variances of the parameters by theory, under their true names; empty without a theory."""
+    """Return the theoretical variances of the parameters under their true names; empty without a theory."""
     source = plan.data_cells[cell].source
     if not isinstance(source, SimulatedSource):
         return {}
@@ -49,9 +49,9 @@ def least_variances(plan: Plan, cell: int, estimator: int) -> dict[str, float]:
 
 
 def _true_names(estimated: Sequence[str], true: Iterable[str]) -> list[str | None]:
-    """Return the names that parameters have in the true system, None of those that it lacks.
+    """Return the names of parameters in the true system, None for those not in it.
 
-    Where the estimated numerator is longer than the true one, coefficients go together by their power.
+    If the estimated numerator is longer than the true one, coefficients are matched by their power.
     """
     true = list(true)
     shift = sum(re.fullmatch(r"b\d+", name) is not None for name in estimated)
@@ -61,9 +61,9 @@ def _true_names(estimated: Sequence[str], true: Iterable[str]) -> list[str | Non
 
 
 def long_record_variances(plan: Plan) -> dict[tuple[int, int], dict[str, float]]:
-    """Return N times the variances of parameters of submodels on long records, by place of data cell and estimator.
+    """Return N times the asymptotic variances of submodel parameters, by place of data cell and estimator.
 
-    The limit is taken whatever the number of samples of the cell: short records do not reach it.
+    The limit is independent of the cell's number of samples: short records do not reach it.
     """
     found: dict[tuple[int, int], dict[str, float]] = {}
     # Cells that differ in the number of samples or the seed have the same limit.
@@ -90,16 +90,16 @@ def _limit(source: Any, estimator: Any, terms: tuple[Term, ...] | None) -> dict[
     return dict(zip(expected.parameters.names, variances.tolist(), strict=True)) if expected.limit else {}
 
 
-# --- what can be reached in some settings -----------------------------------------------------------------------------
+# --- attainable accuracy in some settings -----------------------------------------------------------------------------
 
-#: Different numbers of samples that are shown, of all that are swept.
+#: Number of shown record lengths, if the number of samples is swept.
 SIZES = 4
-#: Combinations of the other swept settings that are shown.
+#: Number of shown combinations of the other swept settings.
 SETTINGS = 6
 
 
 def expectations(plan: Plan) -> tuple[list[dict[str, Any]], int]:
-    """Return what every estimator can reach in some settings, as data, and how many other settings there are."""
+    """Return the attainable accuracy of every estimator in some settings, and the number of other settings."""
     cells = [(cell, cell.source) for cell in plan.data_cells if isinstance(cell.source, SimulatedSource)]
     if not cells:
         text = f"{plan.experiment} is about a measured record, whose true system is not known; "
@@ -110,12 +110,12 @@ def expectations(plan: Plan) -> tuple[list[dict[str, Any]], int]:
 
 
 def _own(cell: DataCell) -> dict[str, Any]:
-    """Return swept settings besides the number of samples."""
+    """Return the swept settings other than the number of samples."""
     return {name: value for name, value in cell.swept.items() if name.split(".")[-1] != "samples"}
 
 
 def _shown(cells: list[tuple[DataCell, SimulatedSource]]) -> list[tuple[DataCell, SimulatedSource]]:
-    """Return data cells of the first settings, each at a few numbers of samples from the least to the greatest."""
+    """Return data cells of the first settings, each at a few numbers of samples from the smallest to the largest."""
     by_settings: dict[str, dict[int, int]] = {}
     for k, (cell, source) in enumerate(cells):
         by_settings.setdefault(repr(_own(cell)), {})[source.sampling.length] = k

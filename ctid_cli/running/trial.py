@@ -1,9 +1,9 @@
-"""The trial of a specification: what only its first data sets show is found before anything is stored.
+"""Trial of a specification: find errors that only its first data sets show, before anything is stored.
 
-The first data set of each setting is made, and every estimator is prepared on it. Custom components are tried in a
-process of their own, under limits and twice, with the global random generators in two states: what comes out otherwise
-the second time could not be repeated. Custom estimators are fitted to the first data set as well. A component that ends
-its process, or takes too long, is left to the run, which stores that for every estimate.
+The first data set of each setting is simulated, and every estimator prepared on it. Custom components are tried in a
+separate process, under limits and twice, with the global random generators in two states: results that differ the
+second time are not reproducible. Custom estimators are also fitted to the first data set. A component that ends its
+process, or takes too long, is left to the run, which stores the failure for every estimate.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ from ctid_cli.storage.columns import FAILURES
 from ctid_cli.storage.manifest import true_values
 from ctid_cli.storage.truth import found_of_rows
 
-#: Samples of the data sets that are made, and time after which no other is begun [s].
+#: Total number of samples of the simulated data sets, and time after which no further one is begun [s].
 MAX_TRIAL_SAMPLES = 20_000_000
 MAX_SECONDS = 30.0
-#: Wall time that the process of custom components may take where there is no limit [s].
+#: Wall time limit of the process of custom components if there is no other limit [s].
 PATIENCE = 600.0
-#: The data sets among what is tried; no estimator has an empty name.
+#: Name for the data sets among the tried parts; estimator names are never empty.
 _DATA = ""
-#: Errors of a program, which no other data set would mend.
+#: Programming errors, which are independent of the data set.
 MISTAKES = (NameError, AttributeError, TypeError, ImportError)
-#: What depends on the state of the global generators is another thing each time that it is computed.
+#: Results that depend on the state of the global generators differ in every computation.
 GLOBAL = "depends on the global random state, so that no run could be repeated; draw from"
 
 
@@ -66,19 +66,19 @@ def load_tried(
     allow_code: bool = False,
     allow_outside: bool = False,
 ) -> Spec:
-    """Read, check and try a specification, for a run."""
+    """Read, check and try a specification before a run."""
     return load_spec(given, overrides, allow_code=allow_code, allow_outside=allow_outside, trial=try_out)
 
 
 class Setting(NamedTuple):
-    """One combination of what data sets are made from, and the swept values that tell it from others."""
+    """One combination of data options, and its swept values."""
 
     cell: DataCell
     swept: Mapping[KeyPath, Any]
 
 
 class Candidate(NamedTuple):
-    """An estimator with one combination of its swept options, and a start that it takes."""
+    """An estimator with one combination of swept options, and one of its starts."""
 
     name: str
     estimator: Any
@@ -87,21 +87,21 @@ class Candidate(NamedTuple):
 
     @property
     def is_custom(self) -> bool:
-        """Whether its class is not one of ctid's."""
+        """Whether its class is custom."""
         return is_custom(getattr(self.estimator, "options", None))
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a trial has found."""
+    """Result of a trial."""
 
-    #: What must be mended, and what may be right with other data.
+    #: Errors to correct, and problems that may not occur with other data.
     wrong: list[Complaint] = field(default_factory=list)
     odd: list[Complaint] = field(default_factory=list)
 
 
 def try_out(spec: Spec) -> Found:
-    """Try the settings and estimators of a specification; sections that have mistakes are not in it."""
+    """Try the settings and estimators of a specification without the sections that have errors."""
     settings, candidates = _settings(spec), list(_candidates(spec))
     success = {} if spec.success is None else spec.success.model_dump()
     custom_data = any(_custom_parts(setting.cell.source) for setting in settings)
@@ -109,7 +109,7 @@ def try_out(spec: Spec) -> Found:
         return _try_all(settings, candidates, success)
     limits = Limits() if spec.limits is None else Limits(**spec.limits.model_dump())
     found = None
-    # What ends its process, or cannot be sent to one, is left to the run.
+    # Components that end their process, or cannot be sent to one, are left to the run.
     with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made, suppress(Exception):
         folder = Path(made)
         found = call_alone(folder, _try_under_limits, limits, folder / "late", settings, candidates, success)[0]
@@ -117,12 +117,12 @@ def try_out(spec: Spec) -> Found:
 
 
 def _settings(spec: Spec) -> list[Setting]:
-    """Return the distinct settings, each with the first level of the noise: the others decide on nothing else."""
+    """Return the distinct settings, each with the first noise level, because other levels make no difference here."""
     parts = data_parts(spec)
     if spec.signal is None and spec.data is None and spec.inputs is None:
         if spec.loop is None and spec.excitation is None:
             return []
-        # The other sections are tried although the system is wrong.
+        # The other sections are tried even if the system is wrong.
         parts.setdefault(("system",), [Variant({}, {}, TransferFunction([1.0], [1.0, 1.0]))])
     if spec.data is None and spec.sampling is None:
         return []
@@ -150,11 +150,11 @@ def _candidates(spec: Spec) -> Iterator[Candidate]:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# In this process, or in that of custom components
+# In this process, or in the process of custom components
 
 
 def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
-    """Try custom components within the limits of an estimate."""
+    """Try custom components under the limits of an estimate."""
     if limits.wall_seconds is None:
         limits = replace(limits, wall_seconds=PATIENCE)
     with late.open("wb") as watched:
@@ -165,9 +165,9 @@ def _try_under_limits(limits: Limits, late: Path, *given: Any) -> Found:
 
 
 def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], success: Mapping[str, Any]) -> Found:
-    """Make the first data set of each setting, and prepare every estimator on it."""
+    """Simulate the first data set of each setting, and prepare every estimator on it."""
     found, end = Found(), time.monotonic() + MAX_SECONDS
-    #: What is wrong with the data, and with each estimator by its name, and the swept values that were tried.
+    #: Problems of the data, and of each estimator by name, with the swept values that were tried.
     failures: dict[str, list[Failure]] = defaultdict(list)
     tried: dict[str, list[Mapping[KeyPath, Any]]] = defaultdict(list)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -193,13 +193,13 @@ def _try_all(settings: Sequence[Setting], candidates: Sequence[Candidate], succe
 
 
 def _custom_parts(source: Any) -> dict[str, Any]:
-    """Return the custom components that make a data set, by their places, in the order of their work."""
+    """Return the custom components of a data set by their places, in the order of use."""
     parts = source.parts if isinstance(source, SimulatedSource) else {}
     return {place: part for place, part in parts.items() if is_custom(part)}
 
 
 def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
-    """Return the first data set of a source; or None, and why it cannot be made if its sections are to blame."""
+    """Return the first data set of a source; or None, and the problems if its sections cause the error."""
     custom = _custom_parts(source)
     try:
         if isinstance(source, SimulatedSource):
@@ -208,7 +208,7 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
     except DataError as error:
         at = tuple(error.section.split(".")) if error.section else ()
         return None, [((*at, "kind") if error.section in custom else at, str(error))]
-    except Exception:  # of which a run says more: it is stored with every estimate
+    except Exception:  # a run reports it with every estimate
         return None, []
 
     def excited(r: Any) -> Any:
@@ -229,12 +229,12 @@ def _first_data(source: Any) -> tuple[Any, list[Complaint]]:
 
 
 def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
-    """Return what is computed with the global generators in two states; only once what takes long."""
+    """Compute something with the global generators in two states, or once if it takes long."""
     results = []
     for seed in (0, 1):
         begun = time.monotonic()
         random.seed(seed)
-        np.random.seed(seed)  # noqa: NPY002 - the one that must not matter
+        np.random.seed(seed)  # noqa: NPY002 - results must not depend on it
         results.append(compute())
         if time.monotonic() - begun > MAX_SECONDS:
             break
@@ -242,12 +242,12 @@ def _twice(compute: Callable[[], Any]) -> tuple[Any, Any]:
 
 
 def _unusable(estimator: Any, data: Any) -> str:
-    """Say why an estimator cannot use a record at all; empty where it can."""
+    """Return why an estimator cannot use a record; empty if it can."""
     try:
         estimator.prepare(data.record)
     except (DataError, OptionError) as error:
         return str(error)
-    except Exception:  # of which a run says more: it is stored with every estimate
+    except Exception:  # a run reports it with every estimate
         return ""
     return ""
 
@@ -260,7 +260,7 @@ def _fit(
     success: Mapping[str, Any],
     found: Found,
 ) -> None:
-    """Fit an estimator to the first data set, with custom measures, as a run does."""
+    """Fit an estimator to the first data set, with custom measures, as in a run."""
     path: KeyPath = ("estimators", candidate.name, "kind")
     cell, terms = setting.cell, structure(setting.cell.source, estimators)
 
@@ -280,7 +280,7 @@ def _fit(
     except MISTAKES as error:
         found.wrong.append((path, f"fails on the first data set: {reason(error)}"))
     except BaseException as error:
-        # Of another kind of failure others may be free.
+        # Other data sets may not have such a failure.
         text = f"fails on the first data set: {reason(error)}; such estimates are stored as FAILED"
         found.odd.append((path, text))
     else:
@@ -294,7 +294,7 @@ def _fit(
 
 
 def _uncounted(row: Mapping[str, Any], truth: Mapping[str, float], success: Mapping[str, Any]) -> Iterator[str]:
-    """Say that an estimate has nothing that a true value, or the rule of success, can be compared with."""
+    """Yield the reasons why an estimate cannot be compared with true values or the success rule."""
     lacks = dict(zip(truth, np.isnan(found_of_rows([row], truth).values[0]).tolist(), strict=True))
     if truth and all(lacks.values()):
         names = ", ".join(row["parameters"] or {}) or "a model with another number of poles"

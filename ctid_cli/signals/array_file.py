@@ -1,6 +1,6 @@
-"""Columns from MATLAB and HDF5 files that hold plain arrays, read in a process of its own.
+"""Columns from MATLAB and HDF5 files of plain arrays, read in a separate process.
 
-Some damaged files crash the libraries that read them.
+Some damaged files crash the reading libraries.
 """
 
 import faulthandler
@@ -24,12 +24,12 @@ from ctid_cli.signals.hdf5 import hdf5_arrays, text_of
 from ctid_cli.signals.table import Columns, Table
 
 MATLAB, HDF5 = (".mat",), (".h5", ".hdf5")
-#: Seconds that reading may take, and bytes a second of the slowest disk.
+#: Minimum time limit of reading [s], and speed of the slowest disk [bytes/s].
 LEAST_PATIENCE, SLOWEST = 50.0, 5e6
 
 
 def read_array_table(path: str | os.PathLike[str]) -> Table:
-    """Read the variables of a MATLAB file, or the data sets of an HDF5 file, which has a unit as attribute ``unit``."""
+    """Read the variables of a MATLAB file, or the data sets of an HDF5 file; an attribute ``unit`` gives the unit."""
     file = require_file(path, f" the file is empty; {_how_to_save(path)}")
     told, vectors = _read_in_own_process(path, file)
     if "refused" in told:
@@ -50,11 +50,11 @@ def read_array_table(path: str | os.PathLike[str]) -> Table:
 
 
 def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return what ``_write_content`` has found; refuse a file that crashes it, or takes too long."""
+    """Return the result of ``_write_content``; refuse a file that crashes it, or takes too long."""
     with TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True) as made:
         folder = Path(made)
         with warnings.catch_warnings():
-            # The process does nothing but this, so that threads of others do not matter.
+            # The process runs only this function, so threads of other processes do not matter.
             warnings.simplefilter("ignore", DeprecationWarning)
             process = multiprocessing.get_context("fork").Process(target=_write_content, args=(path, folder))
             process.start()
@@ -71,8 +71,8 @@ def _read_in_own_process(path: str | os.PathLike[str], file: str) -> tuple[dict[
 
 
 def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
-    """Write the vectors of a file to a folder, and why other variables are none."""
-    faulthandler.disable()  # a crash is no news
+    """Write the vectors of a file to a folder, and the reasons why other variables are not vectors."""
+    faulthandler.disable()  # a crash is expected here
     told: dict[str, Any]
     try:
         arrays, objects = _arrays(path)
@@ -86,7 +86,7 @@ def _write_content(path: str | os.PathLike[str], folder: Path) -> None:
         told = {"refused": str(error)}
     except PermissionError as error:
         told = {"refused": f"cannot be read: {error.strerror}"}
-    except Exception:  # a reader in C meets damage in its own way, memory included; the caller says so
+    except Exception:  # C readers fail on damage in many ways, including memory errors; the caller reports it
         raise SystemExit(1) from None
     (folder / "told.json").write_text(json.dumps(told), encoding="utf-8")
 
@@ -99,9 +99,9 @@ def _arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str
         return hdf5_arrays(path)
     claimed: list[Any] = []
     with warnings.catch_warnings():
-        # Two objects in one file share a placeholder name, which is no concern of the arrays next to them.
+        # Objects in one file share a placeholder name, which does not affect the arrays.
         warnings.simplefilter("ignore")
-        with suppress(Exception):  # objects have no headers of this kind; what else is wrong the reader itself says
+        with suppress(Exception):  # objects have no such headers; the reader itself reports other errors
             claimed = scipy.io.whosmat(path)
         for name, shape, _ in claimed:
             require_values(repr(name), math.prod(shape))
@@ -136,10 +136,10 @@ def _flat(content: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
 
 
 def _vector(value: Any) -> Array:
-    """Return an array as a vector of real numbers; a ValueError says why it is none."""
+    """Return an array as a vector of real numbers; a ValueError gives the reason if it is not one."""
     if hasattr(value, "toarray"):
         try:
-            # Indices are looked at before anything is written to where they say.
+            # Indices are checked before they are used for writing.
             value.tocsc().check_format(full_check=True)
             value = value.toarray()
         except (ValueError, MemoryError):

@@ -1,15 +1,15 @@
-r"""A signal without power above half its sampling frequency, as straight lines on a finer clock.
+r"""Signals without power above half the sampling frequency, as straight lines on a finer clock.
 
-Between its samples such a signal is ``sum_k u_k sinc((t - t_k)/h)``, which no exact pass takes. Straight lines between
-points h/4 apart do, if the points are chosen so that the lines have the spectrum of the signal below half the sampling
-frequency: lines damp a wave ``exp(jwt)`` by ``sinc(w h/8)^2``, so the points are those of the signal over that factor.
-What is left are the images of the finer clock, around multiples of 4 sampling frequencies. Behind a system they are
-``(w/(4 w_s - w))^2 |G(4 w_s - w)/G(w)|`` of the response to the frequency w: one or two ten thousandths of the output
-at most, where lines through the samples themselves are wrong by hundredths.
+Between its samples such a signal is ``sum_k u_k sinc((t - t_k)/h)``, for which there is no exact simulation. There is
+one for straight lines between points h/4 apart, and the points are chosen so that the lines have the spectrum of the
+signal below half the sampling frequency: lines attenuate a wave ``exp(jwt)`` by ``sinc(w h/8)^2``, so the signal is
+divided by that factor. The error consists of the images of the finer clock, around multiples of 4 sampling frequencies.
+After a system they are ``(w/(4 w_s - w))^2 |G(4 w_s - w)/G(w)|`` of the response to the frequency w: one or two ten
+thousandths of the output at most, whereas lines through the samples themselves have errors of hundredths.
 
-The sum runs over all time. Of a periodic signal all is known, and it is formed by Fourier's series. Otherwise it is cut
-off by a Kaiser window after 32 samples, and beyond the ends of a record the signal is taken as mirrored in its last
-sample.
+The sum runs over all time. For a periodic signal it is computed exactly by a Fourier series. Otherwise it is truncated
+by a Kaiser window after 32 samples, and the signal is extended beyond the ends of a record by odd reflection in its
+end samples.
 """
 
 from typing import NamedTuple
@@ -18,29 +18,29 @@ import numpy as np
 
 from ctid_cli.arrays import Array
 
-#: Points of the finer clock in an interval.
+#: Points of the finer clock per interval.
 FINER = 4
-#: Samples on either side that an instant between two samples depends on, and the window that ends there: 80 dB.
+#: Number of samples on each side used for an instant between two samples, and the parameter of their window (80 dB).
 REACH, KAISER = 32, 8.0
-#: Above this fraction of half the sampling frequency, images leak through the window.
+#: Above this fraction of half the sampling frequency, images pass the window.
 PASSED = 0.9
 
 
 class BandLimitedDoubt(NamedTuple):
-    """What is not known of a signal between its samples."""
+    """Uncertainty of a signal between its samples."""
 
-    #: Time from both ends within which the unknown samples beyond matter [s].
+    #: Distance from both ends within which the unknown samples outside matter [s].
     reach: float
-    #: Root mean square of what another guess of these changes there [input unit].
+    #: Root mean square change there under another assumption about these samples [input unit].
     ends: float
-    #: Share of the signal's power too close to half the sampling frequency [-].
+    #: Fraction of the signal's power too close to half the sampling frequency [-].
     beyond: float
 
 
 def finer_values(values: Array, *, periodic: bool) -> Array:
-    """Return points between which straight lines have the spectrum of a signal.
+    """Return points whose connecting straight lines have the spectrum of a signal.
 
-    Of a periodic signal those of one whole period, ``4 N``; otherwise those from the first sample to the last.
+    For a periodic signal they cover one whole period, ``4 N`` points; otherwise the first to the last sample.
     """
     return _of_series(values) if periodic else _of_window(values, "odd")
 
@@ -51,7 +51,7 @@ def values_between(values: Array) -> Array:
 
 
 def finer_times(t: Array, *, periodic: bool) -> Array:
-    """Return the instants of these points; every fourth of them is one of the signal."""
+    """Return the instants of these points; every fourth one is a sampling instant."""
     places = np.arange((t.size - 1) * FINER + 1) / FINER
     times = np.interp(places, np.arange(t.size), t)
     if not periodic:
@@ -61,7 +61,7 @@ def finer_times(t: Array, *, periodic: bool) -> Array:
 
 
 def band_limited_doubt(t: Array, values: Array) -> BandLimitedDoubt:
-    """Return what another guess of the samples beyond the ends changes, and the power near the edge of the band."""
+    """Return the effect of another assumption about samples outside the record, and the power near the band edge."""
     mirrored, held = (_of_window(values, way) for way in ("odd", "constant"))
     edge = min(REACH * FINER, mirrored.size // 2)
     off = np.concatenate([(mirrored - held)[:edge], (mirrored - held)[-edge:]])
@@ -77,13 +77,13 @@ def _of_series(values: Array) -> Array:
     n = values.size
     spectrum = np.fft.rfft(values) / np.sinc(np.arange(n // 2 + 1) / (n * FINER)) ** 2
     if n % 2 == 0:
-        # The line at half the sampling frequency stands for its two neighbours on the finer clock.
+        # The line at half the sampling frequency is divided between two lines on the finer clock.
         spectrum[-1] *= 0.5
     return np.asarray(np.fft.irfft(spectrum, n * FINER) * FINER)
 
 
 def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:
-    """Return points by the windowed sum, the signal beyond its ends mirrored (``odd``) or held at the last sample."""
+    """Return points by the windowed sum; outside, the signal is reflected (``odd``) or held at its end samples."""
     more = REACH + 2
     if beyond == "odd" and values.size > 1:
         longer = np.pad(values, more, mode="reflect", reflect_type="odd")
@@ -93,7 +93,7 @@ def _of_window(values: Array, beyond: str, *, undamped: bool = True) -> Array:
     weights = np.sinc(lags / FINER) * np.kaiser(lags.size, KAISER)
     points = np.zeros((longer.size - 2 * REACH) * FINER)
     for phase in range(FINER):
-        # Together they weigh one, so that a constant stays what it is; the first phase has one more at the end.
+        # Normalised to a sum of one, so that a constant is preserved; the first phase has one more point at the end.
         part = weights[phase::FINER]
         points[phase::FINER] = np.convolve(longer, part / part.sum(), "valid")[int(phase > 0) :]
     # 1/sinc(x/2)^2 = 1 + x^2/12 + x^4/240 + ...: in differences, up to the sixth order in x.

@@ -1,6 +1,6 @@
-"""Checks that the option dataclasses share; each failure is one full sentence for the user.
+"""Checks shared by option dataclasses; each error message is one full sentence.
 
-The sentence begins with the name of the option, or with a label that says more.
+The sentence begins with the name of the option, or with a more specific label.
 """
 
 import math
@@ -15,14 +15,14 @@ import numpy as np
 from ctid_cli.arrays import Array
 from ctid_cli.errors import DataError, OptionError
 
-#: Largest magnitude of a signal, and one over the least that it may reach: squares of squares still are numbers.
+#: Largest magnitude of a signal; its reciprocal is the smallest. Fourth powers of it do not overflow.
 LARGEST = 1e60
-#: The same of times and the steps between them [s]: so are high powers of poles.
+#: Largest magnitude of times and of steps between them [s]; high powers of poles do not overflow.
 LONGEST = 1e24
 
 
 def require_scale(what: str, values: Array, largest: float = LARGEST) -> None:
-    """Refuse a signal in a unit so small or so large that nothing can be computed with it; zeros are allowed."""
+    """Refuse a signal whose unit makes it too small or too large for computation; zeros are allowed."""
     finite = np.abs(values[np.isfinite(values)])
     found = float(finite.max(initial=0.0))
     if found > largest or 0.0 < found < 1.0 / largest:
@@ -31,7 +31,7 @@ def require_scale(what: str, values: Array, largest: float = LARGEST) -> None:
 
 
 def require_steps(what: str, t: Array) -> None:
-    """Refuse a clock that is too fast to compute with."""
+    """Refuse a clock that is too fast for computation."""
     least = float(np.diff(t).min(initial=np.inf))
     if least < 1.0 / LONGEST:
         raise DataError(f"{what} advances by {least:.3g}; give it in a unit in which it is at least {1 / LONGEST:g}")
@@ -50,7 +50,7 @@ def require_not_negative(name: str, value: float, unit: str, label: str = "") ->
 
 
 def require_share(name: str, value: float, label: str = "", *, whole: bool = True) -> None:
-    """Refuse anything but a number above 0, and up to 1 or below it."""
+    """Refuse anything but a number above 0 and at most 1, or below 1."""
     if not _is_number(value) or not 0 < value <= 1 or (value == 1 and not whole):
         most = "at most" if whole else "below"
         raise OptionError(name, f"{label or name} must be a number above 0 and {most} 1 [-], not {value!r}.")
@@ -85,7 +85,7 @@ def require_increasing(name: str, t: Array) -> None:
 
 
 def freeze(owner: object, **values: object) -> None:
-    """Set fields of a frozen dataclass; arrays can no longer be written to."""
+    """Set fields of a frozen dataclass; arrays become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
@@ -93,11 +93,11 @@ def freeze(owner: object, **values: object) -> None:
 
 
 class Checked:
-    """Base of option dataclasses whose annotations say what is allowed.
+    """Base of option dataclasses whose annotations define the allowed values.
 
-    A number is annotated with its check and what that takes after the value, as in
-    ``Annotated[float, require_positive, "s"]``; words are a ``Literal``. Each item of a tuple is checked, which may be
-    given as a list.
+    A number is annotated with its check and the further arguments of the check, as in
+    ``Annotated[float, require_positive, "s"]``; words are a ``Literal``. Each item of a tuple is checked, and lists are
+    accepted as tuples.
     """
 
     def __post_init__(self) -> None:
@@ -120,7 +120,7 @@ def _checked(name: str, value: Any, hint: Any, label: str = "") -> Any:
         parts[1](name, value, *parts[2:], label=label)
     elif origin is Literal:
         require_choice(name, value, parts)
-    elif origin in (Union, types.UnionType) and value is not None:  # what may be absent too
+    elif origin in (Union, types.UnionType) and value is not None:  # optional values
         return _checked(name, value, parts[0])
     elif origin is tuple:
         return tuple(_checked(name, item, parts[0], f"each of the {name}") for item in value)

@@ -1,4 +1,4 @@
-"""Inputs: each is a frozen dataclass of options that generates a held signal."""
+"""Excitations: each input is a frozen dataclass of options that generates a held signal."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,7 +17,7 @@ from ctid_cli.signals.measurement import read_held_signal
 # fmt: off
 #: Taps of a maximal-length feedback register by its number of stages n: ``c[k + n]`` is the parity of ``c[k]`` and the
 #: ``c[k + tap]``. The polynomial 1 + sum of x^(n - tap) + x^n is primitive over GF(2), hence the period is 2^n - 1.
-#: These are the customary choices with two or four taps (P. Alfke, Xilinx application note XAPP 052, 1996);
+#: These are common choices with two or four taps (P. Alfke, Xilinx application note XAPP 052, 1996);
 #: the tests verify every period.
 TAPS: dict[int, tuple[int, ...]] = {
     2: (1,), 3: (1,), 4: (1,), 5: (2,), 6: (1,), 7: (1,), 8: (2, 3, 4), 9: (4,), 10: (3,), 11: (2,),
@@ -25,15 +25,15 @@ TAPS: dict[int, tuple[int, ...]] = {
     19: (13, 17, 18), 20: (3,),
 }
 # fmt: on
-#: A positive number, or the clock of the sampling.
+#: A positive number, or None for the sampling clock.
 ClockPeriod = Annotated[float, checks.require_positive, "s"] | None
 
 
 class Excitation(ABC):
-    """An input: options that generate a held signal."""
+    """An input: a class of options that generates a held signal."""
 
     kind: ClassVar[str]
-    #: Whether nothing is drawn, so that a specification needs no seed for it.
+    #: Whether no random numbers are drawn, so that a specification needs no seed.
     deterministic: ClassVar[bool] = False
 
     @abstractmethod
@@ -45,7 +45,7 @@ class Excitation(ABC):
         sample_times : ndarray, shape (N,)
             Sampling instants [s]; the first and the last bound the signal.
         rng : numpy.random.Generator
-            Source of whatever is random in it.
+            Source of all random numbers.
 
         Returns
         -------
@@ -55,19 +55,19 @@ class Excitation(ABC):
         Raises
         ------
         DataError
-            If the signal cannot be had over these instants.
+            If the signal cannot be generated over these instants.
         """
 
 
-# --- the clock of an input ------------------------------------------------------------------------------------------
+# --- clock of an input ----------------------------------------------------------------------------------------------
 
 
 def clock_instants(sample_times: Array, period: float | None) -> Array:
-    """Return the instants at which an input takes a new value, from the first sample to the last."""
+    """Return the instants at which an input changes its value, from the first sample to the last."""
     if period is None:
         return sample_times
     duration = float(sample_times[-1] - sample_times[0])
-    # An edge that coincides with the last sample counts, on whichever side rounding puts it.
+    # An edge at the last sample counts, even if rounding places it later.
     ticks = math.floor(duration / period + COINCIDENCE) + 1
     return np.asarray(sample_times[0] + period * np.arange(ticks))
 
@@ -94,11 +94,11 @@ class Prbs(checks.Checked, Excitation):
     clock_period : float
         Time for which each value is held [s]; independent of the sampling.
     amplitude : float, default 1.0
-        The signal is plus or minus this [input unit].
+        Amplitude: the signal is plus or minus this value [input unit].
 
     Notes
     -----
-    The register's state at the start is drawn at random, zero excluded, so each data set has another phase of
+    The initial state of the register is random, zero excluded, so each data set has another phase of
     the same sequence. Over one period the two values differ in number by one, and the autocorrelation is
     amplitude^2 at lag zero and -amplitude^2 / (2^n - 1) at all other multiples of the clock period.
 
@@ -119,7 +119,7 @@ class Prbs(checks.Checked, Excitation):
     amplitude: Annotated[float, checks.require_positive, "input unit"] = 1.0
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the sequence on its clock from the first instant on; the first state of the register is drawn."""
+        """Return the sequence on its clock, starting at the first instant; the initial register state is random."""
         clock = clock_instants(sample_times, self.clock_period)
         bits = maximal_length_sequence(self.stages, clock.size, int(rng.integers(1, 2**self.stages)))
         return HeldSignal(clock, np.where(bits == 1, self.amplitude, -self.amplitude))
@@ -136,7 +136,7 @@ class Gbn(checks.Checked, Excitation):
     switching_probability : float, default 0.5
         Probability of a change at each tick [-], above 0 and at most 1. At 0.5 the values are independent.
     amplitude : float, default 1.0
-        The signal is plus or minus this [input unit].
+        Amplitude: the signal is plus or minus this value [input unit].
 
     Notes
     -----
@@ -154,7 +154,7 @@ class Gbn(checks.Checked, Excitation):
     amplitude: Annotated[float, checks.require_positive, "input unit"] = 1.0
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the values on their clock from the first instant on; the first value and all changes are drawn."""
+        """Return the values on their clock, starting at the first instant; first value and changes are random."""
         clock = clock_instants(sample_times, self.clock_period)
         drawn = rng.random(clock.size)
         changes = np.concatenate(([drawn[0] < 0.5], drawn[1:] < self.switching_probability))
@@ -184,7 +184,7 @@ class Gaussian(checks.Checked, Excitation):
         return HeldSignal(clock, self.standard_deviation * rng.standard_normal(clock.size))
 
 
-# --- inputs that are given ------------------------------------------------------------------------------------------
+# --- given inputs ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -194,9 +194,9 @@ class Step(checks.Checked, Excitation):
     Parameters
     ----------
     amplitude : float, default 1.0
-        Height, not zero [input unit].
+        Height [input unit], not zero.
     time : float, default 0.0
-        When it happens [s]; at 0 the input is already high at the first sample.
+        Time of the step [s]; at 0 the input is already high at the first sample.
     """
 
     kind: ClassVar[str] = "step"
@@ -211,7 +211,7 @@ class Step(checks.Checked, Excitation):
             raise OptionError("amplitude", "amplitude must not be zero [input unit]: such a step excites nothing.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the step, which must come before the last instant; nothing is drawn."""
+        """Return the step, which must occur before the last instant; no random numbers are drawn."""
         return Steps((self.time,), (self.amplitude,)).generate(sample_times, rng)
 
 
@@ -222,7 +222,7 @@ class Steps(checks.Checked, Excitation):
     Parameters
     ----------
     times : tuple of float
-        When the values begin [s], increasing; the input is zero before the first one.
+        Start times of the values [s], increasing; the input is zero before the first one.
     levels : tuple of float
         The values [input unit], as many as times; each is held until the next one.
 
@@ -249,12 +249,12 @@ class Steps(checks.Checked, Excitation):
             raise OptionError("times", f"times must increase from 0 s on; they are {list(self.times)} s.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the staircase, whose first step must come before the last instant; nothing is drawn."""
+        """Return the staircase, whose first step must occur before the last instant; no random numbers are drawn."""
         start, end = float(sample_times[0]), float(sample_times[-1])
         if self.times[0] >= end:
             which = f"the {'first ' * (len(self.times) > 1)}step at {self.times[0]:g} s"
             raise DataError(f"{which} comes too late for a record that ends at {end:g} s")
-        # What begins after the record, or ends before it, is not applied.
+        # Values that begin after the record, or end before it, are not used.
         times = np.array([-np.inf, *self.times])
         used = slice(
             int(np.searchsorted(times, start, side="right")) - 1, int(np.searchsorted(times, end, side="right"))
@@ -275,14 +275,14 @@ class InputFile(checks.Checked, Excitation):
     input : str, default "u"
         Column of the values [input unit].
     hold : {"zoh", "foh", "band-limited"}, default "zoh"
-        How the input behaves between its breaks.
+        Interpolation of the input between its breaks.
     sha256 : str, optional
-        SHA-256 of the file, to make sure of its content; a specification fills it in from the file.
+        Expected SHA-256 of the file; a specification takes it from the file.
 
     Notes
     -----
-    The input is zero before the file's first instant and keeps its last value after the last one. The file's
-    clock is the record's: what lies before the first sample is not applied.
+    The input is zero before the file's first instant and keeps its last value after the last one. The file and
+    the record have the same time axis: values before the first sample are not used.
     """
 
     kind: ClassVar[str] = "file"
@@ -300,13 +300,13 @@ class InputFile(checks.Checked, Excitation):
             raise OptionError("input", f"time and input must be two columns; both are {self.time!r}.")
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the file's signal from the first instant on; nothing is drawn."""
+        """Return the file's signal, starting at the first instant; no random numbers are drawn."""
         whole = read_held_signal(self.file, time=self.time, input=self.input, hold=self.hold)
         start, end = float(sample_times[0]), float(sample_times[-1])
         if whole.t[0] >= end:
             begins = f"the input begins at {whole.t[0]:g} s, and the record ends at {end:g} s"
             raise DataError(f"{self.file}: {begins}; shift the file's times or take more samples")
-        # One break beyond the end stays: straight lines need it.
+        # One break beyond the end is kept for interpolation.
         stop = int(np.searchsorted(whole.t, end)) + 1
         times, values = whole.t[:stop], whole.values[:stop]
         if times[0] < start:

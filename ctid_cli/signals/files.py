@@ -1,4 +1,4 @@
-"""Untrusted files: ordinary ones only, of bounded size, and where they may lie."""
+"""Checks of untrusted files: ordinary files only, of bounded size, in allowed folders."""
 
 import os
 import stat
@@ -6,14 +6,14 @@ from pathlib import Path
 
 from ctid_cli.errors import DataError
 
-#: Bytes of the largest data file; ten million samples with all their digits need less.
+#: Maximum size of a data file [bytes]; ten million samples with all digits need less.
 MAX_FILE_BYTES = 2_000_000_000
-#: Numbers of the largest array in a file, whatever its header says of them.
+#: Maximum number of values of an array in a file, whatever its header declares.
 MAX_VALUES = 100_000_000
-#: Letters of a file that a message repeats, and names that it lists.
+#: Maximum number of characters from a file, and of names, in a message.
 MAX_LETTERS, MAX_NAMES = 24, 20
 
-#: Copies of files that this process was sent, by the SHA-256 of their content.
+#: Paths of transferred copies of files, by the SHA-256 of their content.
 COPIES: dict[str, str] = {}
 
 _KINDS = {
@@ -26,9 +26,9 @@ _KINDS = {
 
 
 def require_file(path: str | os.PathLike[str], empty: str = " the file is empty") -> str:
-    """Refuse what is no ordinary file, before it is opened: a pipe waits for ever, a device never ends.
+    """Refuse anything but an ordinary file before it is opened: reading a pipe or a device may never end.
 
-    The system's own files on processes and devices say that they are empty, so that they are never read.
+    System files on processes and devices report size zero, so they are refused as empty.
     """
     file = os.fspath(path)
     try:
@@ -49,19 +49,19 @@ def require_file(path: str | os.PathLike[str], empty: str = " the file is empty"
 
 
 def require_values(what: str, count: int) -> None:
-    """Refuse an array whose header asks for more memory than any record needs."""
+    """Refuse an array whose header declares more memory than any record needs."""
     if count > MAX_VALUES:
         raise DataError(f"{what} claims to hold {count} values; at most {MAX_VALUES} are read")
 
 
 def is_inside(path: str | os.PathLike[str], folder: Path) -> bool:
-    """Whether a file lies in a folder or below it, links followed."""
+    """Return whether a file lies in a folder or below it, after following links."""
     try:
         return Path(path).resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # links that go round in circles, a zero byte
+    except (OSError, RuntimeError, ValueError):  # circular links, a zero byte
         return False
 
 
 def quoted(text: str) -> str:
-    """What a file holds, as a message may repeat it: short, on one line."""
+    """Return text from a file in a form for messages: short, on one line."""
     return repr(text) if len(text) <= MAX_LETTERS else f"a text of {len(text)} characters"

@@ -1,4 +1,4 @@
-"""A measured frequency response as data that a model can be fitted to, and the tables that it is read from."""
+"""Measured frequency responses as data for estimation, and reading them from tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctid_cli.signals.table import Table, split_header
 from ctid_cli.signals.treatment import Weight
 from ctid_cli.text import listed
 
-#: Names by which columns are recognised; case is ignored.
+#: Column names by role; case is ignored.
 NAMES: dict[str, tuple[str, ...]] = {
     "frequency": ("frequency", "frequencies", "freq", "f", "omega", "w"),
     "real": ("real", "re"),
@@ -27,15 +27,15 @@ NAMES: dict[str, tuple[str, ...]] = {
     "gain": ("gain", "magnitude", "mag", "amplitude", "gain_db", "magnitude_db", "mag_db"),
     "phase": ("phase", "angle", "phase_deg", "phase_rad"),
     "standard_error": ("standard_error", "se"),
-    #: Those of ``ctid frf``: interval of the hold that was divided out, whether lines share samples, and the degrees of
+    #: Columns of ``ctid frf``: interval of the hold that was divided out, whether lines share samples, and degrees of
     #: freedom of the standard errors.
     "hold_interval": ("hold_interval",),
     "correlated": ("correlated",),
     "freedom": ("freedom",),
 }
-#: Prefixes of hertz.
+#: Units of frequency as multiples of hertz.
 HERTZ = {"hz": 1.0, "mhz": 1e-3, "khz": 1e3, "ghz": 1e9}
-#: A line may be this fraction beyond half the sampling frequency.
+#: Relative tolerance by which a line may exceed half the sampling frequency.
 ROUNDING = 1e-9
 
 
@@ -48,32 +48,32 @@ class FrequencyData:
     frequencies : array_like, shape (K,)
         Frequencies [rad/s], none below zero; lines are sorted by them.
     response : array_like of complex, shape (K,)
-        Values ``G(jw)`` [output unit/input unit]; with an interval those of samples, ``Y/U`` of the sampled output and
-        of the samples of an input that is constant between them.
+        Values ``G(jw)`` [output unit/input unit]; with an interval, ``Y/U`` of the sampled output and the
+        sampled input, which is constant between samples.
     standard_error : array_like, shape (K,), optional
         ``sqrt(E |e|^2)`` of the error of each complex value [output unit/input unit].
     interval : float, default 0.0
-        Sampling interval [s] of such samples; 0 where the values are ``G(jw)``.
+        Sampling interval [s] of such values; 0 for ``G(jw)``.
     correlated : bool, default False
-        Whether neighbouring lines have errors in common, as those of local polynomials and of Welch's method have.
+        Whether errors of neighbouring lines are correlated, as with local polynomials and Welch's method.
     freedom : float, default infinite
-        Degrees of freedom of the complex residuals that the standard errors are from, their median over the lines [-];
-        infinite where standard errors are known.
+        Degrees of freedom of the complex residuals used for the standard errors, median over the lines [-];
+        infinite if the standard errors are known.
     weight : {"inverse", "inverse-sqrt", "none"}, default "none"
-        What the errors of lines without standard errors are multiplied by: the reciprocal of the measured gain, which
-        makes them relative, that of its square root, or one. Weights by a gain that is not large beside its noise bias
-        an estimate.
+        Factor of the errors of lines without standard errors: the reciprocal of the measured gain (relative errors),
+        of its square root, or one. Weighting by a gain that is not large compared with its noise biases an
+        estimate.
     name : str, default ""
-        What messages call the data.
+        Name of the data in messages.
     units : tuple of str, default ("s", "out", "in")
         Units of time, output and input.
     notes : tuple of str, default ()
-        What reading them has shown.
+        Notes from reading the data.
 
     Raises
     ------
     DataError
-        If the arrays differ in length or hold a number that cannot be used.
+        If the arrays differ in length or contain unusable numbers.
 
     Examples
     --------
@@ -138,7 +138,7 @@ class FrequencyData:
 def held_data(
     frequencies: Array, response: ComplexArray, standard_error: Array, interval: float, **others: Any
 ) -> FrequencyData:
-    """Return the values of samples from those that the response of a zero-order hold was divided out of."""
+    """Return the values for the sampled output from a response that was divided by that of a zero-order hold."""
     factor = hold_factor("zoh", frequencies, interval)
     return FrequencyData(frequencies, response * factor, standard_error * np.abs(factor), interval, **others)
 
@@ -147,7 +147,7 @@ def held_data(
 
 
 def is_frequency_table(path: str | os.PathLike[str]) -> bool:
-    """Return whether the header of a file names frequencies and complex values at them."""
+    """Return whether the header of a file names columns of frequencies and complex values."""
     found = _named(open_table(path))
     return "frequency" in found and ({"real", "imaginary"} <= found.keys() or {"gain", "phase"} <= found.keys())
 
@@ -161,20 +161,20 @@ def read_frequency_data(
     ----------
     path : path
         A text, MATLAB or HDF5 file with columns ``frequency`` [Hz or rad/s], and ``real`` and ``imaginary``, or
-        ``gain`` [- or dB] and ``phase`` [deg or rad]; with ``standard_error`` the square root of ``E |e|^2`` of the
-        complex value. Comments ``# hold: zoh`` and ``# interval: 0.05`` say that the values are those of samples.
+        ``gain`` [- or dB] and ``phase`` [deg or rad]; optional ``standard_error`` is the square root of ``E |e|^2`` of
+        the complex value. Comments ``# hold: zoh`` and ``# interval: 0.05`` mark values of the sampled output.
     low, high : float, optional
         First and last frequency to use [unit of the file].
 
     Returns
     -------
     FrequencyData
-        The lines; those without a value are left out, and a note says so.
+        The lines; lines without a value are left out, with a note.
 
     Raises
     ------
     DataError
-        If the file is no such table.
+        If the file is not such a table.
     """
     table = open_table(path)
     chosen = _named(table)
@@ -211,7 +211,7 @@ def read_frequency_data(
 
 
 def _named(table: Table) -> dict[str, str]:
-    """Return the first column of each role by its name."""
+    """Return the first matching column of each role."""
     found: dict[str, str] = {}
     for name in table.names:
         bare = split_header(name)[0].rpartition(".")[2] if not table.is_text else split_header(name)[0]
@@ -222,10 +222,10 @@ def _named(table: Table) -> dict[str, str]:
 
 
 def _rate(table: Table, name: str) -> tuple[float, str]:
-    """Return what makes rad per unit of time of a frequency, and that unit."""
+    """Return the factor from a frequency unit to rad per unit of time, and that unit of time."""
     unit = (split_header(name)[1] or "").strip()
     if unit.lower() in HERTZ:
-        # Millihertz and megahertz differ by their capital only.
+        # Millihertz and megahertz differ only in case.
         return 2.0 * math.pi * (1e6 if unit.startswith("MH") else HERTZ[unit.lower()]), "s"
     found = re.fullmatch(r"rad(?:ians?)?\s*(?:/|per)\s*(\S+)", unit)
     if found is None:
@@ -237,7 +237,7 @@ def _rate(table: Table, name: str) -> tuple[float, str]:
 
 
 def _complex(table: Table, chosen: dict[str, str], values: dict[str, Array], pair: tuple[str, str]) -> ComplexArray:
-    """Return complex values from real and imaginary part, or from gain and phase in their units."""
+    """Return complex values from real and imaginary part, or from gain and phase with their units."""
     first, second = (values[role] for role in pair)
     if pair == ("real", "imaginary"):
         return np.asarray(first + 1j * second)
@@ -253,7 +253,7 @@ def _complex(table: Table, chosen: dict[str, str], values: dict[str, Array], pai
 
 
 def _sampled(table: Table, time_unit: str) -> float | None:
-    """Return the interval of samples that the comments of a file tell; 0 of G(jw), None where they say nothing."""
+    """Return the sampling interval from the comments of a file; 0 for G(jw), None if not stated."""
     said: dict[str, tuple[int, str]] = {}
     for line, text in table.comments:
         found = re.fullmatch(r"\s*(?:#|%|//)\s*(hold|interval)\s*[:=]\s*(.*?)\s*", text, re.IGNORECASE)

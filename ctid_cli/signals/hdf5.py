@@ -1,4 +1,4 @@
-"""Untrusted HDF5 files: only plain arrays in the file itself, of bounded size."""
+"""Reading of untrusted HDF5 files: only plain arrays in the file itself, of bounded size."""
 
 import itertools
 import os
@@ -10,20 +10,20 @@ import numpy as np
 from ctid_cli.errors import DataError
 from ctid_cli.signals.files import MAX_FILE_BYTES, MAX_VALUES
 
-#: Groups in groups, members of a file, and bytes of an attribute.
+#: Maximum depth of groups, number of members of a file, and bytes of an attribute.
 MAX_DEPTH, MAX_MEMBERS, MAX_ATTRIBUTE = 16, 1_000_000, 1_000_000
-#: Kinds of NumPy's types that hold plain numbers, or text of a fixed length.
+#: NumPy type kinds of plain numbers and text of fixed length.
 PLAIN = "biufcS"
-#: Data sets of a file of columns, and letters of a unit.
+#: Maximum number of data sets of a file of columns, and of characters of a unit.
 MAX_DATA_SETS, MAX_UNIT = 10_000, 60
-#: What MATLAB calls arrays of real numbers.
+#: MATLAB class names of arrays of real numbers.
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
 
 def _items(
     group: Any, name: str = "", depth: int = 0, counter: Iterator[int] | None = None
 ) -> Iterator[tuple[str, Any]]:
-    """Return all groups and data sets by their path; refuse links, external data and numbers beyond all bounds."""
+    """Yield all groups and data sets with their paths; refuse links, external data and unbounded sizes."""
     import h5py
 
     counter = counter or itertools.count()
@@ -49,13 +49,13 @@ def _items(
 
 def _require_small_attributes(item: Any, name: str) -> None:
     for key in item.attrs:
-        # A scalar text has the size of a pointer here; HDF5 itself bounds its length.
+        # The reported size of a scalar text is that of a pointer; HDF5 itself limits its length.
         if item.attrs.get_id(key).get_storage_size() > MAX_ATTRIBUTE:
             raise DataError(f"the attribute {key[:60]!r} of {name[:60] or '/'!r} is too large")
 
 
 def require_plain_tree(group: Any) -> None:
-    """Refuse a file of which any part is not plain, before any of it is read."""
+    """Refuse a file with any part that is not plain, before reading any of it."""
     total = 0
     for path, item in _items(group):
         if hasattr(item, "dtype"):
@@ -67,9 +67,9 @@ def require_plain_tree(group: Any) -> None:
 
 
 def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the arrays of a file by name and unit, and the classes of MATLAB objects in it by name.
+    """Return the arrays of a file and their units by name, and the classes of MATLAB objects by name.
 
-    MATLAB writes version 7.3 as HDF5, where strings, structs and objects are told apart by attributes.
+    MATLAB writes version 7.3 as HDF5, where attributes distinguish strings, structs and objects.
     """
     import h5py
 
@@ -78,7 +78,7 @@ def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str,
     with h5py.File(path, "r") as store:
         for place, item in _items(store):
             name, kind = place.replace("/", "."), text_of(item.attrs.get("MATLAB_class", b"double"))
-            # What begins with # is MATLAB's own store of what objects and cells refer to.
+            # Names with # are MATLAB's storage for the content of objects and cells.
             if name.startswith(("#", *(f"{known}." for known in objects))):
                 continue
             if "MATLAB_object_decode" in item.attrs:
@@ -95,7 +95,7 @@ def hdf5_arrays(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str,
 
 
 def text_of(value: Any) -> str:
-    """Return an attribute, or a field of MATLAB's, as text; nothing where it is several."""
+    """Return an attribute, or a MATLAB field, as text; empty if it has several values."""
     if isinstance(value, np.ndarray):
         value = value.item() if value.size == 1 else ""
     return value.decode("latin1") if isinstance(value, bytes) else str(value)

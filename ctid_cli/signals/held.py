@@ -1,4 +1,4 @@
-"""Signals that are held between known instants: the only kind of input an exact simulation needs."""
+"""Signals held between known instants, which allow exact simulation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ctid_cli.signals.band_limited import finer_times, finer_values, values_betw
 from ctid_cli.signals.checks import freeze, require_increasing
 from ctid_cli.signals.treatment import Hold as Hold
 
-#: Instants closer than this fraction of the shortest break interval count as the same instant.
-#: Products such as ``k * 0.05`` and ``j * 0.5`` name one instant and differ in the last bit.
+#: Instants closer than this fraction of the shortest break interval count as the same instant: ``k * 0.05`` and
+#: ``j * 0.5`` may be the same instant and differ in the last bit.
 COINCIDENCE = 1e-9
-#: A clock counts as regular when no instant is further than this fraction of the interval from its place.
+#: A clock counts as regular if all instants are within this fraction of the interval from the regular grid.
 REGULARITY = 1e-7
 
 
@@ -28,7 +28,7 @@ def regular_interval(t: Array) -> float | None:
         return None
     interval = float((t[-1] - t[0]) / (t.size - 1))
     grid = t[0] + interval * np.arange(t.size)
-    # Large times carry their own rounding, which is no sign of an irregular clock.
+    # Large times have rounding errors, which do not make a clock irregular.
     tolerance = REGULARITY * interval + 4 * np.finfo(float).eps * float(np.abs(t).max())
     return interval if float(np.abs(t - grid).max()) <= tolerance else None
 
@@ -79,17 +79,17 @@ class HeldSignal:
 
     @cached_property
     def slack(self) -> float:
-        """Instants closer than this count as the same [s]."""
+        """Tolerance for instants that count as the same [s]."""
         return COINCIDENCE * float(np.diff(self.t).min()) if self.t.size > 1 else 0.0
 
     @cached_property
     def lines(self) -> HeldSignal:
-        """The signal as exact passes take it: itself, or if it is band-limited, straight lines on a finer clock."""
+        """The signal for exact simulation: itself, or for a band-limited one, straight lines on a finer clock."""
         return self._in_lines(periodic=False)
 
     @cached_property
     def periodic_lines(self) -> HeldSignal:
-        """Lines of a signal that repeats itself one interval after its last sample."""
+        """Straight lines of a signal that repeats one interval after its last sample."""
         return self._in_lines(periodic=True)
 
     def _in_lines(self, *, periodic: bool) -> HeldSignal:
@@ -100,7 +100,7 @@ class HeldSignal:
 
     @cached_property
     def _between(self) -> HeldSignal:
-        """The values of a band-limited signal, close enough together for straight lines."""
+        """The values of a band-limited signal on a clock fine enough for straight lines."""
         return HeldSignal(finer_times(self.t, periodic=False), values_between(self.values), "foh")
 
     @cached_property
@@ -109,7 +109,7 @@ class HeldSignal:
         return float(self.values.mean())
 
     def at(self, times: ArrayLike) -> Array:
-        """Return the signal at given instants, from the right at a jump.
+        """Return the signal at given instants, with the right-hand limit at a jump.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class HeldSignal:
 
 
 def hold_factor(hold: Hold, frequencies: Array, interval: float) -> ComplexArray:
-    """Spectrum of a held input over that of its samples."""
+    """Return the spectrum of a held input divided by that of its samples."""
     across = np.sinc(frequencies * interval / (2 * np.pi))
     if hold == "zoh":
         return np.asarray(across * np.exp(-0.5j * frequencies * interval))

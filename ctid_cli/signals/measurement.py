@@ -1,4 +1,4 @@
-"""A measured record as it is: which columns it comes from, their units, and what was assumed in reading it."""
+"""Measured records with the source columns, their units, and the assumptions made in reading them."""
 
 import os
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ from ctid_cli.signals.table import ROLES, Table, split_header
 from ctid_cli.signals.text_file import read_text_table
 
 Offset = Literal["none", "remove"]
-#: What stands between the units of several inputs.
+#: Separator between the units of several inputs.
 SEPARATOR = ", "
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A record and what is known of the file that it comes from."""
+    """A record with metadata of its file."""
 
     record: Record
     time_unit: str | None
@@ -33,21 +33,21 @@ class Measurement:
     time: str
     input: str
     output: str
-    #: The window that was asked for [time unit].
+    #: Requested window [time unit].
     start: float | None = None
     stop: float | None = None
     notes: tuple[str, ...] = ()
-    #: Its file; None for a record that comes from none.
+    #: File of the record; None if it is not from a file.
     path: Path | None = None
-    #: Column of the reference of its loop, and its samples.
+    #: Reference column of its loop, and its samples.
     reference: str | None = None
     reference_values: Array | None = None
-    #: Columns of all inputs, where there are several; of these, ``input_unit`` has the units with commas between them.
+    #: Columns of all inputs if there are several; then ``input_unit`` has their units separated by commas.
     inputs: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, record: Record) -> "Measurement":
-        """A record of which nothing else is known."""
+        """Return a measurement of a record without metadata."""
         several = tuple(record.held) if record.several else ()
         return cls(record, None, None, None, "t", next(iter(record.held)), "y", inputs=several)
 
@@ -58,7 +58,7 @@ class Measurement:
 
 
 def open_table(path: str | os.PathLike[str]) -> Table:
-    """Open a MATLAB or HDF5 file; what has another name is text."""
+    """Open a MATLAB or HDF5 file by its suffix; any other file as text."""
     return read_array_table(path) if Path(path).suffix.lower() in MATLAB + HDF5 else read_text_table(path)
 
 
@@ -71,7 +71,7 @@ def read_record(
     hold: Hold = "zoh",
     offset: Offset = "none",
 ) -> Record:
-    """Record from a file with one line per instant.
+    """Read a record from a file with one line per instant.
 
     Parameters
     ----------
@@ -84,9 +84,9 @@ def read_record(
     output : str, default "y"
         Column of the output [output unit]; an empty field or NaN is a missing sample.
     hold : {"zoh", "foh", "band-limited"}, default "zoh"
-        How the input behaves between its samples.
+        Interpolation of the input between its samples.
     offset : {"none", "remove"}, default "none"
-        ``remove`` subtracts the mean of the input and the mean of the present output samples.
+        ``remove`` subtracts the means of the input and of the present output samples.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def read_record(
     Raises
     ------
     DataError
-        If the file cannot be used; the message names the file, the line and what to do.
+        If the file cannot be used; the message names the file, the line and the remedy.
     """
     require_choice("offset", offset, get_args(Offset))
     record = read_measurement(path, time=time, input=input, output=output, hold=hold, in_seconds=True).record
@@ -118,12 +118,12 @@ def read_measurement(
     reference: str | None = None,
     in_seconds: bool = False,
 ) -> Measurement:
-    """Read a record from a file, with its units, and the reference of its loop from another column.
+    """Read a record from a file with its units, and optionally the reference of its loop.
 
-    A window is read as if the file had no other lines: the input before it is not used, since the state that it
-    left behind is estimated with the model where that is asked for. Where times must be in seconds, a column that is
-    labelled with another unit is refused unless it is named with that unit. Several inputs are named by their
-    columns, and may have a hold each.
+    Lines outside a window are ignored, including the earlier input, whose effect is an initial state that can be
+    estimated with the model. If times must be in seconds, a time column labelled with another unit is refused unless
+    it is selected by its name including the unit. Several inputs are named by their columns, and may have different
+    holds.
     """
     first, *others = [input] if input is None or isinstance(input, str) else input
     holds = [hold] * (1 + len(others)) if isinstance(hold, str) else hold
@@ -168,12 +168,12 @@ def read_measurement(
 def read_held_signal(
     path: str | os.PathLike[str], *, time: str = "t", input: str = "u", hold: Hold = "zoh"
 ) -> HeldSignal:
-    """Read an input over seconds, from a file whose other columns do not matter."""
+    """Read an input, with times in seconds, ignoring the other columns of a file."""
     require_choice("hold", hold, get_args(Hold))
     columns = open_table(path).select({"time": time, "input": input}, in_seconds=True)
     return HeldSignal(columns.values["time"], columns.input(), hold)
 
 
 def read_instants(path: str | os.PathLike[str], time: str = "t") -> Array:
-    """Read instants in seconds, from a file whose other columns do not matter."""
+    """Read instants in seconds, ignoring the other columns of a file."""
     return open_table(path).select({"time": time}, in_seconds=True).values["time"]

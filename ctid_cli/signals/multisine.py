@@ -1,4 +1,4 @@
-"""Sums of sinusoids as inputs."""
+"""Multisine excitation."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from ctid_cli.signals.held import COINCIDENCE, HeldSignal
 
 Spacing = Literal["linear", "logarithmic"]
 Phases = Literal["random", "schroeder"]
-#: Number of the highest harmonic: of a band that is filled, and otherwise.
+#: Maximum number of harmonics of a full band, and highest harmonic otherwise.
 MAX_FILLED, MAX_HARMONIC = 10_000, 1_000_000
 
 
@@ -26,11 +26,11 @@ class Multisine(checks.Checked, Excitation):
     Parameters
     ----------
     lowest_frequency : float, optional
-        Lower end of the band [rad/s]; the first tone without a period.
+        Lower end of the band [rad/s]; without a period, the first tone.
     highest_frequency : float, optional
         Upper end of the band [rad/s], below pi over the (mean) clock period.
     tones : int, optional
-        Number of tones, spaced over the band; a single one lies at its lower end. With a period, None takes every
+        Number of tones, spaced over the band; a single one lies at its lower end. With a period, None means every
         harmonic in the band.
     amplitude : float, default 1.0
         Root mean square over whole periods of the tones [input unit].
@@ -43,7 +43,7 @@ class Multisine(checks.Checked, Excitation):
     period : float, optional
         Time after which the signal repeats [s]: tones are moved to the nearest harmonics of 2 pi over it.
     phases : {"random", "schroeder"}, default "random"
-        ``random`` draws them anew in every data set; ``schroeder`` makes the peak low and is the same in every data
+        ``random`` draws new phases for every data set; ``schroeder`` gives a low peak and is the same in every data
         set.
 
     Raises
@@ -53,14 +53,14 @@ class Multisine(checks.Checked, Excitation):
 
     Notes
     -----
-    Each tone has the amplitude ``amplitude * sqrt(2 / tones)``, whatever the length of the record: a longer record
-    begins with the shorter one. Tones that a period moves to the same harmonic become one.
+    Each tone has the amplitude ``amplitude * sqrt(2 / tones)``, independent of the record length: a longer record
+    begins with the shorter one. Tones moved to the same harmonic by a period become one.
 
     Schroeder's phases sweep through the tones in a time T (M. R. Schroeder, IEEE Trans. Inf. Theory 16(1), 1970,
     https://doi.org/10.1109/TIT.1970.1054411): for N equally spaced tones ``phase_k = -pi k (k - 1) / N``, and in
     general ``phase_k - phase_(k-1) = -(w_k - w_(k-1)) T (k - 1) / N``, T being 2 pi over the smallest distance of two
-    tones. The peak over the root mean square, the crest factor, is about 1.7 for many equally spaced tones, and 2.6 to
-    3.5 with random phases; sparse tones, as in logarithmic spacing, have more.
+    tones. The crest factor (peak over root mean square) is about 1.7 for many equally spaced tones, and 2.6 to
+    3.5 with random phases; sparse tones, as in logarithmic spacing, have a higher one.
 
     Examples
     --------
@@ -70,7 +70,7 @@ class Multisine(checks.Checked, Excitation):
     """
 
     kind: ClassVar[str] = "multisine"
-    #: Values of an option with which no random number is drawn.
+    #: Values of an option for which no random numbers are drawn.
     deterministic_with: ClassVar[dict[str, tuple[str, ...]]] = {"phases": ("schroeder",)}
 
     lowest_frequency: Annotated[float, checks.require_positive, "rad/s"] | None = None
@@ -145,7 +145,7 @@ class Multisine(checks.Checked, Excitation):
         if base is None:
             assert self.tones is not None
             return np.asarray(spaced(*self.band, self.tones))
-        # An end that is a harmonic up to rounding belongs to the band.
+        # A band edge that equals a harmonic up to rounding belongs to the band.
         first = math.ceil(self.band[0] / base * (1 - COINCIDENCE))
         last = math.floor(self.band[1] / base * (1 + COINCIDENCE))
         if self.tones is None or first > last:
@@ -159,12 +159,12 @@ class Multisine(checks.Checked, Excitation):
         if self.phases == "random":
             return rng.uniform(0.0, 2 * math.pi, frequencies.size)
         steps = np.diff(frequencies)
-        # By the end of each step as much of the sweep is over as there is power in the tones before.
+        # The fraction of the sweep completed by the end of each step is the fraction of power in the tones before.
         over = 2 * math.pi / steps.min(initial=math.inf) * np.arange(1, frequencies.size) / frequencies.size
         return np.concatenate(([0.0], -np.cumsum(steps * over)))
 
     def generate(self, sample_times: Array, rng: np.random.Generator) -> HeldSignal:
-        """Return the sum on its clock, which must carry the highest tone; random phases are drawn."""
+        """Return the sum on its clock, which must be fast enough for the highest tone; phases may be random."""
         clock = clock_instants(sample_times, self.clock_period)
         frequencies = self.frequencies_used
         _require_carried(clock, float(frequencies[-1]))
@@ -177,7 +177,7 @@ class Multisine(checks.Checked, Excitation):
 
 
 def _require_carried(clock: Array, highest: float) -> None:
-    """Refuse a highest tone [rad/s] that the clock, at its mean period, cannot carry."""
+    """Refuse a highest tone [rad/s] that is too high for the mean period of the clock."""
     mean_period = (clock[-1] - clock[0]) / (clock.size - 1) if clock.size > 1 else math.inf
     limit = math.pi / mean_period
     if highest >= limit:

@@ -1,4 +1,4 @@
-"""Noise that is added to an output, white or through a rational filter, and the random streams of an experiment."""
+"""Output noise, white or through a rational filter, and the random streams of an experiment."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,33 +13,33 @@ from ctid_cli.signals.checks import Checked, require_finite, require_not_negativ
 
 Role = Literal["input", "sampling", "noise", "start", "parameters"]
 
-#: First component of every spawn key. Results are repeatable only while these numbers stay what they are.
+#: First component of every spawn key. Results are repeatable only if these numbers never change.
 ROLES: dict[Role, int] = {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
 Decibels = Annotated[float, require_finite, "dB"] | None
 Variance = Annotated[float, require_not_negative, "output unit^2"] | None
-#: Unit of every way to say how strong noise is.
+#: Unit of every noise level option.
 LEVEL_UNITS = {
     "snr_db": "dB",
     "standard_deviation": "output unit",
     "variance": "output unit^2",
     "innovation_variance": "output unit^2",
 }
-#: Largest signal-to-noise ratio of either sign; far beyond it no number holds the ratio of the variances.
+#: Largest absolute signal-to-noise ratio; the variance ratio of much larger ones cannot be represented.
 MAX_SNR_DB = 1000
 
 
 def stream(seed: int, role: Role, replicate: int, number: int = 0) -> np.random.Generator:
-    """Return the random numbers of one role in one replicate, of the first or a further input; of nothing else.
+    """Return the random generator of one role in one replicate, for the first or a further input.
 
-    Levels (noise power, record length, estimators) do not enter, so every level of an experiment sees the
-    same input and the same noise shape in the same replicate, and adding a level changes no other.
+    Levels (noise power, record length, estimators) do not enter, so every level of an experiment has the
+    same input and the same noise shape in the same replicate, and adding a level does not change the others.
     """
     further = (number,) if number else ()
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(ROLES[role], replicate, *further)))
 
 
 class Noise(Checked):
-    """What is added to an output: white innovations through a filter, at an absolute or a relative level.
+    """Output noise: white innovations through a filter, at an absolute or a relative level.
 
     It is stationary from the first sample on.
     """
@@ -64,7 +64,7 @@ class Noise(Checked):
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
+        """Numerator and denominator of the noise filter in ascending powers of q^-1."""
         return (1.0,), (1.0,)
 
     def innovation_variance_of(self, noise_free: Array | None = None) -> float:
@@ -83,7 +83,7 @@ class Noise(Checked):
         Raises
         ------
         DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is missing or zero throughout.
+            If the level is a signal-to-noise ratio and the noise-free output is missing or zero throughout.
         """
         if (variance := getattr(self, "innovation_variance", None)) is not None:
             return float(variance)
@@ -94,7 +94,7 @@ class Noise(Checked):
         return variance / self._unit_variance
 
     def variance_of(self, noise_free: Array | None = None) -> float:
-        """Return the variance of the noise: that for unit innovations times theirs.
+        """Return the variance of the noise: that for unit innovations times the innovation variance.
 
         Parameters
         ----------
@@ -109,12 +109,12 @@ class Noise(Checked):
         return self._unit_variance * self.innovation_variance_of(noise_free)
 
     def autocovariance(self, lags: ArrayLike, noise_free: Array | None = None) -> Array:
-        """Return the covariance of samples at a distance.
+        """Return the covariance of samples at given lags.
 
         Parameters
         ----------
         lags : array_like of int, shape (M,)
-            Distances [samples], of either sign.
+            Lags [samples], of either sign.
         noise_free : ndarray, shape (N,), optional
             The output without noise [output unit]; needed with a signal-to-noise ratio.
 
@@ -135,7 +135,7 @@ class Noise(Checked):
         return np.asarray(self.innovation_variance_of(noise_free) * covariances[distances], dtype=float)
 
     def generate(self, noise_free: Array, rng: np.random.Generator) -> Array:
-        """Draw the noise of one record: filtered innovations, the first state from its stationary distribution.
+        """Draw the noise of one record: filtered innovations, with the initial state from its stationary distribution.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class Noise(Checked):
         Raises
         ------
         DataError
-            If a signal-to-noise ratio is asked for and the noise-free output is zero throughout.
+            If the level is a signal-to-noise ratio and the noise-free output is zero throughout.
         """
         initial = self._state_root @ rng.standard_normal(self._state_root.shape[0])
         shape: Array = rng.standard_normal(noise_free.size)
@@ -164,7 +164,7 @@ class Noise(Checked):
 
     @cached_property
     def state_space(self) -> tuple[Array, Array, float]:
-        """Transposed direct form, whose state is that of ``scipy.signal.lfilter``: F, G and h_0."""
+        """Transposed direct form, with the state of ``scipy.signal.lfilter``: F, G and h_0."""
         states = max(map(len, self.filter)) - 1
         leading = self.filter[1][0]
         numerator, denominator = (np.pad(part, (0, states + 1 - len(part))) / leading for part in self.filter)
@@ -174,7 +174,7 @@ class Noise(Checked):
 
     @cached_property
     def state_covariance(self) -> Array:
-        """Covariance of the state in the long run, for unit innovations."""
+        """Stationary covariance of the state for unit innovations."""
         from scipy.linalg import solve_discrete_lyapunov
 
         transition, gain, _ = self.state_space
@@ -185,13 +185,13 @@ class Noise(Checked):
 
     @cached_property
     def _state_root(self) -> Array:
-        """Symmetric root of the state's covariance, which may be singular: common zeros of C and D, or an empty G."""
+        """Symmetric root of the state covariance, which is singular with common zeros of C and D, or an empty G."""
         values, vectors = np.linalg.eigh(self.state_covariance)
         return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, dtype=float)
 
     @cached_property
     def _unit_variance(self) -> float:
-        """Variance for unit innovations."""
+        """Noise variance for unit innovations."""
         direct = self.state_space[2]
         return direct**2 + (float(self.state_covariance[0, 0]) if self.state_covariance.size else 0.0)
 
@@ -212,8 +212,8 @@ class WhiteNoise(Noise):
 
     Notes
     -----
-    The same standard normal samples are drawn at every level and then scaled, so levels differ by a factor
-    only. The mean square is that of the record at hand, its mean value included.
+    The same standard normal samples are drawn at every level and then scaled, so levels differ only by a factor.
+    The mean square is that of the current record, including its mean value.
 
     Examples
     --------
@@ -254,7 +254,7 @@ class ArmaNoise(Noise):
     Raises
     ------
     ValueError
-        If the filter is unstable or no filter, or not exactly one level is given.
+        If the filter is unstable or invalid, or not exactly one level is given.
 
     Notes
     -----
@@ -263,8 +263,8 @@ class ArmaNoise(Noise):
     For unit innovations it is ``P_11 + h_0^2``, and the covariance at lag k > 0 is the first entry of
     ``F^(k-1) (F P e_1 + G h_0)``.
 
-    The same standard normal numbers are drawn at every level, first those of the state, so that levels differ by a
-    factor only and longer records begin with the shorter ones.
+    The same standard normal numbers are drawn at every level, first those of the state, so that levels differ only
+    by a factor and longer records begin with the shorter ones.
 
     Examples
     --------
@@ -301,7 +301,7 @@ class ArmaNoise(Noise):
 
     @property
     def filter(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Numerator and denominator in rising powers of q^-1 of what white innovations pass through."""
+        """Numerator and denominator of the noise filter in ascending powers of q^-1."""
         return self.numerator, self.denominator
 
 

@@ -1,4 +1,4 @@
-"""One experiment's data: output samples and the held input that caused them."""
+"""Records: output samples and the held inputs of one experiment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Enters = Literal["controller", "input"]
 
 
 class Controller(Protocol):
-    """A controller ``C(q)``, or ``C(s)`` in continuous time, as far as a record needs to know it."""
+    """The parts of a controller ``C(q)``, or ``C(s)`` in continuous time, needed by a record."""
 
     @property
     def numerator(self) -> ArrayLike:
@@ -34,25 +34,25 @@ class Controller(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """What closed the loop while a record was taken.
+    """The feedback loop during a record.
 
     Parameters
     ----------
     reference : ndarray, shape (N,)
         The reference r at the sampling instants.
     controller : Controller or None
-        What made the input from reference and output; None where that is not known.
+        The controller; None if unknown.
     enters : {"controller", "input"}, default "controller"
-        Whether r enters before the controller, ``u = C (r - y)``, or behind it, ``u = r - C y``.
+        Whether r enters before the controller, ``u = C (r - y)``, or after it, ``u = r - C y``.
     hold : {"zoh", "foh"}, default "zoh"
-        The reference between the samples, which matters to a controller in continuous time only.
+        Interpolation of the reference between samples, which only matters for a continuous-time controller.
 
     Raises
     ------
     DataError
         If the reference is not a list of finite numbers.
     ValueError
-        If it is not said where it enters.
+        If ``enters`` is invalid.
     """
 
     reference: Array
@@ -75,7 +75,7 @@ class Loop:
 
     @property
     def formula(self) -> str:
-        """How the controller makes the input from reference r and output y."""
+        """Control law: the input from reference r and output y."""
         sides = (getattr(self.controller, name) for name in ("numerator", "denominator"))
         b, a = (" ".join(f"{c:.6g}" for c in np.asarray(side)) for side in sides)
         p = "s" if self.continuous else "q"
@@ -94,14 +94,14 @@ class Record:
     y : ndarray, shape (N,)
         Output samples [output unit]; a NaN is a masked (missing) sample.
     inputs : HeldSignal, or mapping of names to HeldSignal or array_like
-        The input on its own break times [s]; or several ones by name. Values without times are those at the instants of
+        The input on its own break times [s]; or several inputs by name. Values without times belong to the instants of
         the output, each held until the next one (zoh).
     noise_free : ndarray, shape (N,), optional
-        The output before noise is added [output unit], known only for simulated records.
+        The output without noise [output unit], known only for simulated records.
     name : str, default ""
-        Where the record comes from; appears in messages.
+        Source of the record, for messages.
     loop : Loop, optional
-        What closed the loop; None for a record taken in open loop, or in a loop that is not known.
+        The feedback loop; None for a record in open loop or in an unknown loop.
     feedback : bool, default False
         Whether the input depends on the output in a way that ``loop`` does not describe.
 
@@ -109,11 +109,11 @@ class Record:
     ------
     DataError
         If the record is empty, its times do not increase strictly, or no output is finite; or if there is a loop with a
-        discrete controller, and the clock is not regular or the input not held from one sample to the next.
+        discrete controller, and the clock is not regular or the input not constant between samples.
 
     Notes
     -----
-    Arrays are copied and made read-only: a record never changes, and never changes its owner's data.
+    Arrays are copied and made read-only: a record never changes, and does not change the data of the caller.
     """
 
     t: Array
@@ -174,7 +174,7 @@ class Record:
 
     @classmethod
     def from_arrays(cls, t: ArrayLike, u: ArrayLike, y: ArrayLike, hold: Hold = "zoh", name: str = "") -> Record:
-        """Make a record whose input is known at the instants of the output.
+        """Make a record whose input is given at the instants of the output.
 
         Parameters
         ----------
@@ -185,9 +185,9 @@ class Record:
         y : array_like, shape (N,)
             Output samples [output unit]; NaN marks a missing sample.
         hold : {"zoh", "foh", "band-limited"}, default "zoh"
-            How the input behaves between its samples.
+            Interpolation of the input between its samples.
         name : str, default ""
-            Appears in messages.
+            Name in messages.
 
         Returns
         -------
@@ -199,7 +199,7 @@ class Record:
 
     @property
     def held(self) -> dict[str, HeldSignal]:
-        """The inputs by name; one without a name is called u."""
+        """The inputs by name; a single unnamed input is called u."""
         assert isinstance(self.inputs, dict)
         return self.inputs
 
@@ -210,12 +210,12 @@ class Record:
 
     @property
     def input(self) -> HeldSignal:
-        """The only input.
+        """The input of a record with one input.
 
         Raises
         ------
         DataError
-            If there are several.
+            If there are several inputs.
         """
         if self.several:
             raise DataError(
@@ -226,24 +226,24 @@ class Record:
 
     @property
     def hold(self) -> Holds:
-        """How the inputs behave between their samples; that of each where they differ."""
+        """Hold of the inputs; a tuple if they differ."""
         each = tuple(signal.hold for signal in self.held.values())
         return each[0] if len(set(each)) == 1 else each
 
     @property
     def hold_options(self) -> list[str]:
-        """The hold as it is written behind ``--hold``."""
+        """The hold as values of ``--hold``."""
         if isinstance(self.hold, str):
             return [self.hold]
         return [f"{name}={signal.hold}" for name, signal in self.held.items()]
 
     @property
     def each_input(self) -> list[Record]:
-        """The record with each of its inputs alone."""
+        """The record with each of its inputs separately."""
         return [self.of_input(name) for name in self.held]
 
     def driven_by(self, **inputs: HeldSignal) -> Record:
-        """Return the record with some of its inputs changed.
+        """Return the record with some of its inputs replaced.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class Record:
         return replace(self, inputs={**self.held, **inputs})
 
     def of_input(self, name: str) -> Record:
-        """Return the record with one of its inputs alone.
+        """Return the record with only one of its inputs.
 
         Parameters
         ----------
@@ -289,12 +289,12 @@ class Record:
 
     @cached_property
     def valid(self) -> BoolArray:
-        """Which output samples are present, shape (N,)."""
+        """Mask of the present output samples, shape (N,)."""
         return np.isfinite(self.y)
 
     @cached_property
     def bridged_y(self) -> Array:
-        """Outputs with missing samples bridged by straight lines [output unit], shape (N,)."""
+        """Outputs with missing samples interpolated linearly [output unit], shape (N,)."""
         if self.valid.all():
             return self.y
         return np.asarray(np.interp(self.t, self.t[self.valid], self.y[self.valid]), dtype=float)
@@ -317,7 +317,7 @@ class Record:
 
 
 def beginning(record: Record, samples: int) -> Record:
-    """Return the first samples of a record, with the input until then."""
+    """Return the first samples of a record, with the input until the last of them."""
     if record.n_samples <= samples:
         return record
     t = record.t[:samples]
@@ -341,7 +341,7 @@ def common_samples(record: Record, others: Sequence[Record]) -> int:
 def _named_inputs(
     inputs: HeldSignal | Mapping[str, HeldSignal | ArrayLike], t: Array, where: str
 ) -> dict[str, HeldSignal]:
-    """Return inputs by name, values at the instants of the output held."""
+    """Return inputs by name; arrays become signals held between the instants of the output."""
     if isinstance(inputs, HeldSignal):
         return {"u": inputs}
     if not isinstance(inputs, Mapping):
@@ -366,5 +366,5 @@ def as_records(records: Any) -> list[Record]:
 
 
 def named(record: Record) -> str:
-    """Return how a message about a record begins."""
+    """Return the beginning of a message about a record."""
     return f"{record.name}: " if record.name else ""

@@ -1,4 +1,4 @@
-"""One signal on a regular clock, from a text, MATLAB or sound file."""
+"""A signal on a regular clock, from a text, MATLAB or sound file."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ctid_cli.signals.table import Columns, Table, split_header
 
 #: Largest distance of an instant from the grid, in sampling intervals.
 CLOCK_TOLERANCE = 0.01
-#: A record with more samples missing between its lines than this many times those it has is not on one grid.
+#: Largest ratio of the number of grid instants to the number of samples in the file.
 MOST_FILLED = 20
 
 
-#: Seconds in a unit of time, by the labels that files use.
+#: Seconds per unit of time, by the unit labels in files.
 SECONDS = {
     **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
     **dict.fromkeys(("ms", "millisecond", "milliseconds"), 1e-3),
@@ -34,9 +34,9 @@ SECONDS = {
 
 @dataclass(frozen=True, eq=False)
 class SampledSignal:
-    """A signal on a regular clock and what is known of the file that it comes from."""
+    """A signal on a regular clock with metadata of its file."""
 
-    #: Signal [signal unit]; NaN where a sample is missing, shape (N,).
+    #: Signal [signal unit]; NaN for missing samples, shape (N,).
     samples: Array
     #: Sampling interval [time unit].
     interval: float
@@ -55,7 +55,7 @@ class SampledSignal:
         return int(np.count_nonzero(~np.isfinite(self.samples)))
 
     def in_seconds(self) -> SampledSignal:
-        """The same signal with its times in seconds."""
+        """Return the signal with its times in seconds."""
         unit = self.time_unit or "s"
         if unit not in SECONDS:
             unknown = f"{self.file}: the unit of time, {unit!r}, is not known, so there is no frequency in Hz"
@@ -110,19 +110,19 @@ def read_sampled_signal(
 
 
 def _selected(table: Table, time: str | None, signal: str | None, *, without_times: bool) -> Columns:
-    """Read the signal, and its times if they are not known otherwise."""
+    """Read the signal, and its times unless they are given otherwise."""
     asked = {"time": time, "signal": signal}
     try:
         return table.select(asked, without_times=without_times)
     except DataError as error:
         if without_times:
             raise
-        table.select(asked | {"time": None}, without_times=True)  # says what is wrong with the signal itself
+        table.select(asked | {"time": None}, without_times=True)  # raises if the signal itself is wrong
         raise DataError(f"{error}; or give the clock (--interval SECONDS or --rate HERTZ)") from None
 
 
 def _on_grid(columns: Columns, values: Array, unit: str) -> tuple[Array, float, list[str]]:
-    """Return samples at all instants of the grid that the times lie on, its interval, and notes on what is missing."""
+    """Return samples at all instants of the grid of the times, its interval, and notes on missing samples."""
     t = columns.values["time"]
     if t.size < 2:
         raise DataError(f"{columns.file}: one sample has no frequency")
@@ -131,7 +131,7 @@ def _on_grid(columns: Columns, values: Array, unit: str) -> tuple[Array, float, 
     tolerance = 4 * np.finfo(float).eps * float(np.abs(t).max())
     worst = int(np.argmax(stray))
     if stray[worst] > CLOCK_TOLERANCE * interval + tolerance:
-        # Where most neighbours of a sample are missing, the median is a multiple of the interval.
+        # If most neighbours of a sample are missing, the median is a multiple of the interval.
         beside = f"{t[worst]:.9g} {unit} lies {stray[worst]:.3g} {unit} beside a grid of {interval:.6g} {unit}"
         places, interval, stray = _nearest_grid(t, float(steps.min()))
         if not stray.max() <= CLOCK_TOLERANCE * interval + tolerance:
@@ -149,8 +149,8 @@ def _on_grid(columns: Columns, values: Array, unit: str) -> tuple[Array, float, 
 
 
 def _nearest_grid(t: Array, usual: float) -> tuple[Array, float, Array]:
-    """Place of each instant on a grid of about this interval, its interval, and how far each lies beside it."""
+    """Return grid places of the instants, the grid interval near a given one, and distances from the grid."""
     places = np.concatenate(([0.0], np.cumsum(np.maximum(1.0, np.round(np.diff(t) / usual)))))
-    # The grid that fits all instants best in the sense of its two ends.
+    # This grid contains the first and the last instant.
     interval = float((t[-1] - t[0]) / places[-1])
     return places, interval, np.abs(t - (t[0] + places * interval))

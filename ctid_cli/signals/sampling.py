@@ -1,4 +1,4 @@
-"""When the output is sampled."""
+"""Sampling schemes: instants of the output samples."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ Samples = Annotated[int, checks.require_integer, 2]
 
 
 def geometric_sizes(first: int, last: int, count: int) -> list[int]:
-    """Return whole numbers spaced geometrically, such as the record lengths of a study of how accuracy grows."""
+    """Return geometrically spaced whole numbers, such as the record lengths of a study of convergence."""
     checks.require_integer("the first size", first, 1)
     checks.require_integer("the last size", last, 1)
     checks.require_integer("the count", count, 2)
@@ -31,7 +31,7 @@ def geometric_sizes(first: int, last: int, count: int) -> list[int]:
 
 
 class Sampling(ABC):
-    """When the output is sampled, and what the estimator is told of the input."""
+    """Sampling instants of the output, and input information given to the estimator."""
 
     kind: ClassVar[str]
 
@@ -40,13 +40,13 @@ class Sampling(ABC):
 
     @property
     def length(self) -> int:
-        """Number of samples of a record; that of one record where it is not known."""
+        """Number of samples of a record; if it is random, that of one record."""
         samples = getattr(self, "samples", None)
         return samples if isinstance(samples, int) else len(self.times(np.random.default_rng(0)))
 
     @property
     def mean_interval(self) -> float:
-        """Expected interval between samples [s]; that of one record where it is not known."""
+        """Expected interval between samples [s]; if it is unknown, that of one record."""
         times = np.asarray(self.times(np.random.default_rng(0)), dtype=float)
         return float(np.ptp(times) / max(times.size - 1, 1))
 
@@ -57,7 +57,7 @@ class Sampling(ABC):
         Parameters
         ----------
         rng : numpy.random.Generator
-            Source of whatever is random in them.
+            Source of all random numbers.
 
         Returns
         -------
@@ -68,7 +68,7 @@ class Sampling(ABC):
 
 @dataclass(frozen=True)
 class OfInterval(checks.Checked, Sampling):
-    """What schemes have in common that are given by an interval, of a clock or on average."""
+    """Base of schemes with an interval, exact or on average."""
 
     interval: Annotated[float, checks.require_positive, "s"]
     samples: Samples = field(metadata={"geometric": True})
@@ -90,7 +90,7 @@ class RegularSampling(OfInterval):
     samples : int
         Number of samples, at least 2.
     input_record : {"sampled", "exact"}, default "sampled"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
 
     Examples
     --------
@@ -101,13 +101,13 @@ class RegularSampling(OfInterval):
     """
 
     kind: ClassVar[str] = "regular"
-    #: No random number is drawn.
+    #: No random numbers are drawn.
     deterministic: ClassVar[bool] = True
 
     input_record: InputRecord = "sampled"
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return the ticks of the clock; nothing is drawn."""
+        """Return the ticks of the clock; no random numbers are drawn."""
         return self.interval * np.arange(self.samples, dtype=float)
 
 
@@ -124,13 +124,13 @@ class UniformIntervals(checks.Checked, Sampling):
     samples : int
         Number of samples, at least 2.
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
 
     Notes
     -----
-    Holding the samples of an input whose edges fall between them makes it late by half an interval on
-    average, which biases the delay: that is what ``sampled`` is for. :class:`IrregularSampling` draws the same
-    intervals, given by their mean.
+    Holding samples of an input with edges between them delays it by half an interval on average, which biases
+    the delay: ``sampled`` shows this effect. :class:`IrregularSampling` draws the same intervals, given by their
+    mean.
     """
 
     kind: ClassVar[str] = "uniform_intervals"
@@ -151,7 +151,7 @@ class UniformIntervals(checks.Checked, Sampling):
         return 0.5 * float(self.low + self.high)
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return instants at intervals that are drawn."""
+        """Return instants at random intervals."""
         return np.concatenate(([0.0], np.cumsum(rng.uniform(self.low, self.high, self.samples - 1))))
 
 
@@ -168,11 +168,11 @@ class IrregularSampling(OfInterval):
     spread : float, default 0.5
         Intervals are uniform within this fraction below and above the mean [-], above 0 and below 1.
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
 
     Notes
     -----
-    The same as ``uniform_intervals`` with ``low = (1 - spread) interval`` and ``high = (1 + spread) interval``.
+    Equivalent to ``uniform_intervals`` with ``low = (1 - spread) interval`` and ``high = (1 + spread) interval``.
     """
 
     kind: ClassVar[str] = "irregular"
@@ -181,7 +181,7 @@ class IrregularSampling(OfInterval):
     input_record: InputRecord = "exact"
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return instants at intervals that are drawn."""
+        """Return instants at random intervals."""
         low, high = (1 - self.spread) * self.interval, (1 + self.spread) * self.interval
         return UniformIntervals(low, high, self.samples).times(rng)
 
@@ -197,14 +197,14 @@ class JitteredSampling(OfInterval):
     samples : int
         Number of samples, at least 2.
     largest_shift : float
-        Each instant but the first is off its tick by an independent time, uniform within plus or minus this [s];
-        less than half the interval.
+        Largest shift of an instant from its tick [s], less than half the interval; shifts are independent and
+        uniform, and zero for the first instant.
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
 
     Notes
     -----
-    The instants are known to the estimator: this is a clock that is recorded, not one that is mistaken.
+    The instants are known to the estimator: the clock is irregular, but without measurement errors.
     """
 
     kind: ClassVar[str] = "jitter"
@@ -219,7 +219,7 @@ class JitteredSampling(OfInterval):
             raise OptionError("largest_shift", f"largest_shift must be less than {most}: samples would change places.")
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return the ticks of the clock with shifts that are drawn."""
+        """Return the ticks of the clock with random shifts."""
         shifts = rng.uniform(-self.largest_shift, self.largest_shift, self.samples - 1)
         ticks = self.interval * np.arange(self.samples, dtype=float)
         ticks[1:] += shifts
@@ -227,30 +227,30 @@ class JitteredSampling(OfInterval):
 
 
 class GivenInstants(checks.Checked, Sampling):
-    """Samples at instants that are known before any data are made; the record begins at the first of them."""
+    """Samples at instants known before any data are generated; the record begins at the first of them."""
 
     kind: ClassVar[str] = "irregular"
-    #: No random number is drawn.
+    #: No random numbers are drawn.
     deterministic: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
 class ListedInstants(GivenInstants):
-    """Samples at instants that are listed.
+    """Samples at listed instants.
 
     Parameters
     ----------
     instants : tuple of float
-        The instants [s], two or more that increase.
+        The instants [s], at least two, increasing.
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
     """
 
     instants: tuple[float, ...]
     input_record: InputRecord = "exact"
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return the instants; nothing is drawn."""
+        """Return the instants; no random numbers are drawn."""
         return np.array(self.instants, dtype=float)
 
 
@@ -265,9 +265,9 @@ class InstantsFile(GivenInstants):
     time : str, default "t"
         Column of the instants [s], strictly increasing.
     sha256 : str, optional
-        SHA-256 of the file, to make sure of its content; a specification fills it in from the file.
+        Expected SHA-256 of the file; a specification takes it from the file.
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges.
+        Input given to the estimator: its samples at the output's instants, or its true edges.
     """
 
     file: str
@@ -276,7 +276,7 @@ class InstantsFile(GivenInstants):
     input_record: InputRecord = "exact"
 
     def times(self, rng: np.random.Generator) -> Array:
-        """Return the instants of the file; nothing is drawn."""
+        """Return the instants of the file; no random numbers are drawn."""
         instants = read_instants(self.file, self.time)
         if instants.size < 2:
             raise DataError(f"{self.file}: there is one instant, and a record has two or more")

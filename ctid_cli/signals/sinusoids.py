@@ -1,4 +1,4 @@
-"""Sums of sinusoids whose frequencies and amplitudes may step, and what disturbs them."""
+"""Sums of sinusoids with steps in frequency and amplitude, and their disturbances."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, cast
@@ -17,12 +17,12 @@ PhaseAtSteps = Literal["jump", "continuous"]
 
 @dataclass(frozen=True)
 class Piece:
-    """A constant value up to an instant.
+    """A constant value until an instant.
 
     Parameters
     ----------
     value : float
-        Value, in the unit of what it belongs to.
+        Value, in the unit of the quantity.
     until : float, optional
         Instant at which the next piece begins [s]; the last piece has none.
     """
@@ -32,7 +32,7 @@ class Piece:
 
 
 def _require_course(name: str, course: float | tuple[Piece, ...], unit: str, label: str = "") -> None:
-    """Refuse values that are not positive, and pieces that do not follow one another."""
+    """Refuse values that are not positive, and pieces that are not in order."""
     if not isinstance(course, tuple):
         require_positive(name, course, unit)
         return
@@ -65,7 +65,7 @@ class Tone(Checked):
     Raises
     ------
     ValueError
-        If a value is not positive, or the pieces do not follow one another.
+        If a value is not positive, or the pieces are not in order.
     """
 
     frequency: Annotated[float | tuple[Piece, ...], _require_course, "rad/s"]
@@ -82,9 +82,9 @@ class SumOfSinusoids(Checked):
     tones : tuple of Tone
         The sinusoids.
     bias : float, default 0.0
-        Constant that is added [signal unit].
+        Constant term [signal unit].
     phase_at_steps : {"continuous", "jump"}, default "continuous"
-        What a step of a frequency does to the phase: it is the integral of w (``continuous``), or jumps with
+        Phase at a step of a frequency: it is the integral of w (``continuous``), or jumps with
         ``sin(w(t) t + phase)`` (``jump``).
 
     Raises
@@ -95,7 +95,7 @@ class SumOfSinusoids(Checked):
     Notes
     -----
     Each tone is ``A(t) sin(int_0^t w + phase)``; with ``jump`` it is ``A(t) sin(w(t) t + phase)``, whose phase jumps
-    when the frequency w steps. A piece begins at the very instant that the one before it names.
+    when the frequency w steps. At the instant named by a piece, the next piece already applies.
 
     Examples
     --------
@@ -131,7 +131,7 @@ class SumOfSinusoids(Checked):
 
     @property
     def highest_frequency(self) -> float:
-        """The highest frequency that any tone ever has [rad/s]."""
+        """Highest frequency of any tone at any time [rad/s]."""
         return float(max(_values(tone.frequency).max() for tone in self.tones))
 
     def frequencies_at(self, times: ArrayLike) -> Array:
@@ -154,17 +154,17 @@ class SumOfSinusoids(Checked):
 
 @dataclass(frozen=True)
 class UniformDisturbance(Checked):
-    """Independent samples, uniform between two bounds of one size.
+    """Independent samples, uniform between symmetric bounds.
 
     Parameters
     ----------
     half_width : float
-        Largest size of a sample [signal unit].
+        Bound of the absolute value of a sample [signal unit].
 
     Raises
     ------
     ValueError
-        If the size is not positive.
+        If the bound is not positive.
     """
 
     kind: ClassVar[str] = "uniform"
@@ -172,13 +172,13 @@ class UniformDisturbance(Checked):
     half_width: Annotated[float, require_positive, "signal unit"]
 
     def generate(self, undisturbed: Array, rng: np.random.Generator) -> Array:
-        """Draw the disturbance of one record; of the signal only the length matters."""
+        """Draw the disturbance of one record; only the length of the signal matters."""
         return self.half_width * rng.uniform(-1.0, 1.0, undisturbed.size)
 
 
 @dataclass(frozen=True)
 class SineDisturbance(Checked):
-    """One more sinusoid, whose frequency is not estimated.
+    """An additional sinusoid, whose frequency is not estimated.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ class SineDisturbance(Checked):
     """
 
     kind: ClassVar[str] = "sine"
-    #: No random number is drawn.
+    #: No random numbers are drawn.
     deterministic: ClassVar[bool] = True
 
     amplitude: Annotated[float, require_positive, "signal unit"]
@@ -237,7 +237,7 @@ def _steps(courses: list[float | tuple[Piece, ...]]) -> tuple[float, ...]:
 
 
 def _place(course: float | tuple[Piece, ...], t: Array) -> IndexArray:
-    """Return the number of the piece at each instant; 3 k 0.1 and k 0.3 are one instant, whatever their last bits."""
+    """Return the number of the piece at each instant; 3 k 0.1 and k 0.3 count as equal despite rounding."""
     ends = _ends(course)
     return np.searchsorted(ends * (1.0 - COINCIDENCE), t, side="right")
 

@@ -1,4 +1,4 @@
-"""Sound files: their channels as columns of a table, and their clock."""
+"""Sound files: channels as columns of a table, and sampling rate."""
 
 import os
 from collections.abc import Sequence
@@ -10,12 +10,12 @@ from ctid_cli.errors import DataError
 from ctid_cli.signals.files import require_file, require_values
 from ctid_cli.signals.table import Columns, Table
 
-#: How the names of sound files end.
+#: Suffixes of sound files.
 SOUNDS = (".wav", ".wave", ".flac", ".aif", ".aiff", ".ogg")
 
 
 def is_sound(path: str | os.PathLike[str]) -> bool:
-    """Return whether the name of a file is that of a sound."""
+    """Return whether a file name has the suffix of a sound file."""
     return Path(path).suffix.lower() in SOUNDS
 
 
@@ -24,7 +24,7 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[Table, float]:
     file = require_file(path)
     try:
         import soundfile
-    except (ImportError, OSError):  # an OSError where the library that it needs is not there
+    except (ImportError, OSError):  # an OSError if its C library is missing
         how = "pip install 'ctid[sound]' adds it, or save the samples as text (.csv)"
         raise DataError(f"{file}: sound is read with the package soundfile: {how}") from None
     try:

@@ -1,4 +1,4 @@
-"""Named columns of numbers, whatever file they come from, and the checks that make a record or a signal of them."""
+"""Named columns of numbers from any kind of file, and checks for use as a record or a signal."""
 
 import itertools
 import re
@@ -16,10 +16,10 @@ from ctid_cli.text import closest, listed
 
 Role = Literal["time", "input", "output"]
 
-#: Roles of the columns of a record. A signal has a time and a signal; a record of a loop has a reference too.
+#: Roles of the columns of a record. A signal has a time and a signal; a record of a loop also has a reference.
 ROLES: tuple[Role, ...] = get_args(Role)
 
-#: Names by which a column is recognised by default, the most specific first; case is ignored.
+#: Default column names of each role, the most specific first; case is ignored.
 USUAL_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("t", "time", "times", "seconds", "timestamp", "samplinginstants", "ts", "sampletime"),
     "input": ("u", "input", "inputs", "inputdata"),
@@ -29,20 +29,20 @@ USUAL_NAMES: dict[str, tuple[str, ...]] = {
         *("amplitude", "data", "audio", "sound", "wave", "voltage"),
     ),
 }
-#: Names whose unit may stand behind a slash; elsewhere the slash is part of the name.
+#: Names after which a slash precedes the unit; in other names the slash is part of the name.
 BEFORE_SLASH = {name for role in ROLES for name in USUAL_NAMES[role]}
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns of numbers that were read, and the lines that they come from in a text file."""
+    """Columns that were read, with their line numbers in a text file."""
 
     file: str
-    #: Numbers by the name of their column, or by its role once roles are known.
+    #: Numbers by column name, or by role once roles are known.
     values: Mapping[str, Array]
     lines: Sequence[int] | None = None
     notes: tuple[str, ...] = ()
-    #: Names by roles, also of times that are known otherwise and not read.
+    #: Column names by role, including a time column that is not read.
     names: Mapping[str, str] = field(default_factory=dict)
 
     def unit(self, role: str) -> str | None:
@@ -50,11 +50,11 @@ class Columns:
         return split_header(self.names[role])[1]
 
     def place(self, k: int) -> str:
-        """Return the place of a row, for the beginning of a message."""
+        """Return the place of a row, as the beginning of a message."""
         return f"{self.file}: sample {k + 1}" if self.lines is None else f"{self.file}:{self.lines[k]}"
 
     def timed(self) -> "Columns":
-        """Return the columns with an instant for each row; one number in their place is the sampling interval."""
+        """Return the columns with an instant for each row; a single number in the time column is the interval."""
         main = next(role for role in ("output", "signal", "input", "time") if role in self.values)
         t, size = self.values["time"], self.values[main].size
         name, unit = self.names["time"], self.unit("time") or "s"
@@ -92,14 +92,14 @@ class Columns:
         require_steps(f"{self.place(int(np.argmin(steps)) + 1)}: {what}", t)
 
     def input(self, used: slice = slice(0, None), role: str = "input") -> Array:
-        """Return an input without gaps: the system responds to its input whether or not that was recorded."""
+        """Return an input; refuse missing values, since the system also responds to values that were not recorded."""
         u, what = self.values[role][used], f"{role} {self.names[role]!r}"
         self._refuse(~np.isfinite(u), f"{what} is missing or not finite; only the output may have gaps", used.start)
         self._require_scale(what, u, used.start)
         return u
 
     def output(self, used: slice) -> Array:
-        """Return an output that is nowhere infinite and not missing everywhere."""
+        """Return an output; refuse infinite values and a column without any value."""
         y, what = self.values["output"][used], f"output {self.names['output']!r}"
         self._refuse(np.isinf(y), f"{what} is infinite; leave the field empty where a sample is missing", used.start)
         if not np.isfinite(y).any():
@@ -108,7 +108,7 @@ class Columns:
         return y
 
     def window(self, t: Array, start: float | None, stop: float | None, slack: float = 0.0) -> slice:
-        """Return the rows between two instants, up to some slack."""
+        """Return the rows between two instants, with a tolerance."""
         unit = (self.unit("time") if "time" in self.values else None) or "s"
         low, high = -np.inf if start is None else start, np.inf if stop is None else stop
         if not low < high:
@@ -123,40 +123,40 @@ class Columns:
         return slice(first, last)
 
     def _refuse(self, wrong: BoolArray, message: str, first: int = 0) -> None:
-        """Refuse a column that is wrong somewhere, and name the first row where it is."""
+        """Refuse a column with wrong values, naming the first row that has one."""
         if wrong.any():
             raise DataError(f"{self.place(first + int(np.argmax(wrong)))}: {message}")
 
     def _require_scale(self, what: str, values: Array, first: int, *limit: float) -> None:
-        """Refuse a column in a unit in which nothing can be computed, and name the row of the largest value."""
+        """Refuse a column with a unit unsuitable for computation, naming the row of the largest value."""
         largest = first + int(np.nanargmax(np.abs(values)))
         require_scale(f"{self.place(largest)}: {what}", values, *limit)
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The names of the columns of a file, of which those that are asked for are read."""
+    """Column names of a file, of which selected columns are read."""
 
     file: str
     names: tuple[str, ...]
     read: Callable[[Sequence[str]], Columns]
-    #: The place of the names, for messages.
+    #: Place of the names, for messages.
     head: str
     noun: str = "column"
     hint: str = ""
-    #: Whether the columns have an order, and each line of the file a number.
+    #: Whether the columns have an order, and the lines numbers.
     is_text: bool = False
     notes: tuple[str, ...] = ()
-    #: Comments before the data with their lines.
+    #: Comments before the data with their line numbers.
     comments: tuple[tuple[int, str], ...] = ()
 
     def select(
         self, asked: Mapping[str, str | None], *, without_times: bool = False, in_seconds: bool = False
     ) -> Columns:
-        """Read the column of each role: that which is asked for, or else that which its name or its place tells.
+        """Read the column of each role: the named one, or one recognised by its name or position.
 
-        Where times must be in seconds, a column that is labelled with another unit is refused unless it is named with
-        that unit. Without times, their column is found but not read, and may be absent.
+        If times must be in seconds, a time column labelled with another unit is refused unless it is selected by its
+        name and unit. Without times, their column is identified but not read, and may be absent.
         """
         chosen, notes = self._choose(asked, ("time",) if without_times else ())
         if in_seconds:
@@ -168,8 +168,8 @@ class Table:
         return columns if without_times else columns.timed()
 
     def _choose(self, asked: Mapping[str, str | None], optional: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-        """Return the column of each role, and what was assumed."""
-        # A reference has no usual names: it is only taken where it is named.
+        """Return the column of each role, and the assumptions made."""
+        # A reference has no usual names: it is used only if it is named.
         roles = [role for role in asked if role in USUAL_NAMES]
         chosen = {role: self.named(wanted) for role in roles if (wanted := asked[role]) is not None}
         for role in roles:
@@ -199,10 +199,10 @@ class Table:
         raise DataError(". ".join(filter(None, [*parts, self.hint])))
 
     def _recognised(self, role: str, chosen: Mapping[str, str], *, sure: bool) -> str | None:
-        """Return the column with the most telling of the usual names of a role; of several the first, unless sure."""
+        """Return the column with the most specific usual name of a role; if several match, the first, unless sure."""
         for usual in USUAL_NAMES[role]:
             matching = self._called((usual,), chosen)
-            # What lies in the same struct as the columns that are known belongs to them.
+            # Columns in the same struct as the known columns are preferred.
             homes = {name.rpartition(".")[0] for name in chosen.values()}
             close = [name for name in matching if not self.is_text and name.rpartition(".")[0] in homes]
             matching = close or matching
@@ -215,18 +215,18 @@ class Table:
         return None
 
     def _called(self, usual: Sequence[str], chosen: Mapping[str, str]) -> list[str]:
-        """Return the columns that are not taken yet and have a usual name, without their unit and their struct."""
+        """Return the unused columns with a usual name, ignoring unit and struct."""
         bare = {name: split_header(name)[0] for name in self.names if name not in chosen.values()}
         leaves = {name: text if self.is_text else text.rpartition(".")[2] for name, text in bare.items()}
         return [name for name in self.names if leaves.get(name, "").lower() in usual]
 
     def _take_by_position(self, chosen: dict[str, str], roles: Sequence[str]) -> list[str]:
-        """Take the columns of the roles that are still open in their order, where no name contradicts; say so."""
+        """Assign the remaining roles in column order, unless names contradict; return a note."""
         missing = [role for role in roles if role not in chosen]
         if not missing:
             return []
         left = [name for name in self.names if name not in chosen.values()]
-        # A column with a usual name is not put in another place than its name says.
+        # A column with a usual name is never assigned to another role.
         contradicts = any(self._called(USUAL_NAMES[role], chosen) for role in roles)
         ordered = self.is_text or missing == ["signal"]
         if not ordered or len(self.names) != len(roles) or len(left) != len(missing) or contradicts:
@@ -255,13 +255,13 @@ class Table:
             raise DataError(f"{self.head}: {wrong}; convert the column, or name it {name!r} to count in {unit}")
 
     def _require_single(self, names: Sequence[str]) -> None:
-        """Refuse columns that have one name."""
+        """Refuse several columns with the same name."""
         if len(names) > 1 and len(set(names)) == 1:
             raise DataError(f"{self.head}: {len(names)} columns are called {names[0]!r}; rename all but one")
 
     @property
     def _listing(self) -> str:
-        """The columns of the file, for messages."""
+        """List of the columns of the file, for messages."""
         if not self.names:
             return f"the file has no {self.noun} of numbers"
         more = f" and {len(self.names) - MAX_NAMES} more" if len(self.names) > MAX_NAMES else ""

@@ -1,4 +1,4 @@
-"""Columns of numbers in text files, whose layout is found in their first lines."""
+"""Columns of numbers from text files, whose layout is determined from their first lines."""
 
 import codecs
 import csv
@@ -20,17 +20,17 @@ from ctid_cli.signals.table import Columns, Table, split_header
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Lines that decide on separator and decimal sign, and the bytes at the beginning of a file in which they lie.
+#: Number of lines used to determine separator and decimal sign, and the maximum size of these lines [bytes].
 HEAD_LINES, HEAD_BYTES = 50, 1_000_000
-#: Columns of the widest file.
+#: Maximum number of columns.
 MAX_COLUMNS = 10_000
-#: Rows that are converted at a time: memory is needed for them and for the numbers of the columns that are used.
+#: Rows converted at once: memory is needed for these and for the numbers of the used columns.
 ROWS = 1 << 17
-#: Separators in the order in which they are preferred if several fit; the blank stands for any blanks and tabs.
+#: Separators in order of preference; the blank stands for any number of blanks and tabs.
 SEPARATORS = ("\t", ";", ",", " ")
-#: How comments begin, which may stand before the data.
+#: Prefixes of comments, which are allowed before the data.
 COMMENTS = ("#", "%", "//")
-#: What stands for a missing sample.
+#: Notations of a missing sample.
 MISSING = ("", "nan", "NaN", "NAN", "na", "NA")
 #: Digits, a sign and digits again, as in 2024-03-01, 1/3/24 or 12:30.
 DATE = re.compile(r"\d[-/.]\d{1,2}[-/.]\d|\d:\d\d")
@@ -45,7 +45,7 @@ NO_TEXT = "this is not a text file; records are read from text (.csv, .txt), MAT
 
 @dataclass(frozen=True)
 class Layout:
-    """How a file is written, its columns, and the lines of their names and of the first sample."""
+    """Layout of a file: encoding, separators, columns, and line numbers of names and first sample."""
 
     path: str | os.PathLike[str]
     file: str
@@ -60,7 +60,7 @@ class Layout:
 
     def opened(self) -> io.TextIOBase:
         """Open the file at its first sample."""
-        # What cannot be decoded there can be no number, and need not be one where it is not used.
+        # Undecodable text is not a number, which is allowed in unused columns.
         text = open(self.path, encoding=self.encoding, errors="replace", newline="")  # noqa: SIM115
         for _ in range(self.first - 1):
             text.readline()
@@ -76,11 +76,11 @@ def read_text_table(path: str | os.PathLike[str]) -> Table:
     return Table(layout.file, names, read, head=head, is_text=True, notes=notes, comments=layout.comments)
 
 
-# --- the first lines ------------------------------------------------------------------------------
+# --- first lines ----------------------------------------------------------------------------------
 
 
 def _layout(path: str | os.PathLike[str], file: str) -> Layout:
-    """Find out how a file is written."""
+    """Determine the layout of a file."""
     text, encoding = _head(path, file)
     comments: list[tuple[int, str]] = []
     content: list[tuple[int, str]] = []
@@ -96,7 +96,7 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
     if not rows[0][1]:
         raise DataError(f"{file}:{rows[0][0]}: the line names no columns; it must name them, as in t,u,y")
     if _all_numbers(rows[0][1]):
-        # Some programs write the names of the columns as a comment.
+        # Some programs write the column names as a comment.
         before, comment = next(((k, line) for k, line in reversed(comments) if k < rows[0][0]), (0, ""))
         rows.insert(0, (before, _fields(comment.lstrip().lstrip("#%/"), separator)))
         if len(rows[0][1]) != len(rows[1][1]) or _all_numbers(rows[0][1]):
@@ -122,13 +122,13 @@ def _layout(path: str | os.PathLike[str], file: str) -> Layout:
 
 
 def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
-    """Return the whole lines at the beginning of a file, and its encoding."""
+    """Return the complete lines at the beginning of a file, and its encoding."""
     try:
         with open(path, "rb") as content:
             head = content.read(HEAD_BYTES)
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-    # The mark of UTF-32 begins with that of UTF-16.
+    # The byte order mark of UTF-32 begins with that of UTF-16.
     if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
         encodings = ["utf-32"]
     elif head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -137,7 +137,7 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
         encodings = ["utf-8-sig", "cp1252"] if b"\0" not in head else []
     for encoding in encodings:
         try:
-            # The last letter may be cut.
+            # The last character may be incomplete.
             text = codecs.getincrementaldecoder(encoding)().decode(head)
         except UnicodeDecodeError:
             continue
@@ -150,10 +150,10 @@ def _head(path: str | os.PathLike[str], file: str) -> tuple[str, str]:
 
 
 def _split(line: str, separator: str) -> list[str]:
-    """Return the fields of a line as they are written."""
+    """Return the fields of a line as written."""
     line = line.strip("\r\n")
     if separator == " ":
-        # The unit of a name stays with it.
+        # Keep a name and its unit together.
         line = re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
     try:
         return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
@@ -162,7 +162,7 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _fields(line: str, separator: str) -> list[str]:
-    """Return the fields of a line without blanks around them, up to the last one that is not empty."""
+    """Return the stripped fields of a line up to the last non-empty one."""
     fields = [field.strip() for field in _split(line, separator)]
     while fields and not fields[-1]:
         del fields[-1]
@@ -170,9 +170,9 @@ def _fields(line: str, separator: str) -> list[str]:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return the separator that gives most lines one field for each of several columns.
+    """Return the separator for which most lines have one field per column, with several columns.
 
-    Where none does, there is one column, or the lines are refused where their fields are counted.
+    If there is none, the file has one column, or the lines are refused later when fields are counted.
     """
 
     def fitness(separator: str) -> tuple[int, bool, bool, int]:
@@ -185,7 +185,7 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _decimal(fields: Iterable[str]) -> str:
-    """Return the sign that more of the numbers have that have one."""
+    """Return the decimal sign used by most of the numbers that have one."""
     votes = dict.fromkeys(NUMBERS, 0)
     for field in fields:
         for sign, number in NUMBERS.items():
@@ -194,7 +194,7 @@ def _decimal(fields: Iterable[str]) -> str:
 
 
 def _is_units(rows: Sequence[tuple[int, list[str]]]) -> bool:
-    """Return whether the line below the names holds units: words, followed by a line with numbers."""
+    """Return whether the line below the names contains units: words, followed by a line with numbers."""
     if len(rows) < 3 or len(rows[1][1]) > len(rows[0][1]):
         return False
     words = [field for field in rows[1][1] if field not in MISSING]
@@ -202,7 +202,7 @@ def _is_units(rows: Sequence[tuple[int, list[str]]]) -> bool:
 
 
 def _with_unit(name: str, unit: str) -> str:
-    """Return the name of a column with its unit, unless it has one already."""
+    """Return a column name with its unit, unless it already has one."""
     unit = unit.strip("[]()").strip()
     return f"{name} [{unit}]" if name and unit and split_header(name)[1] is None else name
 
@@ -219,7 +219,7 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 
 
 def _read_columns(layout: Layout, names: Sequence[str]) -> Columns:
-    """Read some columns; a line without a single field is left out."""
+    """Read some columns; lines with only empty fields are left out."""
     places = [layout.columns.index(name) for name in names]
     parts: list[Any] = []
     try:
@@ -251,16 +251,16 @@ def _read_columns(layout: Layout, names: Sequence[str]) -> Columns:
 
 
 def _lines(layout: Layout, rows: set[int]) -> Iterator[tuple[int, str]]:
-    """Return some lines of a file as they are."""
+    """Return some lines of a file unchanged."""
     if rows:
         with layout.opened() as text:
             yield from ((k, line) for k, line in enumerate(text) if k in rows)
 
 
 class _Widened:
-    """A text with a line of names in front, one more than there are columns.
+    """A text preceded by a line of names, one more than there are columns.
 
-    pandas then gives all lines that many fields: the last one is empty unless a line has too many.
+    pandas then expects that number of fields: the last one is empty unless a line has too many.
     """
 
     def __init__(self, text: io.TextIOBase, layout: Layout) -> None:
@@ -268,7 +268,7 @@ class _Widened:
         self._front = layout.separator.join(map(str, range(len(layout.columns) + 1))) + "\n"
 
     def read(self, size: int = -1) -> str:
-        """Read the line in front, then the text."""
+        """Read the line of names, then the text."""
         front, self._front = self._front, ""
         return front or self._text.read(size)
 
@@ -277,8 +277,8 @@ class _Widened:
 
 
 def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
-    """Read columns by their places, and one more that is empty if no line has too many fields."""
-    import pandas as pd  # a second of start-up time that only a command that reads a file should pay
+    """Read columns by position, and an additional one that is empty unless a line has too many fields."""
+    import pandas as pd  # takes a second, only when a file is read
 
     width = len(layout.columns)
     options: Any = {"header": 0, "names": range(width + 1), "usecols": [*places, width], "index_col": False}
@@ -291,7 +291,7 @@ def _chunks(layout: Layout, places: Sequence[int]) -> Iterator["DataFrame"]:
 
 
 def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
-    """Refuse the first line with too many fields or without a number, and say which."""
+    """Refuse the first line with too many fields or without a number, and quote it."""
     number, width = NUMBERS[layout.decimal], len(layout.columns)
     if opened := re.search(r"inside string starting at row (\d+)", error):
         why = "a quotation mark is opened and never closed; export the file anew, or correct the line"
@@ -313,7 +313,7 @@ def _refuse(layout: Layout, places: Sequence[int], error: str) -> NoReturn:
 
 
 def _instead_of_number(text: str, layout: Layout) -> str:
-    """Say what stands where a number should, and what to do about it."""
+    """Describe the text found in place of a number, with a remedy."""
     if DATE.search(text):
         return "a date or a time of day; write times as numbers, such as seconds since the first sample"
     if text.startswith(COMMENTS):

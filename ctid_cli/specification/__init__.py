@@ -1,1 +1,1 @@
-"""From a YAML file to a checked specification."""
+"""Reading and checking of specifications in YAML."""

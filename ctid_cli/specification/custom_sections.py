@@ -1,4 +1,4 @@
-"""Sections of custom components, and of components that are told apart by their kind."""
+"""Sections of custom components, and of components selected by their kind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ctid_cli.specification.sweeps import variants
 from ctid_cli.specification.values import ByShape, Name, Number, OneOf, Text
 from ctid_cli.text import did_you_mean
 
-#: The base class of custom components, and the methods of which it needs one, with what they are given.
+#: Base class of custom components, and its required methods with their arguments.
 CONTRACTS: dict[str, tuple[type, dict[str, tuple[str, ...]]]] = {
     "estimator": (Estimator, {"fit": ("record", "start")}),
     "measure": (Measure, {"value": ("fit", "data")}),
@@ -41,7 +41,7 @@ def names_code(kind: str) -> bool:
 
 
 def custom_form(part: str) -> Any:
-    """Return the annotation of the section of a custom component."""
+    """Return the annotation for sections of a custom component."""
 
     def validated(value: Any, info: ValidationInfo) -> Section:
         if isinstance(value, Section):
@@ -66,7 +66,7 @@ def custom_form(part: str) -> Any:
 
 
 def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
-    """Return the section of a custom class, if it is what this part of a specification needs."""
+    """Return the section of a custom class; refuse a class without the required methods or base class."""
     name, (base, methods) = target.__name__, CONTRACTS[part]
     wanted = " or ".join(f"{method}(self, {', '.join(given)})" for method, given in methods.items())
     if part != "estimator" and not issubclass(target, base):
@@ -98,7 +98,7 @@ def _custom_section(target: type[Any], part: str, kind: str) -> type[Section]:
             raise CustomCodeError(f"{name}: an option cannot be called {option!r} here; rename it")
     try:
         return section_for(target, kind, base=form, sweeping=part != "measure")
-    # Annotations of a custom class can fail in any way.
+    # Evaluating the annotations of a custom class can raise any exception.
     except Exception as error:
         raise CustomCodeError(f"the options of {name} cannot be read: {reason(error)}") from None
 
@@ -109,7 +109,7 @@ class CustomSection(Section):
     custom: ClassVar[bool] = True
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that worker processes cannot be given the component."""
+        """Yield a problem if the component cannot be sent to worker processes."""
         from joblib.externals.loky.backend.reduction import dumps
 
         try:
@@ -119,30 +119,30 @@ class CustomSection(Section):
 
 
 class CustomMeasureSection(CustomSection):
-    """Options of a custom measure, and what it is called.
+    """Options of a custom measure, and its name.
 
     Parameters
     ----------
     name : str, optional
-        what tables call it; by default like its class
+        name in tables; by default that of its class
     """
 
     name: Name
 
 
 class CustomSystemSection(CustomSection):
-    """Options of a custom system, and what is true of it.
+    """Options of a custom system, and its true values.
 
     Parameters
     ----------
     truth : mapping, optional
-        true values of what is estimated, by name; the name of an option stands for its value
+        true values of the estimated quantities, by name; the name of an option stands for its value
     """
 
     truth: dict[str, Annotated[float | str, ByShape(Number, "the name of an option is allowed too", text=Text)]] = {}  # noqa: RUF012
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say which true values are none."""
+        """Yield invalid true values."""
         yield from super().complaints()
         fields = {name: getattr(self, name) for name in type(self).model_fields}
         numbers = [name for name, value in fields.items() if isinstance(value, (int, float, list))]
@@ -154,7 +154,7 @@ class CustomSystemSection(CustomSection):
 
 
 class Kinds(OneOf):
-    """Annotation of a section that is one of several, told apart by its ``kind``, or a custom one where it may be."""
+    """Annotation of a section with one of several kinds, or a custom one if allowed."""
 
     def __init__(self, *names: str, custom: str = "") -> None:
         forms: dict[str, Any] = {k: section_for(target, k) for name in names for k, target in classes(name).items()}

@@ -1,4 +1,4 @@
-"""What is wrong with a specification although every section is right by itself."""
+"""Errors of a specification in which every section is valid on its own."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,11 +31,11 @@ from ctid_cli.specification.sweeps import Case, Cases
 from ctid_cli.specification.system_sections import RelativeStart, UniformStart, truth_of
 from ctid_cli.specification.yaml_source import KeyPath
 
-#: Samples, or clock periods of the input, of the longest record; ten times this would not fit in memory.
+#: Maximum number of samples, or clock periods of the input, of a record; ten times this would not fit in memory.
 MAX_SAMPLES = 10_000_000
-#: Data cells times estimators with each of their settings that an experiment may have.
+#: Maximum number of data cells times estimator settings of an experiment.
 MAX_SETTINGS = 1_000_000
-#: Settings whose first data sets are tried.
+#: Maximum number of settings whose first data sets are tried.
 MAX_TRIALS = 64
 #: Success rules of systems and of signals.
 _RULES_OF_SYSTEMS = ("delay_relative_error", "fit_percent", "parameter_relative_error")
@@ -43,11 +43,11 @@ _RULES_OF_SIGNALS = ("band", "by", "window")
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# All sections together
+# All sections
 
 
 def too_many_cases(spec: Spec) -> str:
-    """Return why not even the combinations of a specification can be looked at; empty if they can."""
+    """Return why a specification has too many combinations to check; empty if it does not."""
     cells = math.prod(map(sweeps.case_count, spec.of_data.values()))
     estimators = sum(map(sweeps.case_count, spec.estimators.values()))
     if cells > (most := sweeps.MAX_COMBINATIONS):
@@ -61,7 +61,7 @@ def too_many_cases(spec: Spec) -> str:
 def joint_complaints(
     spec: Spec, broken: frozenset[str], trial: Callable[[Spec], Iterable[Complaint]], *, files_are_good: bool
 ) -> list[Complaint]:
-    """Return what the sections of a specification have against each other, and what a trial of them shows."""
+    """Return the contradictions between sections of a specification, and the problems found by a trial."""
     found = [*_of_names(spec), *_of_missing(spec, broken), *_of_worlds(spec, broken)]
     cases = cases_of(spec, files_are_good=files_are_good)
     too_long = list(sweeps.checked(cases, (_of_length,)))
@@ -69,20 +69,20 @@ def joint_complaints(
     found += [*too_long, *sweeps.checked(usable, CHECKS)]
     places = {path[0] for path, _ in found if path}
     of_data = {"data", "inputs", *OF_DATA}
-    # A wrong level of the noise, or a wrong estimator, leaves the rest to be tried.
+    # A wrong noise level or estimator does not prevent a trial of the rest.
     if files_are_good and not places & of_data - {"noise"}:
         faulty = {path[1] for path, _ in found if path[:1] == ("estimators",)}
         right = {name: section for name, section in spec.estimators.items() if name not in faulty}
-        # Estimators would refuse a record for what is wrong with its sections.
+        # Otherwise estimators would refuse a record because of errors in its sections.
         rest = sweeps.replaced(spec, ("estimators",), {} if (places | broken) & of_data else right)
         found += trial(sweeps.replaced(rest, ("noise",), None) if "noise" in places else rest)
     return found
 
 
 def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
-    """Return what checks are given of a specification: options of sections, and what follows from them.
+    """Return the cases for the checks of a specification: options of sections, and values derived from them.
 
-    There are no cases of what is not there, nor of custom components: what their options mean is not known.
+    There are no cases for missing sections and custom components, whose options have no known meaning.
     """
     on_signal = spec.signal is not None
     found: dict[str, dict[KeyPath, list[Case]]]
@@ -93,9 +93,9 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
         found["sampling"] = {}
     if spec.disturbance is None:
         found["disturbance"] = {("disturbance",): [(None, {})]}
-    # What keeps an unstable system finite, if anything does.
+    # The loop, if any, that may stabilise an unstable system.
     found["feedback"] = {("loop",): [(None, {})]} if spec.loop is None else found["loop"]
-    # The systems again, each with the name of its input where there are several.
+    # The systems, each with the name of its input if there are several.
     found["driven"] = {
         path: [(("" if path[1:] == () else str(path[1]), one), swept) for one, swept in cases]
         for path, cases in found["system"].items()
@@ -124,14 +124,14 @@ def cases_of(spec: Spec, *, files_are_good: bool = True) -> Cases:
 
 
 def _cases(spec: Spec, place: KeyPath, section: Any, *, custom: bool = False) -> list[Case]:
-    """Return the options of a section, and the values that they sweep by their places."""
+    """Return the options of a section with their swept values by place."""
     if section is None or (section.custom and not custom):
         return []
     return [(located(one.options, spec.folder), sweeps.swept_in({place: one})) for one in sweeps.variants(section)]
 
 
 def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
-    """Return what is checked of sections in which nothing is swept."""
+    """Return the cases of sections without swept values."""
     given: list[tuple[str, KeyPath, Any]] = [(name, (name,), getattr(spec, name)) for name in ("data", "success")]
     given.append(("monte_carlo", ("monte_carlo",), spec.monte_carlo))
     given.append(("seed", ("monte_carlo", "seed"), getattr(spec.monte_carlo, "seed", 0)))
@@ -149,17 +149,17 @@ def _single_cases(spec: Spec) -> dict[str, dict[KeyPath, list[Case]]]:
     for name, place, value in given:
         if value is not None:
             found.setdefault(name, {})[place] = [(value, {})]
-    # Random parameters all have the structure of the system.
+    # All random parameters have the structure of the system.
     found["relative_start"] = dict(list(found.get("relative_start", {}).items())[:1])
     return found
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Names, and what is missing
+# Names and missing sections
 
 
 def _of_names(spec: Spec) -> Iterator[Complaint]:
-    """Say which measures there are not, and what there is twice."""
+    """Yield unknown and duplicate measures."""
     names: set[str] = set()
     for k, one in enumerate(spec.measures or ()):
         if isinstance(one, CustomMeasureSection):
@@ -179,7 +179,7 @@ def _of_names(spec: Spec) -> Iterator[Complaint]:
 
 
 def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
-    """Say what is missing, where it is not only broken."""
+    """Yield missing sections, except those that are present but invalid."""
     place = ("monte_carlo", "until", "percent_half_width")
     until = None if spec.monte_carlo is None or spec.data is not None else spec.monte_carlo.until
     if until is not None and until.percent_half_width is not None and not spec.success and "success" not in broken:
@@ -189,7 +189,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
     if random and spec.monte_carlo is None and "monte_carlo" not in broken:
         yield ("starts", "initial_delay", random[0]), "a random start needs a seed; add monte_carlo: {runs: 1, seed: 1}"
     relay = spec.loop is not None and any(hasattr(spec.loop.controller, form) for form in ("relay", "unknown"))
-    # To estimators a record in a loop with a relay is one in open loop.
+    # For estimators, a record from a relay loop is an open-loop record.
     if spec.signal is None and (spec.loop is None or relay) and not broken & {"loop", "data", "excitation"}:
         give = "give loop, or data.reference and loop.controller for a measured record"
         message = f"closed-loop instruments need the reference and the controller; {give}"
@@ -205,7 +205,7 @@ def _of_missing(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
 
 
 def _of_worlds(spec: Spec, broken: frozenset[str]) -> Iterator[Complaint]:
-    """Say which estimators and success rules belong to the other kind of experiment."""
+    """Yield estimators and success rules that belong to the other kind of experiment."""
     on_signal = spec.signal is not None
     if not on_signal and ("signal" in broken or (spec.system is None and spec.data is None)):
         return
@@ -268,7 +268,7 @@ def _of_relay(loop: Any, data: Any) -> Iterator[Complaint]:
 
 
 def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
-    """A linear loop may keep an unstable system stable; whether it does is seen when it is tried."""
+    """Yield an unstable system without a linear loop; a trial shows whether a loop stabilises it."""
     if feedback is not None and not isinstance(feedback.controller, Relay):
         return
     if isinstance(system, TransferFunction):
@@ -277,7 +277,7 @@ def _of_unstable_system(feedback: Any, system: Any) -> Iterator[Complaint]:
         return
     for k, submodel in enumerate(system.submodels):
         if not submodel.is_stable:
-            # Poles at the origin are declared as integrators, which may be simulated.
+            # Poles at the origin are declared as integrators, which can be simulated.
             poles = submodel.poles[submodel.poles != 0]
             place = ("system", "additive", k)
             yield place, f"the submodel is unstable and cannot be simulated: {_unstable(poles)}"

@@ -1,4 +1,4 @@
-"""What is allowed in a specification but unwise, said before anything is run."""
+"""Warnings about valid but questionable settings of a specification, before anything is run."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,15 +16,15 @@ from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.spec import Spec
 from ctid_cli.specification.sweeps import checked, variants
 
-#: A record shows the slowest pole if it lasts this many of its time constants beyond the delay: below that its standard
-#: error grows much faster than that of a longer record falls with the number of samples.
+#: Minimum record length beyond the delay, in time constants of the slowest pole: in shorter records the standard
+#: error of the pole grows much faster than it would fall with the number of samples in longer ones.
 TIME_CONSTANTS = 3.0
-#: Input edges this close to a sample, as a fraction of the sampling interval, are seen when they happen.
+#: Input edges within this fraction of the sampling interval of a sample count as simultaneous with it.
 ON_TIME = 1e-6
 
 
 def joint_warnings(spec: Spec) -> list[Complaint]:
-    """Say what is allowed but unwise."""
+    """Return the warnings."""
     cases = cases_of(spec)
     warnings = [*checked(cases, CHECKS), *checked(cases, (_of_sampled_input,), MAX_TRIALS)]
     if spec.starts is not None:
@@ -53,7 +53,7 @@ def _of_slow_sampling(system: Any, sampling: Any) -> Iterator[Complaint]:
 
 
 def _of_short_record(system: Any, duration: float) -> Iterator[Complaint]:
-    # A lightly damped mode shows within its period, long before it has died away.
+    # A lightly damped mode is visible within one period, long before it has decayed.
     frequencies = np.abs(system.poles)
     slowest = float(1.0 / frequencies[frequencies > 0.0].min(initial=math.inf))
     needed = float(system.delay + TIME_CONSTANTS * slowest)
@@ -77,7 +77,7 @@ def _of_sampled_input(excitation: Any, sampling: Any, seed: int) -> Iterator[Com
     try:
         times = sampling.times(stream(seed, "sampling", 0))
         applied = excitation.generate(times, stream(seed, "input", 0))
-    except DataError as error:  # of a case that was not tried
+    except DataError as error:  # in a case that was not tried
         yield ("excitation",), f"{error}; estimates of such data sets are stored as FAILED"
         return
     if applied.hold != "zoh":
@@ -104,7 +104,7 @@ def _of_open_loop(loop: Any, estimator: Any) -> Iterator[Complaint]:
 
 
 def _own(estimator: Any, name: str) -> Any:
-    """Return the estimator of one of several inputs, which have names, by itself."""
+    """Return the estimator for one of several named inputs."""
     return estimator.of_input(name) if name and hasattr(estimator, "of_input") else estimator
 
 
@@ -131,7 +131,7 @@ def _of_white_formula(noise: Any, estimator: Any) -> Iterator[Complaint]:
 
 
 def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint]:
-    """Say that no parameters make the model the system."""
+    """Yield an estimator whose model structure does not contain the system."""
     name, system = driven
     estimator = _own(estimator, name)
     key, more = ("terms", "add to the terms") if hasattr(estimator, "terms") else ("", "")
@@ -144,7 +144,7 @@ def _of_structure(driven: tuple[str, Any], estimator: Any) -> Iterator[Complaint
 
 
 def _degrees(model: Any) -> Sequence[int]:
-    """Return the degrees of denominator and numerator of a system or of the model of an estimator, as one fraction."""
+    """Return the degrees of denominator and numerator of a system or model as one fraction."""
     if hasattr(model, "relative_degree"):
         return model.order, model.order - model.relative_degree
     if hasattr(model, "terms"):

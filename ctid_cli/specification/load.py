@@ -1,4 +1,4 @@
-"""From a YAML file to a checked specification; everything that is wrong with it is reported at once."""
+"""Loading of a specification from a YAML file; all errors are reported at once."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -30,13 +30,13 @@ def load_spec(
     allow_outside: bool = False,
     trial: Callable[[Spec], Any] | None = None,
 ) -> Spec:
-    """Read and check a specification, of a file or as a mapping.
+    """Read and check a specification from a file or a mapping.
 
-    Code that it names is run, and data files outside its folder are read, only if that is allowed; a caller that gives
-    a mapping chooses the files. A trial is given what is right, and returns what is wrong and odd about it.
+    Code that it names is run, and data files outside its folder are read, only if allowed; a caller that passes a
+    mapping chooses the files. A trial function receives the valid part and returns its errors and warnings.
 
-    Sampling is called slow, which is a warning and no error, if its (mean) interval exceeds pi / max |p| over the
-    poles p [rad/s] of the system: its rate is then below twice the frequency of the fastest pole.
+    Sampling is called slow (a warning, not an error) if its (mean) interval exceeds pi / max |p| over the poles
+    p [rad/s] of the system: the sampling rate is then below twice the frequency of the fastest pole.
     """
     if isinstance(given, Mapping):
         folder, source = Path(), parse_yaml(written(given), "(specification)", overrides)
@@ -73,7 +73,7 @@ def spec_from_canonical(canonical: Mapping[str, Any], folder: Path | None = None
 
 
 def load_loop(path: Path) -> LoopOptions:
-    """Return the section ``loop`` of a file, for a record whose reference is a column of it."""
+    """Return the section ``loop`` of a file, for a record with its reference in a column."""
     source = read_yaml(path)
     tree = source.tree.get("loop") if isinstance(source.tree, dict) else None
     if tree is None:
@@ -101,7 +101,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _require_none(source: YamlSource, complaints: Sequence[Complaint]) -> None:
-    """Raise what is wrong, each problem once and in the order of the file."""
+    """Raise a SpecError if there are problems: each one once, in the order of the file."""
     problems = {source.problem(where, message) for where, message in complaints}
     if problems:
         in_order = sorted(problems, key=lambda p: (p.file == OVERRIDE_FILE, p.line, p.column, p.key, p.message))
@@ -109,7 +109,7 @@ def _require_none(source: YamlSource, complaints: Sequence[Complaint]) -> None:
 
 
 def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
-    """Return where kinds name code that is not the program's own, anywhere in a tree, however deep."""
+    """Yield the places of kinds in a tree that name code outside the program."""
     waiting: list[tuple[KeyPath, Any]] = [((), tree)]
     while waiting:
         path, node = waiting.pop()
@@ -121,16 +121,16 @@ def _code_in(tree: Any, folder: Path) -> Iterator[KeyPath]:
 
 
 def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec, list[Complaint]]:
-    """Return what is right of a specification, and all that is wrong with its sections by themselves."""
+    """Return the valid part of a specification, and all problems of its individual sections."""
     tree = source.tree
-    # A specification may come from anywhere.
+    # A specification is untrusted input.
     ask = "names code, which would be run; if you trust it, repeat the command with --allow-code (or CTID_ALLOW_CODE=1)"
     code = [source.problem(path, ask) for path in _code_in(tree, folder)]
     if code and not allow_code:
         raise RefusedError("\n".join(map(str, sorted(code, key=lambda p: (p.line, p.column)))))
     spec, complaints = _right_part(tree, folder)
     complaints += [((*where, KEY), message) for where, message in presence_complaints(spec, tree)]
-    # What is wrong is left out of what is looked at next.
+    # Invalid sections are excluded from the following checks.
     wrong = {str(where[0]) for where, _ in complaints if where and where[0] != "estimators"}
     spec = spec.model_copy(update=dict.fromkeys(wrong & Spec.model_fields.keys()))
     spec._folder, spec._source = folder, source
@@ -138,7 +138,7 @@ def _validated(source: YamlSource, folder: Path, allow_code: bool) -> tuple[Spec
 
 
 def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Complaint]]:
-    """Return the sections, and estimators, that are right by themselves, and what is wrong with the others."""
+    """Return the valid sections and estimators, and the problems of the others."""
     context = {"folder": folder, "of_signal": tree.get("signal") is not None}
     try:
         return Spec.model_validate(tree, context=context), []
@@ -154,7 +154,7 @@ def _right_part(tree: Mapping[str, Any], folder: Path) -> tuple[Spec, list[Compl
 
 
 def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Complaint]]:
-    """Return the specification with the content hashes of its files filled in, and what is wrong with the files."""
+    """Return the specification with the content hashes of its files, and the problems of the files."""
     sections: dict[KeyPath, Any] = {("data",): spec.data, ("sampling",): spec.sampling}
     if spec.data is None:
         sections |= spec.generators
@@ -170,9 +170,9 @@ def _with_files(spec: Spec, *, own: bool, anywhere: bool) -> tuple[Spec, list[Co
 
 
 def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, anywhere: bool) -> str:
-    """Return the content hash of a file that can be used.
+    """Return the content hash of a file after checking that it is usable.
 
-    Nothing that a file outside the folder holds is repeated, unless the specification is the caller's own.
+    The content of files outside the folder never appears in messages, unless the caller wrote the specification.
     """
     file = joined(spec.folder, section.file)
     open_to_all = own or is_inside(file, spec.folder)
@@ -196,7 +196,7 @@ def _checked_content(spec: Spec, place: KeyPath, section: Any, *, own: bool, any
     return content
 
 
-# --- which sections an experiment must have, and which it must not, whatever they hold -------------------------------
+# --- required and forbidden sections ---------------------------------------------------------------------------------
 
 _SAMPLING = "is missing; for example {kind: regular, interval: 0.001, duration: 60}"
 _MISSING = "is missing; data are simulated with system, excitation (or loop) and sampling"
@@ -205,8 +205,8 @@ _OF_SYSTEM = "belongs to a system, and there is none here; leave it out"
 _OF_SIGNAL = "belongs to a signal, and there is none here; leave it out"
 _OF_SIMULATION = "belongs to simulated data, and 'data' names a measured record; keep one of the two"
 _OF_LOOP = "the loop makes the input; keep one of the two (a reference stands in loop.reference)"
-#: Sections that are required and forbidden, with what is said of them, by the section that tells the kind of an
-#: experiment; the first that is present counts, the last where none is.
+#: Required and forbidden sections with their messages, by the section that determines the kind of an experiment: the
+#: first one that is present, or the last entry if none is.
 EXPERIMENTS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
     "signal": (
         {"sampling": _SAMPLING},
@@ -235,7 +235,7 @@ EXPERIMENTS: dict[str, tuple[dict[str, str], dict[str, str]]] = {
 
 
 def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-    """Say which sections are missing or too many, whatever they hold."""
+    """Yield missing and superfluous sections, independent of their content."""
     present = {name for name in Spec.model_fields if raw.get(name) is not None}
     kind = next((kind for kind in EXPERIMENTS if kind in present), "system")
     required, forbidden = EXPERIMENTS[kind]
@@ -264,13 +264,13 @@ def presence_complaints(spec: Spec, raw: Mapping[str, Any]) -> Iterator[Complain
 
 
 def _mapping(raw: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return a mapping in another one; an empty one where there is something else."""
+    """Return a mapping contained in another one; an empty one if the value is something else."""
     content = raw.get(name)
     return content if isinstance(content, Mapping) else {}
 
 
 def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> str:
-    """Return a section of simulated data that draws random numbers; empty if none does."""
+    """Return the name of a section of simulated data that draws random numbers; empty if none does."""
     if "data" in present:
         return ""
     parts = {name: (raw.get(name), getattr(spec, name)) for name in ("excitation", "sampling", "noise", "disturbance")}
@@ -286,7 +286,7 @@ def _random_section(spec: Spec, raw: Mapping[str, Any], present: set[str]) -> st
 
 
 def _draws_nothing(part: str, content: Any, section: Section | None) -> bool:
-    """Return whether the class that a section, which may be broken, names draws no random number with its options."""
+    """Return whether the class named by a section, which may be invalid, draws no random numbers with its options."""
     target = None if section is None else section.target
     options = content if isinstance(content, Mapping) else {}
     kind = options.get("kind")

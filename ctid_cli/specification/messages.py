@@ -1,4 +1,4 @@
-"""What is wrong with a value, in sentences, and what docstrings say about options: the words of all messages."""
+"""Messages about invalid values, and option texts from docstrings."""
 
 import inspect
 import re
@@ -12,15 +12,15 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from ctid_cli.specification.yaml_source import KEY, KeyPath
 from ctid_cli.text import did_you_mean
 
-#: Key path inside a section, and what is wrong there.
+#: Key path inside a section, and the problem there.
 Complaint = tuple[KeyPath, str]
 
-#: Begins the tags of unions, which pydantic puts into the places of errors; no text from YAML holds it.
+#: Prefix of the tags of unions, which pydantic puts into error locations; no text from YAML contains it.
 TAG = "\0"
-#: Begins a tag that goes on with what else is allowed there.
+#: Prefix of a tag that ends with the other forms allowed there.
 HINT = TAG + ";"
 
-#: Sentence for every error type that a specification can meet.
+#: Message for every pydantic error type that can occur in a specification.
 SENTENCES = {
     "bool_type": "must be true or false, not {shown}",
     "float_type": "must be a number{unit}, not {shown}",
@@ -49,18 +49,18 @@ SENTENCES = {
 
 
 def wrong(message: str) -> PydanticCustomError:
-    """Return an error whose text reaches the user as it is."""
+    """Return an error with a given message for the user."""
     return PydanticCustomError("said", "{message}", {"message": message})
 
 
 def several_wrong(title: str, problems: Iterable[Complaint]) -> ValidationError:
-    """Return one validation error that holds several problems."""
+    """Return one validation error with several problems."""
     details = [InitErrorDetails(type=wrong(message), loc=path, input=None) for path, message in problems]
     return ValidationError.from_exception_data(title, details)
 
 
 def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint:
-    """Return the place and the sentence of an error in a section whose fields have the given descriptions."""
+    """Return the place and message of a pydantic error in a section with the given field descriptions."""
     parts = [str(part) for part in error["loc"]]
     path = tuple(part for part in error["loc"] if not str(part).startswith(TAG))
     kind, value, context = error["type"], error["input"], error.get("ctx", {})
@@ -79,7 +79,7 @@ def explained(error: ErrorDetails, descriptions: Mapping[str, str]) -> Complaint
 def _told(
     path: KeyPath, kind: str, value: Any, context: dict[str, Any], known: Collection[str]
 ) -> tuple[KeyPath, str, Any, dict[str, Any]]:
-    """Return what is to be told of an error, where pydantic's own type, or place, says too little."""
+    """Return place, type, value and context for the message, which replace those of pydantic if they are too vague."""
     if kind == "no_kind" and not isinstance(value, Mapping):
         text = f"a mapping with a 'kind' (one of {context['allowed']})"
         each = "; several kinds are several experiments, each with a file" if isinstance(value, list) else ""
@@ -91,13 +91,13 @@ def _told(
     if kind == "extra_forbidden" and (word := str(path[-1]).partition(" ")[0]) in known:
         return path, "no_colon", value, {"word": word}
     if kind == "float_type" and type(value) is int:
-        # An integer beyond all floating-point numbers.
+        # An integer outside the range of floating-point numbers.
         return path, "finite_number", float("inf"), context
     return path, kind, value, context
 
 
 def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
-    """Return what a sentence may say about a field, and about the others of its section."""
+    """Return the words that a message may use about a field and about the others of its section."""
     field = str(path[0]) if path else ""
     description = descriptions.get(field, "")
     unit = re.search(r" \[[^\]-][^\]]*\]", description)
@@ -110,7 +110,7 @@ def _words(path: KeyPath, descriptions: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
-    """Return what to write in the place of a value, where that can be guessed."""
+    """Return a suggestion for a value as the end of a message, if one can be guessed."""
     if kind in ("float_type", "int_type") and isinstance(value, (list, tuple)):
         return "; this key cannot be swept"
     if kind == "float_type" and isinstance(value, str) and re.fullmatch(r"[-+]?[0-9]+,[0-9]+", value):
@@ -128,7 +128,7 @@ def _hint(kind: str, value: Any, words: Mapping[str, Any]) -> str:
 
 @cache
 def option_docs(target: type) -> dict[str, str]:
-    """Return the text about every option of a class and its bases: the section Parameters of their docstrings."""
+    """Return the description of every option of a class, from the Parameters sections of its bases and itself."""
     docs: dict[str, str] = {}
     for base in reversed(target.__mro__):
         text = inspect.cleandoc(base.__dict__.get("__doc__") or "")
@@ -141,7 +141,7 @@ def option_docs(target: type) -> dict[str, str]:
 
 
 def shown(value: Any) -> str:
-    """Return a value from a YAML file in the words of a message."""
+    """Return a description of a YAML value for messages."""
     if value is None:
         return "nothing (null)"
     if isinstance(value, bool):

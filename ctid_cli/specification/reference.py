@@ -1,4 +1,4 @@
-"""The reference of experiment files as text: type, unit, default and meaning of every key, from the JSON Schema."""
+"""Reference of experiment files as text: type, unit, default and meaning of every key, from the JSON Schema."""
 
 import json
 import re
@@ -13,10 +13,10 @@ Node = Mapping[str, Any]
 
 _TYPES = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
 _LIMITS = {"exclusiveMinimum": "above", "minimum": "at least", "exclusiveMaximum": "below", "maximum": "at most"}
-#: Limits of what the computer can hold, which the reference omits.
+#: Limits this large come from number formats; the reference omits them.
 _ENORMOUS = 10**15
 _UNIT = re.compile(r" \[([^],…]+)\]")
-#: Python's words for what YAML writes otherwise.
+#: Python constants in YAML notation.
 _IN_YAML = {"None": "null", "True": "true", "False": "false"}
 _LEGEND = (
     "Keys of experiment files: type, [unit], default, meaning. '- kind:' begins one of several forms. '(or a list)': "
@@ -42,7 +42,7 @@ def reference_text(word: str | None = None) -> str:
 
 
 def unit_of(section: str, key: str) -> str:
-    """Return the unit of a key of a section; empty where it has none."""
+    """Return the unit of a key of a section; empty if it has none."""
     schema = json_schema()
     forms = _mappings(schema["properties"].get(section, {}), schema["$defs"])
     texts = (_plain(form["properties"][key]) for form in forms if key in form["properties"])
@@ -59,7 +59,7 @@ def _kind(form: Node) -> str | None:
 
 
 def _keys(form: Node, defs: Node, indent: str, only: str | None = None) -> Iterator[str]:
-    """Yield lines about the keys of a mapping, of which one kind alone may be wanted."""
+    """Yield lines about the keys of a mapping, optionally of one kind only."""
     for key, node in form["properties"].items():
         if key == "kind" and "const" in node:
             continue
@@ -82,7 +82,7 @@ def _keys(form: Node, defs: Node, indent: str, only: str | None = None) -> Itera
 
 
 def _plain(node: Node) -> str:
-    """Return what is said about a value or mapping, in the words of YAML."""
+    """Return the description of a value or mapping with YAML constants."""
     text = node.get("description", "").replace("``", "")
     return re.sub(r"\b(None|True|False)\b", lambda word: _IN_YAML[word[0]], text)
 
@@ -117,7 +117,7 @@ def _mappings(node: Node, defs: Node) -> list[Node]:
 
 
 def _list_form(node: Node, defs: Node) -> Node | None:
-    """Return the list of such values that may stand in the place of one."""
+    """Return the list form of a value, if a list is allowed in its place."""
     forms = _alternatives(node, defs)
     lists = [form for form in forms if form.get("type") == "array"]
     same = [form for form in lists if _alternatives(form.get("items", {}), defs)[0] in forms]
@@ -125,7 +125,7 @@ def _list_form(node: Node, defs: Node) -> Node | None:
 
 
 def _type(node: Node, defs: Node) -> str:
-    """Return the types of a value in words."""
+    """Return the types of a value as text."""
     listed = _list_form(node, defs)
     return " or ".join(dict.fromkeys(_one_type(form, defs) for form in _alternatives(node, defs) if form is not listed))
 

@@ -1,8 +1,8 @@
-"""Sections of a specification: pydantic models that explain in plain words what is wrong, everything at once.
+"""Base of the sections of a specification: pydantic models that report all errors at once in plain words.
 
 A section for an option dataclass is made from the class: types and defaults from its fields, descriptions and units
-from its docstring. Every scalar option may be a list of values to sweep, or a mapping ``{geometric: …}`` where the
-metadata of the field say so.
+from its docstring. Every scalar option may be a list of values to sweep, or a mapping ``{geometric: …}`` if the field
+metadata allow it.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, validate_default=True, defer_build=True)
 
-    #: Option dataclass that it describes, if it describes one.
+    #: Option dataclass that it describes, if any.
     target: ClassVar[type | None] = None
-    #: Whether the option dataclass is one that the user wrote.
+    #: Whether the option dataclass is custom.
     custom: ClassVar[bool] = False
-    #: Sentences for keys that belong to another form of the section.
+    #: Messages for keys that belong to another form of the section.
     elsewhere: ClassVar[Mapping[str, str]] = {}
-    #: What to say of a section that gives nothing; empty if it may.
+    #: Message for an empty section; empty if it is allowed.
     if_empty: ClassVar[str] = ""
 
     @classmethod
     def descriptions(cls) -> dict[str, str]:
-        """Return what the docstring of the section, or of the option dataclass it was made from, says of each key."""
+        """Return the description of each key from the docstring of the section or of its option dataclass."""
         docs = {"kind": "Which one it is"} | option_docs(cls.target or cls) | option_docs(cls)
         return {name: docs.get(name, "") for name in cls.model_fields}
 
@@ -68,7 +68,7 @@ class Section(BaseModel):
             section = handler(value)
         except ValidationError as error:
             details, known = cls.details(error, value), cls.descriptions()
-            # The key that a misspelt one was meant to be is not missing too.
+            # The key meant by a misspelt one is not also reported as missing.
             unknown = [str(each["loc"][-1]) for each in details if each["type"] == "extra_forbidden"]
             meant = {closest(name, known) for name in unknown}
             told = [each for each in details if each["type"] != "missing" or each["loc"][-1] not in meant]
@@ -83,33 +83,33 @@ class Section(BaseModel):
 
     @classmethod
     def details(cls, error: ValidationError, raw: Any) -> list[ErrorDetails]:
-        """Return what pydantic has against the values of a section."""
+        """Return the pydantic errors of the values of a section."""
         return error.errors(include_url=False)
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-        """Say what is wrong with the presence of keys, whatever their values."""
+        """Yield missing or superfluous keys, independent of their values."""
         yield from ()
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say what is wrong with the section although every value, and the options if any, are right by themselves."""
+        """Yield problems of a section in which every value is valid on its own."""
         if self.if_empty and all(getattr(self, name) is None for name in type(self).model_fields):
             yield (), self.if_empty
 
     def build(self) -> Any:
-        """Return the options that the section describes, where nothing is swept."""
+        """Return the options described by a section without swept values."""
         assert self.target is not None
         options = {option.name for option in dataclasses.fields(self.target) if option.init}
         return self.target(**{name: self.part(name) for name in type(self).model_fields if name in options})
 
     def part(self, name: str) -> Any:
-        """Return what an option dataclass is given for a field."""
+        """Return the value of a key for a field of the option dataclass."""
         return _part(getattr(self, name))
 
     def options(self) -> Any:
-        """Build the options; an OptionError says which of them is refused and why."""
+        """Build the options; an OptionError names the refused option and the reason."""
         try:
-            with np.errstate(all="ignore"):  # what overflows is refused, or found by the section's own complaints
+            with np.errstate(all="ignore"):  # overflow is refused here or by `complaints`
                 return self.build()
         except (Exception, SystemExit) as error:
             if self.custom and not isinstance(error, (ValueError, CtidError)):
@@ -121,14 +121,14 @@ class Section(BaseModel):
 
 
 def place_of(error: Exception, options: Container[str]) -> tuple[str, ...]:
-    """Return the option that an error is about, if it is about one of them."""
+    """Return the option named by an error as a path; empty if there is none."""
     field = getattr(error, "field", "")
     return (field,) if field in options else ()
 
 
 def _part(value: Any) -> Any:
     if isinstance(value, Section):
-        return value.options()  # which nothing has against it: the section was validated before the one it is in
+        return value.options()  # never fails: inner sections are validated before outer ones
     return tuple(map(_part, value)) if isinstance(value, list) else value
 
 
@@ -144,7 +144,7 @@ class Geometric(Section):
     geometric: Annotated[list[Whole], Field(min_length=3, max_length=3)]
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say why there are no such numbers."""
+        """Yield the reason why there are no such numbers."""
         if self.geometric[2] > MAX_COMBINATIONS:
             yield ("geometric", 2), f"{self.geometric[2]} values are too many; at most {MAX_COMBINATIONS} are allowed"
             return
@@ -162,7 +162,7 @@ class Geometric(Section):
 def section_for(
     target: type, kind: str = "", *, sweeping: bool = True, without: str = "", base: type[Section] = Section
 ) -> type[Section]:
-    """Return the section of an option dataclass."""
+    """Return the section class of an option dataclass."""
     hints = get_type_hints(target)
     fields: dict[str, Any] = {}
     if kind:
@@ -182,14 +182,14 @@ def section_for(
 
 
 class Options(OneOf):
-    """Annotation of the section of an option dataclass."""
+    """Annotation of a section of an option dataclass."""
 
     def __init__(self, target: type, **settings: Any) -> None:
         super().__init__(lambda _: "options", {"options": section_for(target, **settings)})
 
 
 class WithKey(OneOf):
-    """Annotation of a section that has one form with a key (and other values), and another one without it."""
+    """Annotation of a section with one form that has a key (and other values), and another form without it."""
 
     def __init__(self, key: str, form: Any, otherwise: Any, **also: Any) -> None:
         def choose(value: Any) -> str:
@@ -205,7 +205,7 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
     simple = {float: Number, int: Whole, bool: bool, str: Text, Array: Coefficients}
     origin, arguments = get_origin(hint), get_args(hint)
     if hint in simple:
-        # Names of files and columns are no quantities, and sweeping them would hide what a result belongs to.
+        # Names of files and columns are not quantities; sweeping them would hide the origin of a result.
         return simple[hint], hint not in (str, Array)
     if origin is Literal:
         return hint, True
@@ -228,7 +228,7 @@ def _form(hint: Any, name: str) -> tuple[Any, bool]:
 def _list_form(items: tuple[Any, ...]) -> Any:
     """Return the annotation of a tuple of numbers, words or option dataclasses; None for any other tuple."""
     if dataclasses.is_dataclass(items[0]):
-        # A list of such lists would say too little about which of them belong together, so that nothing in it is swept.
+        # Nothing in these lists is swept: it would be unclear which of the lists inside belong together.
         item = section_for(items[0], sweeping=False)  # type: ignore[arg-type]
         return Annotated[list[item], Field(min_length=1)]  # type: ignore[valid-type]
     length = None if Ellipsis in items else len(items)
@@ -237,7 +237,7 @@ def _list_form(items: tuple[Any, ...]) -> Any:
 
 
 def _default(option: dataclasses.Field[Any]) -> Any:
-    """Return the default as a file would give it."""
+    """Return the default as written in a file."""
     default: Any = option.default
     if option.default_factory is not dataclasses.MISSING:
         default = option.default_factory()

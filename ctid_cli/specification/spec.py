@@ -1,7 +1,7 @@
-"""The model of a specification: one YAML file describes one experiment.
+"""Model of a specification: one YAML file describes one experiment.
 
-Its canonical form has every default filled in and no trace of how the file was written; hashes of parts of it are the
-identity of data and estimators.
+The canonical form contains every default and is independent of how the file was written; hashes of its parts identify
+data and estimators.
 """
 
 import itertools
@@ -40,12 +40,12 @@ _EXPERIMENT = matching(
     EXPERIMENT,
     "use letters, digits, '-', '_' and '.', with '/' between parts, no '..', 200 characters at most",
 )
-#: Sections that data are simulated from, besides those of several inputs; their lists combine to data cells.
+#: Sections of simulated data, except those of several inputs; their lists combine to data cells.
 OF_DATA = ("system", "excitation", "loop", "sampling", "noise", "signal", "disturbance")
 
 
 def _usable(name: str) -> str:
-    """Refuse the name of an experiment under which its results could not be found again."""
+    """Refuse an experiment name under which its results could not be found again."""
     why = why_unusable(name)
     if why:
         raise wrong(f"{name!r} cannot be used here: {why}; choose another name")
@@ -53,7 +53,7 @@ def _usable(name: str) -> str:
 
 
 def _several_inputs(inputs: dict[str, InputSection]) -> dict[str, InputSection]:
-    """Refuse one input as several ones."""
+    """Refuse a single input in the section of several inputs."""
     if len(inputs) < 2:
         raise wrong("inputs are two or more; of one input give system and excitation themselves")
     return inputs
@@ -64,12 +64,12 @@ def _several_inputs(inputs: dict[str, InputSection]) -> dict[str, InputSection]:
 
 
 class RegularDurationSection(Section):
-    """Samples at equal intervals, from 0 s, as many as fit into a time.
+    """Samples at equal intervals, from 0 s, over a given duration.
 
     Parameters
     ----------
     kind : {"regular"}
-        Which one it is
+        Kind of sampling
     interval : float
         Sampling interval [s]
     duration : float
@@ -89,21 +89,21 @@ class RegularDurationSection(Section):
         if not duration >= 2.0 * interval:
             message = f"duration must be at least two sampling intervals of {interval:g} s, not {duration:g} s."
             raise OptionError("duration", message)
-        # Beyond the largest whole number of samples any number of them is refused as too many.
+        # A number of samples beyond the largest integer is refused later as too many.
         return RegularSampling(interval, int(min(round(duration / interval), 2**62)))
 
 
 class ListedTimesSection(Section):
-    """Samples at instants that are listed.
+    """Samples at listed instants.
 
     Parameters
     ----------
     kind : {"irregular"}
-        Which one it is
+        Kind of sampling
     times : list of float
         The instants, strictly increasing [s]; the record begins at the first of them
     input_record : {"sampled", "exact"}, default "exact"
-        What the estimator is told of the input: its samples at the output's instants, or its true edges
+        Input given to the estimator: its samples at the output's instants, or its true edges
     """
 
     target: ClassVar[type | None] = ListedInstants
@@ -116,7 +116,7 @@ class ListedTimesSection(Section):
     input_record: Annotated[InputRecord | list[InputRecord], Swept(InputRecord)] = "exact"
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say which instant does not come after the one before it."""
+        """Yield the first instant that is not later than the one before it."""
         for k, (before, now) in enumerate(itertools.pairwise(self.times), start=1):
             if now <= before:
                 yield ("times", k), f"{now:.12g} s comes after {before:.12g} s; times must increase strictly"
@@ -147,11 +147,11 @@ EstimatorSection = Annotated[Any, Kinds("estimator", "frequency_estimator", cust
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Number of data sets, and what counts
+# Number of data sets, and success
 
 
 class UntilSection(Section):
-    """How precise the measures of every data cell must be, in place of a number of data sets.
+    """Required precision of the measures of every data cell, in place of a number of data sets.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class UntilSection(Section):
 
 
 class MonteCarloSection(Section):
-    """How many data sets, and which: a number of them, or until the measures are precise enough.
+    """Number of data sets and their seed: a fixed number, or until the measures are precise enough.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ class MonteCarloSection(Section):
     until : mapping, optional
         Precision that decides how many data sets each data cell gets, in place of runs
     at_most : int, optional
-        With until, most data sets of a data cell; 200 is the fewest
+        With until, maximum number of data sets of a data cell, at least 200
     """
 
     runs: Annotated[int | None, Field(ge=1, le=1_000_000)] = None
@@ -189,7 +189,7 @@ class MonteCarloSection(Section):
 
     @classmethod
     def requirements(cls, raw: Mapping[str, Any]) -> Iterator[Complaint]:
-        """Say that there is no number of data sets, or more than one rule for it."""
+        """Yield the absence of a number of data sets, or conflicting rules for it."""
         given = {name for name in ("runs", "until", "at_most") if raw.get(name) is not None}
         if {"runs", "until"} <= given:
             yield ("until",), "decides how many data sets there are; keep runs or until (with at_most)"
@@ -202,17 +202,17 @@ class MonteCarloSection(Section):
 
     @property
     def most(self) -> int:
-        """Most data sets that a data cell can get."""
+        """Maximum number of data sets of a data cell."""
         return self.runs or self.at_most or 1
 
     @property
     def first(self) -> int:
-        """Data sets of every data cell, or of its first block."""
+        """Number of data sets of every data cell, or of its first block."""
         return self.runs or next(block_ends(self.most))
 
 
 class SuccessSection(Section):
-    """When an estimate counts as converged; all that is given must hold.
+    """Conditions for an estimate to count as converged; all given ones must hold.
 
     Parameters
     ----------
@@ -225,9 +225,9 @@ class SuccessSection(Section):
     band : float, optional
         Largest error of a settled frequency of a signal [rad/s]
     by : float, optional
-        Frequencies must settle so soon after the start and after their last step [s]
+        Maximum settling time of frequencies after the start and after their last step [s]
     window : list of float, optional
-        First and last instant of the window of rms and bias of a frequency [s], no condition itself; the last 10 s
+        First and last instant of the window of rms and bias of a frequency [s], not a condition; default last 10 s
     """
 
     if_empty = (
@@ -243,7 +243,7 @@ class SuccessSection(Section):
     window: Annotated[list[NotNegative], Field(min_length=2, max_length=2)] | None = None
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that nothing is asked for, or by when but not what, or that the window is empty."""
+        """Yield an empty rule, ``by`` or ``window`` without ``band``, and an empty window."""
         yield from super().complaints()
         if self.by is not None and self.band is None:
             yield ("by",), "is the time of settling into a band; add band [rad/s]"
@@ -254,16 +254,16 @@ class SuccessSection(Section):
 
 
 class LimitsSection(Section):
-    """What one estimate may take; what takes more is ended and counts as a failure of its estimator.
+    """Limits of one estimate; an estimate that exceeds one is ended and counts as a failure of its estimator.
 
     Parameters
     ----------
     cpu_seconds : float, optional
-        Most processor time of an estimate [s]; no limit by default
+        Maximum processor time of an estimate [s]; no limit by default
     wall_seconds : float, optional
-        Most time of an estimate, asleep or at work [s]; no limit by default
+        Maximum wall time of an estimate [s]; no limit by default
     memory_mb : float, optional
-        Most memory of an estimate beyond what its process held before [MB]; no limit by default
+        Maximum memory of an estimate beyond that of its process before [MB]; no limit by default
     """
 
     if_empty = "give cpu_seconds, wall_seconds, memory_mb or several of them; for example {wall_seconds: 600}"
@@ -274,7 +274,7 @@ class LimitsSection(Section):
 
 
 class Spec(Section):
-    """One experiment: simulated or measured data or a signal, estimators, starts, and what counts as success.
+    """One experiment: simulated or measured data or a signal, estimators, starts, and success rule.
 
     Parameters
     ----------
@@ -287,13 +287,13 @@ class Spec(Section):
     inputs : mapping of mappings, optional
         Several inputs by their names, in place of system and excitation, for example 'u1: {system: …, excitation: …}'
     loop : mapping, optional
-        What makes the input from the output, in place of excitation
+        Controller that computes the input from the output, in place of excitation
     signal : mapping, optional
         A sum of sinusoids whose frequencies are estimated, in place of a system
     disturbance : mapping or "none", optional
         What is added to the signal; none by default
     sampling : mapping, optional
-        When the output is sampled
+        Sampling instants of the output
     noise : mapping, optional
         What is added to the output; none by default
     data : mapping, optional
@@ -301,11 +301,11 @@ class Spec(Section):
     estimators : mapping of mappings
         estimators by the names that tables show, for example 'mine: {kind: td_srivc, …}'
     starts : mapping, optional
-        Initial delays and parameters; by default every estimator chooses its own
+        Initial delays and parameters; by default each estimator chooses its own
     monte_carlo : mapping, optional
-        Number of data sets and their seed; needed where anything is random
+        Number of data sets and their seed; needed if anything is random
     success : mapping, optional
-        When an estimate counts as converged
+        Conditions for an estimate to count as converged
     measures : list of str or mapping, optional
         What tables show, such as [bias, rmse, coverage]; by default percentages, or bias and rmse without success; a
         mapping with a kind is a custom measure
@@ -336,7 +336,7 @@ class Spec(Section):
 
     @classmethod
     def details(cls, error: ValidationError, raw: Any) -> list[ErrorDetails]:
-        """Return what pydantic has against the values, naming only the estimators for this kind of experiment."""
+        """Return the pydantic errors of the values, naming only the estimators for this kind of experiment."""
         found = super().details(error, raw)
         given = {name for name in ("signal", "system", "data") if raw.get(name) is not None}
         kinds = KINDS["frequency_estimator" if "signal" in given else "estimator"]
@@ -347,7 +347,7 @@ class Spec(Section):
 
     @property
     def measured(self) -> MeasuredSource | None:
-        """Reader of the measured record, its file as seen from the working directory; None for simulated data."""
+        """Reader of the measured record, with its file relative to the working directory; None for simulated data."""
         if self.data is None:
             return None
         loop = None if self.loop is None else variants(self.loop)[0].options
@@ -356,7 +356,7 @@ class Spec(Section):
 
     @property
     def of_data(self) -> dict[KeyPath, Section]:
-        """Sections that data are simulated from, by their key paths."""
+        """Sections of simulated data, by their key paths."""
         inputs: dict[KeyPath, Any] = {}
         for name, one in (self.inputs or {}).items():
             inputs |= {("inputs", name, "system"): one.system, ("inputs", name, "excitation"): one.excitation}
@@ -365,7 +365,7 @@ class Spec(Section):
 
     @property
     def generators(self) -> dict[KeyPath, Section]:
-        """Sections of what drives the simulation, by their key paths: the inputs, or the reference of the loop."""
+        """Sections of the inputs or of the loop's reference, by their key paths."""
         found = {path: section for path, section in self.of_data.items() if path[-1] == "excitation"}
         if self.loop is not None and self.loop.reference is not None:
             found[("loop", "reference")] = self.loop.reference
@@ -378,12 +378,12 @@ class Spec(Section):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is unwise but allowed, each with its place in the file."""
+        """Warnings about questionable settings, each with its place in the file."""
         return self._warnings
 
     @property
     def text(self) -> str:
-        """The specification as the user wrote it; the canonical form where there is no file."""
+        """The specification as the user wrote it; the canonical form if there is no file."""
         return self._source.text or canonical_json(self.canonical())
 
     @property
@@ -397,14 +397,14 @@ class Spec(Section):
 
 
 class SpecPart(Spec):
-    """What is right of a specification that has mistakes; nothing is required of it.
+    """The valid part of a specification with errors; nothing is required.
 
     Parameters
     ----------
     experiment : str
-        Name of the experiment; empty if it is wrong
+        Name of the experiment; empty if it is invalid
     estimators : mapping of mappings
-        Estimators that are right, by their names
+        Valid estimators, by their names
     """
 
     experiment: str = ""

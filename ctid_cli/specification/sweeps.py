@@ -1,4 +1,4 @@
-"""Lists of values to sweep: the combinations of a section, and complaints about some of them."""
+"""Sweeps over lists of values: combinations of a section, and problems of some of them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from ctid_cli.specification.messages import Complaint
 from ctid_cli.specification.values import Swept
 from ctid_cli.specification.yaml_source import KeyPath
 
-#: Combinations that one section may sweep, and data cells that one experiment may hold.
+#: Maximum number of combinations of one section, and of data cells of one experiment.
 MAX_COMBINATIONS = 100_000
 AnySection = TypeVar("AnySection", bound=BaseModel)
-#: A complaint, and the swept values that it is about.
+#: A problem, and the swept values for which it occurs.
 Failure = tuple[KeyPath, str, Mapping[KeyPath, Any]]
-#: What a check is given, with the swept values that it comes from.
+#: Argument of a check, with the swept values from which it was made.
 Case = tuple[Any, Mapping[KeyPath, Any]]
-#: All that checks are given, by its name and its place.
+#: All arguments of checks, by name and place.
 Cases = Mapping[str, Mapping[KeyPath, Sequence[Case]]]
 Check = Callable[..., Iterator[Complaint]]
 
@@ -39,14 +39,14 @@ class Variant:
 
 
 def variants(section: Any) -> list[Variant]:
-    """Return all combinations of a section's swept values, the last one changing fastest; none of no section."""
+    """Return all combinations of a section's swept values, the last one changing fastest; empty without a section."""
     if section is None:
         return []
     return [Variant(one.model_dump(mode="json"), swept, one.options()) for swept, one in _combinations(section)]
 
 
 def case_count(section: Any) -> int:
-    """Return the number of combinations of a section's swept values, before any of them is made."""
+    """Return the number of combinations of a section's swept values without making them."""
     return math.prod(len(values) for _, values in _axes(section)) if isinstance(section, BaseModel) else 1
 
 
@@ -70,7 +70,7 @@ def _combinations(section: Any) -> Iterator[tuple[dict[KeyPath, Any], Any]]:
 
 
 def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
-    """Return a section with another value at a place in it."""
+    """Return a section in which the value at a path is replaced."""
     name, rest = str(path[0]), path[1:]
     own = getattr(section, name)
     if rest and isinstance(own, Mapping):
@@ -81,7 +81,7 @@ def replaced(section: AnySection, path: KeyPath, value: Any) -> AnySection:
 
 
 def option_complaints(section: Any) -> list[Complaint]:
-    """Return what the option dataclass, if any, has against the values of a section."""
+    """Return the problems that the option dataclass, if any, finds in the values of a section."""
     if section.target is None:
         return []
     axes = dict(_axes(section))
@@ -97,7 +97,7 @@ def option_complaints(section: Any) -> list[Complaint]:
         except OptionError as refused:
             path: KeyPath = (refused.field,) if refused.field else ()
             if path in swept:
-                # Point at the offending item of the list; its value then needs no repetition.
+                # The place is the invalid item of the list, so that its value need not be repeated.
                 failures.append(((*path, axes[path].index(swept[path])), str(refused), {}))
             else:
                 failures.append((path, str(refused), swept))
@@ -105,7 +105,7 @@ def option_complaints(section: Any) -> list[Complaint]:
 
 
 def grouped(failures: Iterable[Failure], tried: Sequence[Mapping[KeyPath, Any]]) -> list[Complaint]:
-    """Return complaints about combinations, each once, with the swept values that decide on it."""
+    """Return problems of combinations, each once, with the swept values on which it depends."""
     groups: dict[Complaint, list[Mapping[KeyPath, Any]]] = {}
     for path, message, swept in failures:
         groups.setdefault((path, message), []).append(swept)
@@ -129,10 +129,10 @@ def _texts(name: KeyPath, swept: Iterable[Mapping[KeyPath, Any]]) -> set[str]:
 
 
 def checked(cases: Cases, checks: Iterable[Check], at_most: int | None = None) -> Iterator[Complaint]:
-    """Yield what checks have against options that are right by themselves.
+    """Yield problems found by checks in options that are valid on their own.
 
-    The arguments of a check are named after the cases that it is given, each combination of them in turn. A place that
-    it yields begins with the name of an argument, which stands for the place of that case.
+    The arguments of a check are named after the cases; each combination of cases is checked in turn. A place yielded by
+    a check begins with the name of an argument, which is replaced by the place of that case.
     """
     for check in checks:
         names = list(inspect.signature(check).parameters)

@@ -1,4 +1,4 @@
-"""Sections for the system to simulate, for what closes a loop around it, and for where estimators start."""
+"""Sections of the simulated system, of the loop, and of the starts of estimators."""
 
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
@@ -23,7 +23,7 @@ from ctid_cli.specification.sections import Options, Section, WithKey, section_f
 from ctid_cli.specification.sweeps import Variant, variants
 from ctid_cli.specification.values import ByShape, Coefficients, NotNegative, Number, OneOf, Swept, without_copies
 
-#: Highest order that the simulation handles to its stated accuracy.
+#: Highest order for which the simulation has its stated accuracy.
 MAX_ORDER = 12
 
 ExcitationSection = Annotated[Section, Kinds("excitation", custom="excitation")]
@@ -49,7 +49,7 @@ class SystemSection(Section):
     delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say why the system cannot be simulated."""
+        """Yield the reason why the system cannot be simulated."""
         with np.errstate(all="ignore"):
             model = TransferFunction(self.numerator, self.denominator)
         if not (np.isfinite(model.numerator).all() and np.isfinite(model.denominator).all()):
@@ -84,7 +84,7 @@ class SubmodelSection(Section):
     integrators: int = Field(default=0, ge=0)
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say why this is no submodel."""
+        """Yield the reason why the submodel is invalid."""
         submodel = self.options()
         if not (np.isfinite(submodel.numerator).all() and np.isfinite(submodel.denominator).all()):
             yield ("denominator",), "its last coefficient is too small for the others; scale the coefficients"
@@ -130,7 +130,7 @@ class AdditiveSystemSection(AdditiveSection):
     delay: Annotated[float | list[float], Swept(NotNegative)] = 0.0
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say why the system cannot be simulated."""
+        """Yield the reason why the system cannot be simulated."""
         for k, section in enumerate(self.additive):
             submodel = section.options()
             if submodel.order > MAX_ORDER:
@@ -147,7 +147,7 @@ class PartSection(SystemSection):
 
 
 class InputSection(Section):
-    """One of several inputs, and what it drives.
+    """One of several inputs, and its transfer function.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ AnySystemSection = Annotated[Any, WithKey("kind", custom_form("system"), _Linear
 
 
 def truth_of(system: Variant) -> dict[str, float]:
-    """Return what is true of a variant of the system; the name of an option of a custom one stands for its value."""
+    """Return the true values of a system variant; in custom ones, option names are replaced by their values."""
     if not is_custom(system.options):
         return parameters_of(system.options)
     truth = system.values["truth"].items()
@@ -182,7 +182,7 @@ _CONTROLLERS = ("pid", "continuous_pid", "continuous", "relay", "numerator", "de
 
 
 def _other_forms(form: str) -> dict[str, str]:
-    """Return the sentences for the keys of the other forms of a controller."""
+    """Return the messages for keys of the other forms of a controller."""
     twice = f"gives the controller a second time, '{form}' has it already; keep one of the forms"
     return {key: twice for key in _CONTROLLERS if key != form}
 
@@ -210,7 +210,7 @@ class PidSection(Section):
 
 
 class ControllerSection(Section):
-    """A controller in the form of its one key."""
+    """A controller in one of several forms, selected by its key."""
 
     def build(self) -> Any:
         """Return the controller."""
@@ -263,7 +263,7 @@ class ContinuousControllerSection(ControllerSection):
 
 
 class UnknownControllerSection(ControllerSection):
-    """A controller that is not known, as ``loop: unknown`` says.
+    """An unknown controller, written as ``loop: unknown``.
 
     Parameters
     ----------
@@ -281,12 +281,12 @@ class UnknownControllerSection(ControllerSection):
 
 
 class RelayControllerSection(ControllerSection):
-    """A relay, which makes the loop oscillate by itself.
+    """A relay, with which the loop oscillates.
 
     Parameters
     ----------
     relay : mapping
-        Its two values, and its hysteresis
+        Output values and hysteresis of the relay
     """
 
     target: ClassVar[type | None] = Relay
@@ -303,12 +303,12 @@ _OfKnown = Annotated[Section, WithKey("pid", PidControllerSection, _OfContinuous
 
 
 def loop_as_mapping(given: Any) -> Any:
-    """Return the section of a loop, for the word unknown that of a controller that is not known."""
+    """Return the section of a loop; for the word unknown, that of an unknown controller."""
     return {"controller": {"unknown": True}} if given == "unknown" else given
 
 
 class LoopSection(Section):
-    """What makes the input: a controller that is fed the output, and a reference.
+    """A feedback loop: a controller with the output as feedback, and a reference.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ class LoopSection(Section):
     enters: Annotated[Enters | list[Enters], Swept(Enters)] = "controller"
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say that the controller does nothing."""
+        """Yield a controller without any effect."""
         if any(_does_nothing(variant.options.controller) for variant in variants(self)):
             yield ("controller",), "the controller is zero, so there is no loop; give it a gain, or give excitation"
 
@@ -343,7 +343,7 @@ def _does_nothing(controller: DiscreteController | ContinuousController | Contin
 
 
 class UniformStart(Section):
-    """An initial delay drawn anew for every data set.
+    """A random initial delay for every data set.
 
     Parameters
     ----------
@@ -354,22 +354,22 @@ class UniformStart(Section):
     uniform: Annotated[list[NotNegative], Field(min_length=2, max_length=2)]
 
     def complaints(self) -> Iterator[Complaint]:
-        """Say why the range is none."""
+        """Yield the reason why the range is invalid."""
         low, high = self.uniform
         if not low < high:
             yield ("uniform",), f"the first value, {low:g} s, must be below the second, {high:g} s"
 
 
 class RelativeStart(Section):
-    """Initial parameters drawn anew for every data set, around those of the simulated system.
+    """Random initial parameters for every data set, around those of the simulated system.
 
     Parameters
     ----------
     relative_uniform : float
-        Every parameter is multiplied by a random number from 1 - this to 1 + this [-]
+        Half-width r of the random factor of every parameter, uniform from 1 - r to 1 + r [-]
     """
 
-    # Below 1 parameters keep their sign.
+    # Below 1, parameters keep their signs.
     relative_uniform: float = Field(gt=0.0, lt=1.0, allow_inf_nan=False)
 
 
@@ -384,7 +384,7 @@ def _form(value: Any) -> str | None:
 
 
 def _several(one: OneOf) -> ByShape:
-    """Return a start or a list of different ones."""
+    """Return the annotation of a start or a list of different ones."""
     item = Annotated[Any, one]
     return ByShape(item, list=Annotated[list[item], Field(min_length=1), AfterValidator(without_copies)])
 
@@ -396,7 +396,7 @@ _LISTED = AfterValidator(lambda value: value if isinstance(value, list) else [va
 
 
 class StartsSection(Section):
-    """Where estimators start that need, or take, an initial delay or initial parameters.
+    """Starts of the estimators that need, or accept, an initial delay or initial parameters.
 
     Parameters
     ----------
@@ -414,7 +414,7 @@ class StartsSection(Section):
 
 
 def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
-    """Return the starts that a specification names."""
+    """Return the starts in a specification."""
     if section is None:
         return ()
     points: list[StartPoint] = []
@@ -435,10 +435,10 @@ def start_points(section: StartsSection | None) -> tuple[StartPoint, ...]:
 
 
 def _short(value: float) -> str:
-    """Return the shortest text that is the number again, without a trailing ``.0``."""
+    """Return the shortest text that represents the number exactly, without a trailing ``.0``."""
     return repr(value).removesuffix(".0")
 
 
 def _percent(value: float) -> str:
-    """Return a fraction in percent, as exactly as the fraction was written."""
+    """Return a fraction in percent with the precision in which it was written."""
     return f"{(100 * Decimal(repr(value))).normalize():f}"

@@ -1,4 +1,4 @@
-"""Values of a specification: numbers, words, and annotations of what may have one of several forms."""
+"""Values of a specification: numbers, words, and annotations of values with several forms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic_core import CoreSchema
 
 from ctid_cli.specification.messages import HINT, TAG, several_wrong, shown, wrong
 
-#: Whole numbers beyond this fit no column of a table or archive.
+#: Largest whole number that fits into a column of a table or archive.
 MAX_WHOLE = 2**63 - 1
 
 
@@ -21,7 +21,7 @@ def _representable(value: int) -> int:
     return value
 
 
-#: -0.0 and 0.0 are one value and must have one text.
+#: Maps -0.0 to 0.0, which must have the same text.
 _OneZero = AfterValidator(lambda value: value + 0.0)
 #: Finite numbers.
 Number = Annotated[float, Field(allow_inf_nan=False), _OneZero]
@@ -48,7 +48,7 @@ Name = Annotated[str, matching("[A-Za-z0-9_-]{1,60}", "a name has letters, digit
 
 
 class OneOf:
-    """Annotation of a value with one of several forms, by the name that `choose` gives to it; None is refused."""
+    """Annotation of a value with one of several forms, selected by the result of `choose`; None is refused."""
 
     def __init__(
         self, choose: Callable[[Any], str | None], forms: Mapping[str, Any], error: str = "", allowed: str = ""
@@ -67,7 +67,7 @@ class OneOf:
 
 
 class ByShape(OneOf):
-    """Annotation of a value with a usual form, and another one if it is a list, a mapping or a text."""
+    """Annotation of a value with a usual form, and other forms for lists, mappings or texts."""
 
     def __init__(self, usual: Any, hint: str = "", **others: Any) -> None:
         name = HINT.removeprefix(TAG) + f" {hint}" if hint else "usual"
@@ -93,10 +93,10 @@ def _different(values: list[Any]) -> list[Any]:
 
 
 def without_copies(values: list[Any], called: Callable[[Any], str] = lambda item: "this start") -> list[Any]:
-    """Return the values, if none is there twice."""
+    """Return the values; refuse duplicates."""
     seen: set[str] = set()
     for k, item in enumerate(values):
-        # Lists and sections have no hash; what is equal reads alike.
+        # Lists and sections are not hashable; equal ones have equal text.
         text = repr(item + 0.0 if type(item) in (int, float) else item)
         if text in seen:
             raise several_wrong("list", [((k,), f"{called(item)} is in this list twice; keep one of them")])

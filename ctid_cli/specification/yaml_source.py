@@ -1,7 +1,7 @@
-"""YAML read without its traps, and with the place of every key and value.
+"""YAML parsing without implicit conversions, with the place of every key and value.
 
-The composer of PyYAML does the syntax; the values are built here, because the tree of nodes is the only thing that
-knows lines and columns. A plain scalar is
+PyYAML parses the syntax; the values are built here, because only the tree of nodes has lines and columns. A plain
+scalar is
 
 - ``null`` if it is empty, ``~`` or ``null``,
 - a boolean if it is exactly ``true`` or ``false`` (``no``, ``on``, ``True`` are text),
@@ -9,8 +9,8 @@ knows lines and columns. A plain scalar is
 - a number if it looks like one, exponents without a point included (``1e-3``), and ``.inf`` or ``.nan``,
 - text otherwise: dates, ``1:30``, ``0x1F`` and ``1_000`` too.
 
-Merge keys (``<<``) are refused: which of two places a merged key comes from is a riddle for the reader, and a plain
-alias (``b: *a``) says the same openly.
+Merge keys (``<<``) are refused: a reader cannot see from which mapping a merged key comes, and a plain alias
+(``b: *a``) is explicit.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from ctid_cli.text import did_you_mean
 
 #: Keys and list indices that lead from the top of a file to a value.
 KeyPath = tuple[str | int, ...]
-#: Ends the path of a key, where it is the key that is wrong and not its value; pydantic's word for it.
+#: Last item of a path if the key is wrong and not its value; defined by pydantic.
 KEY = "[key]"
 
-#: A specification is written by hand; anything larger is some other file, or an alias that multiplies itself.
+#: Maximum file size [bytes]; larger files are not specifications, or have an alias that multiplies itself.
 MAX_BYTES = 250_000
 MAX_VALUES = 100_000
-#: Letters of a key that a message repeats.
+#: Maximum number of characters of a key repeated in a message.
 MAX_KEY = 60
 
-#: What stands for the name of the file in problems with a ``--set`` option.
+#: File name in problems with a ``--set`` option.
 OVERRIDE_FILE = "--set"
 
 _TAG = "tag:yaml.org,2002:"
@@ -54,30 +54,30 @@ _SCALARS: dict[str, re.Pattern[str]] = {
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader with our own table of plain scalars instead of YAML 1.1's."""
+    """PyYAML's safe loader with a custom table of plain scalars in place of YAML 1.1's."""
 
-    # A fresh table: add_implicit_resolver would copy, and so keep, the parent's rules.
+    # A new table: add_implicit_resolver would copy, and thus keep, the rules of the parent.
     yaml_implicit_resolvers: dict[str | None, list[tuple[str, re.Pattern[str]]]] = {  # noqa: RUF012
         None: [(_TAG + name, pattern) for name, pattern in _SCALARS.items()]
     }
 
 
 def problem_at(mark: Any, path: KeyPath, message: str) -> Problem:
-    """Return a problem at a mark of PyYAML, which knows its file."""
+    """Return a problem at a PyYAML mark, which contains the file name."""
     return Problem(mark.name, mark.line + 1, mark.column + 1, path_text(path), message)
 
 
 def _mark(file: str, line: int = 0, column: int = 0) -> Any:
-    """Return the mark of a place, counted from 0."""
+    """Return a mark at a line and column, counted from 0."""
     return yaml.Mark(file, 0, line, column, None, 0)
 
 
 @dataclass
 class YamlSource:
-    """The values of a YAML text and where each of them stands."""
+    """Values of a YAML text with their places."""
 
     file: str
-    #: The text itself, where it came from a file.
+    #: The text, if it came from a file.
     text: str = ""
     tree: Any = None
     #: The node of each value, and that of its key in a mapping.
@@ -85,7 +85,7 @@ class YamlSource:
     problems: list[Problem] = field(default_factory=list)
 
     def mark(self, path: KeyPath) -> Any:
-        """Return where a problem with a key path is to be reported: of a mapping, and where a key is amiss, its key."""
+        """Return the place for reporting a problem: the key for mappings and wrong keys, otherwise the value."""
         key = False
         while path and path not in self.nodes:
             path, key = path[:-1], True
@@ -98,7 +98,7 @@ class YamlSource:
         return problem_at(self.mark(path), path, message)
 
     def build(self, node: Any, path: KeyPath = (), name: Any = None, parents: tuple[Any, ...] = ()) -> Any:
-        """Return the value of a node; what is wrong with it goes to the problems."""
+        """Return the value of a node; add errors to the problems."""
         self.nodes[path] = node, name
         fatal = ""
         if len(self.nodes) > MAX_VALUES:
@@ -139,7 +139,7 @@ class YamlSource:
         tag: str = node.tag.removeprefix(_TAG)
         if tag == "str":
             return text
-        # An explicit tag (!!float abc) may contradict its text, so the pattern is asked again.
+        # An explicit tag (!!float abc) may contradict its text, so the pattern is checked again.
         if tag not in _SCALARS or not _SCALARS[tag].match(text):
             return self._refuse_tag(node, path, "the plain value")
         if tag == "null":
@@ -147,7 +147,7 @@ class YamlSource:
         if tag == "bool":
             return text == "true"
         if tag == "int":
-            # Python refuses very long digit strings; beyond any use as a whole number they are still a number.
+            # Python refuses very long digit strings; such values are read as floating-point numbers.
             return int(text) if len(text) < 400 else float(text)
         return float(re.sub(r"\.(?=[a-zA-Z])", "", text))  # Python writes .inf and .nan without their point
 
@@ -157,7 +157,7 @@ class YamlSource:
 
 
 def path_text(path: KeyPath) -> str:
-    """Return a key path as users write it."""
+    """Return a key path in the notation of users."""
     text = ""
     for part in path[:-1] if path[-1:] == (KEY,) else path:
         word = part if isinstance(part, int) or len(part) <= MAX_KEY else part[: MAX_KEY - 1] + "…"
@@ -166,7 +166,7 @@ def path_text(path: KeyPath) -> str:
 
 
 def read_yaml(path: Path, overrides: Iterable[str] = ()) -> YamlSource:
-    """Read a YAML file, in which some values may be others."""
+    """Read a YAML file, with some values replaced."""
     if path.is_dir():
         raise UsageError(f"{path}: this is a folder; name the YAML file in it")
     if path.is_file() and path.stat().st_size == 0:
@@ -198,7 +198,7 @@ def written(tree: Mapping[str, Any]) -> str:
 
 
 def parse_yaml(text: str, file: str, overrides: Iterable[str] = ()) -> YamlSource:
-    """Return the values and places of a YAML text, in which ``key.path=value`` may set others."""
+    """Return the values and places of a YAML text; overrides ``key.path=value`` replace values."""
     source, root = YamlSource(file, text), _composed(text, file)
     for number, override in enumerate(overrides, start=1):
         try:
@@ -213,7 +213,7 @@ def parse_yaml(text: str, file: str, overrides: Iterable[str] = ()) -> YamlSourc
 
 
 def _composed(text: str, file: str) -> Any:
-    """Return the tree of nodes of a YAML text, whose marks know the file; None of an empty text."""
+    """Return the tree of nodes of a YAML text, with the file in its marks; None for an empty text."""
     try:
         loader = _Loader(text)
         loader.name = file
@@ -221,7 +221,7 @@ def _composed(text: str, file: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         if error.context_mark is not None and "end" in (error.problem or "") and "stream" in (error.problem or ""):
-            mark = error.context_mark  # what was never closed is of more use than the end of the file
+            mark = error.context_mark  # the place of the unclosed item is more useful than the end of the file
         raise SpecError([problem_at(mark, (), _syntax_message(error))]) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
@@ -233,7 +233,7 @@ def _composed(text: str, file: str) -> Any:
 
 
 def _overridden(root: Any, override: str, number: int) -> Any:
-    """Return the tree of nodes in which a value is set as ``--set a.b=value`` asks; its places are in that option."""
+    """Return the tree of nodes with a value set by ``--set a.b=value``; the value's place is in that option."""
     key, equals, text = override.partition("=")
     path = tuple(part.strip() for part in key.split("."))
     here = _mark(OVERRIDE_FILE, number - 1)
@@ -244,12 +244,12 @@ def _overridden(root: Any, override: str, number: int) -> Any:
 
     if not equals or not all(path):
         raise refuse("an override is written key.path=value, for example noise.snr_db=[5,15]")
-    # Columns are those of the option.
+    # Columns count within the option.
     before = "\n" * (number - 1) + ("" if "\n" in text else " " * (len(key) + 1))
     value = _composed(before + text, OVERRIDE_FILE) or yaml.ScalarNode(_TAG + "null", "", here)
 
     def with_value(node: Any, depth: int) -> Any:
-        """Return the same mapping with the value somewhere in it; nodes that aliases share are left as they are."""
+        """Return a copy of the mapping with the new value; nodes shared by aliases are not changed."""
         if depth == len(path):
             return value
         if node is None or node.tag == _TAG + "null":
@@ -274,7 +274,7 @@ def _overridden(root: Any, override: str, number: int) -> Any:
 
 
 def _syntax_message(error: yaml.MarkedYAMLError) -> str:
-    """Return PyYAML's complaint as a sentence, with the usual cause where it is known."""
+    """Return PyYAML's error as a sentence, with its usual cause if known."""
     problem = (error.problem or "the text is not valid YAML").strip()
     if "'\\t'" in problem:
         return "a tab is not allowed here; indent with spaces"

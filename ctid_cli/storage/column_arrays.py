@@ -1,8 +1,8 @@
-"""Columns as the arrays of ``runs.h5``: how values are written to them, read from them and checked.
+"""Columns as arrays of ``runs.h5``: writing, reading and validation.
 
-A text is UTF-8, as long as the longest one. A missing whole number is -1, a missing number NaN. Coefficients fill the
-front of a row, ``_length`` says how much of it. Numbers by name have a column for every name that any estimate has;
-``_present`` says which of them an estimate has, and ``_names`` lists them.
+Texts are UTF-8, padded to the length of the longest one. A missing whole number is -1, a missing number NaN.
+Coefficients fill the front of a row; ``_length`` holds their number. Numbers by name have a column for every name that
+occurs in any estimate; ``_present`` marks the names of each estimate, and ``_names`` lists them.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,11 +16,11 @@ from ctid_cli.storage.columns import Column
 
 AnyArray = NDArray[Any]
 
-#: Rows that are written at once, and make a chunk of the file.
+#: Rows written at once, which form one chunk of the file.
 ROWS = 8192
-#: Stands for a missing whole number.
+#: Value of a missing whole number.
 MISSING = -1
-#: The arrays of a column by what their names end in, each with the kinds of number that it may have.
+#: Arrays of a column by the suffix of their names, each with the allowed kinds of number.
 _ARRAYS: Mapping[str, Mapping[str, str]] = {
     "str": {"": "S"},
     "int64": {"": "iu"},
@@ -32,7 +32,7 @@ _NUMBERS = {"": "f"}
 
 
 def names_of(name: str) -> str:
-    """Return name of the array with the names of the parts of a column."""
+    """Return the name of the array that holds the names of the parts of a column."""
     return f"{name.removesuffix('s')}_names"
 
 
@@ -40,22 +40,22 @@ def names_of(name: str) -> str:
 
 
 class ColumnWriter:
-    """The arrays of one column; all values are measured before the arrays are created and filled."""
+    """Writer of the arrays of one column: all values are measured before the arrays are created and filled."""
 
     def __init__(self, column: Column) -> None:
         self._column = column
-        #: Bytes of the longest text, or coefficients of the longest list.
+        #: Bytes of the longest text, or number of coefficients of the longest list.
         self._longest = 1
         self._names: dict[str, None] = {}
         self._datasets: dict[str, h5py.Dataset] = {}
 
     @property
     def is_fixed(self) -> bool:
-        """Return whether the arrays need the same space whatever the values are."""
+        """Whether the arrays need the same space for any values."""
         return self._column.type not in ("str", "coefficients", "by name")
 
     def include(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Measure the values of some rows."""
+        """Update the array sizes from the values of some rows."""
         name = self._column.name
         values = [value for row in rows if (value := row.get(name))]
         match self._column.type:
@@ -70,11 +70,11 @@ class ColumnWriter:
 
     @property
     def names(self) -> list[str]:
-        """Return names of the parts of a column with numbers by name."""
+        """Names of the parts of a column with numbers by name."""
         return list(self._names)
 
     def create(self, group: h5py.Group, count: int) -> None:
-        """Create the arrays, the one with the values with what it means."""
+        """Create the arrays; the array of the values carries their description and unit."""
         column = self._column
         about: dict[str, Any] = {"meaning": column.meaning.replace("`", ""), "unit": column.unit}
         if column.type == "Int64":
@@ -92,12 +92,12 @@ class ColumnWriter:
         self._datasets[column.name].attrs.update(given)
 
     def write(self, start: int, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the values of some rows, from a place on."""
+        """Write the values of some rows, starting at a position."""
         for name, array in self.arrays(rows).items():
             self._datasets[name][start : start + len(rows)] = array
 
     def arrays(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
-        """Return the values of some rows that were measured as arrays by name, that with the values last."""
+        """Return the values of measured rows as arrays by name, the array of the values last."""
         name = self._column.name
         values = [row.get(name) for row in rows]
         match self._column.type:
@@ -117,7 +117,7 @@ class ColumnWriter:
                 present = np.array([part in row for row in found for part in self._names], dtype=np.uint8)
                 numbers = np.array([row.get(part) for row in found for part in self._names], dtype=np.float64)
                 return {f"{name}_present": present.reshape(shape), name: numbers.reshape(shape)}
-        # "random" is no number: where the search started is in start_delay, and the label in start.
+        # "random" is not a number: the start value of the search is in start_delay, and the label in start.
         plain = [None if isinstance(value, str) else value for value in values]
         return {name: np.array(plain, dtype=np.float64)}
 
@@ -136,7 +136,7 @@ def _write_texts(group: h5py.Group, name: str, texts: Sequence[str]) -> None:
 
 
 def encoded_texts(texts: Sequence[str], longest: int) -> AnyArray:
-    """Return texts as an array that says that they are UTF-8."""
+    """Return texts as an array with the UTF-8 type of HDF5."""
     array = np.empty(len(texts), h5py.string_dtype("utf-8", longest))
     array[:] = [text.encode() for text in texts]
     return array
@@ -146,7 +146,7 @@ def encoded_texts(texts: Sequence[str], longest: int) -> AnyArray:
 
 
 def decoded(column: Column, read: Callable[[str], AnyArray], names: Sequence[str] = ()) -> list[Any]:
-    """Return values, None where there is none, of what reads an array by its ending, and the names of the parts."""
+    """Return values (None if missing) from a function that reads an array by its suffix, and the names of the parts."""
     values = read("")
     if column.type == "str":
         return decoded_texts(values)
@@ -172,7 +172,7 @@ def decoded_texts(values: AnyArray) -> list[str]:
 
 
 def require_column(column: Column, group: h5py.Group, count: int) -> None:
-    """Refuse arrays that are not what a column is: of other length, kind or shape."""
+    """Refuse arrays whose length, kind or shape does not match a column."""
     name, several = column.name, column.type in ("coefficients", "by name")
     for ending, kinds in _ARRAYS.get(column.type, _NUMBERS).items():
         array = group[name + ending]

@@ -1,7 +1,7 @@
-"""The columns of stored estimates: the one list that journal, runs.h5, tables, export, JSON and documentation read.
+"""Columns of stored estimates: the single list used by journal, runs.h5, tables, export, JSON and documentation.
 
-A column that is added here, and given a value where estimates are made, appears in all of them; in results that were
-stored before, it is missing.
+A column that is added here, and is given a value where estimates are made, appears in all of them; results stored
+before have no value in it.
 """
 
 import re
@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-#: Statuses of estimates that have no result because something went wrong.
+#: Statuses of estimates without a result because of an error.
 FAILURES = ("FAILED", "CRASHED", "TIMEOUT", "MEMORY")
 
 ByName = Mapping[str, float | None]
 
 
 def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
-    """Return names of parameters that any estimate has: b0 ..., a1 ..., of submodels, the delay and others."""
+    """Return the names of all parameters in the estimates: b0 ..., a1 ..., of submodels, the delay and others."""
 
     def place(name: str) -> tuple[int, int, str, int]:
         found = re.fullmatch(r"(?:g(\d+)_)?([ab])(\d+)", name)
@@ -29,42 +29,42 @@ def parameter_names(rows: Iterable[ByName | None]) -> list[str]:
 
 
 def measure_names(rows: Iterable[ByName | None]) -> list[str]:
-    """Return names of measures that any estimate has."""
+    """Return the names of all measures in the estimates."""
     from ctid_cli.simulation import frequency_measures
 
     return frequency_measures.measure_names(rows)
 
 
 def sorted_names(rows: Iterable[ByName | None]) -> list[str]:
-    """Return all names that any estimate has."""
+    """Return all names in the estimates, sorted."""
     return sorted({name for row in rows if row for name in row})
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column."""
+    """Description of one column."""
 
     name: str
-    #: A type of pandas, or one of those that are objects to it: ``coefficients`` by descending powers, numbers
-    #: ``by name``, and an ``initial delay``, which may be the word random.
+    #: A pandas type, or a type stored as object in pandas: ``coefficients`` by descending powers, numbers ``by name``,
+    #: and an ``initial delay``, which may be the word random.
     type: Literal["str", "int64", "Int64", "float64", "boolean", "coefficients", "by name", "initial delay"]
     meaning: str
     unit: str | None = None
-    #: Which experiments have it; in rows, those of systems are empty for signals.
+    #: Kinds of experiments with this column; in rows of signals, columns of systems are empty.
     of: Literal["all", "systems", "signals"] = "all"
-    #: Where its value comes from.
+    #: Origin of its value.
     source: Literal["plan", "result", "clock", "truth"] = "result"
-    #: What the names of its parts begin with in a table with one number per cell.
+    #: Prefix of the names of its parts in a table with one number per cell.
     prefix: str = ""
     names: Callable[[Iterable[ByName | None]], list[str]] = parameter_names
 
     @property
     def dtype(self) -> str:
-        """Return its type in pandas."""
+        """Its pandas type."""
         return "object" if self.type in ("coefficients", "by name", "initial delay") else self.type
 
 
-#: All columns, in the order of tables; swept fields stand before those that are compared with the truth.
+#: All columns in the order of tables; swept fields precede the columns that are compared with the true values.
 COLUMNS = (
     Column("id", "str", "the same data, estimator and start always have the same 12 hexadecimal digits", source="plan"),
     Column("experiment", "str", "name of the experiment", source="plan"),
@@ -127,7 +127,7 @@ COLUMNS = (
     Column("true_delay", "float64", "delay of the simulated system", "s", of="systems", source="truth"),
 )
 
-#: What tables count in groups of estimates, with the types of pandas.
+#: Counts in tables of groups of estimates, with their pandas types.
 COUNTS = {
     "n": "int64",
     "failed": "int64",
@@ -136,21 +136,21 @@ COUNTS = {
 }
 
 
-#: What a row of measures has besides.
+#: Further columns of a row of measures.
 OF_MEASURES = ("parameter", "measure", "unit", "value", "error", "without_value")
 
 
 def reserved_names() -> frozenset[str]:
-    """Return names of the columns of estimates and tables; a swept field of such a name is written with its section."""
+    """Return the column names of estimates and tables; a swept field with such a name is prefixed with its section."""
     of_tables = ("table", "sampling", "method", *OF_MEASURES)
     return frozenset((*(c.name for c in COLUMNS), *COUNTS, *of_tables))
 
 
 def failed(message: str, status: str) -> dict[str, Any]:
-    """Return the result of an estimate that does not exist."""
+    """Return the result of an estimate that failed."""
     return no_result() | {"status": status, "message": message}
 
 
 def no_result() -> dict[str, Any]:
-    """Return a result in which everything is missing; texts are empty, as they are read again."""
+    """Return a result in which every value is missing; texts are empty, as they are after reading."""
     return {column.name: "" if column.type == "str" else None for column in COLUMNS if column.source == "result"}

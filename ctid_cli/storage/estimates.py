@@ -1,6 +1,6 @@
-"""The stored estimates of one plan, by column and by row, as a table of pandas, and as CSV and JSON.
+"""Stored estimates of one plan: by column, by row, as pandas table, CSV and JSON.
 
-However many they are: columns are arrays, read when they are asked for, and rows are made some at a time.
+Any number of estimates is supported: columns are arrays that are read when first used; rows are made in batches.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from ctid_cli.storage.truth import ERRORS, VALUES, Found, failures, found_under,
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Columns of the times, which are in the journal only.
+#: Columns of times, which are stored in the journal only.
 CLOCKS = ("seconds", "cpu_seconds")
-#: Columns of several numbers, each with a name.
+#: Columns of several named numbers.
 _BY_NAME = [column.name for column in columns.COLUMNS if column.type == "by name"]
-#: Times of the estimates of an estimator on a data cell, by replicate and start, from the hashes of both and the first
-#: and the last replicate.
+#: Function that returns the times of the estimates of an estimator on a data cell, by replicate and start, from the
+#: hashes of both and the first and last replicate.
 Times = Callable[[str, str, int, int], Mapping[tuple[int, str], tuple[float | None, float | None]]]
 
 
 def read_estimates(folder: Path, names: Sequence[str] | None = None) -> pd.DataFrame:
-    """Return estimates of the latest plan of an experiment, or some columns of them, as a table."""
+    """Return all or some columns of the estimates of the latest plan of an experiment as a table."""
     return read_stored(folder).frame(names)
 
 
@@ -53,9 +53,9 @@ def read_stored(folder: Path) -> Estimates:
 
 
 def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
-    """Return the estimates of the latest plan, from ``runs.h5`` where it holds what the journal does."""
+    """Return the estimates of the latest plan, from ``runs.h5`` if it is up to date with the journal."""
     if log is None:
-        # There is a journal without a plan where the run was killed before it had planned anything.
+        # A journal has no plan if the run was killed before planning.
         if not (folder / EXPORT).exists():
             raise UsageError(f"there are no results in {folder}; 'ctid run' writes them")
         return Estimates(open_export(folder / EXPORT))
@@ -67,7 +67,7 @@ def stored_in(folder: Path, log: JournalReader | None) -> Estimates:
 
 
 def _times_in(folder: Path, *part: Any) -> Any:
-    """Return the times that a journal holds."""
+    """Return the times stored in a journal."""
     with place.reading_journal(folder) as log:
         return {} if log is None else log.times(*part)
 
@@ -85,29 +85,29 @@ class Block:
 
 
 class Estimates:
-    """The stored estimates of one plan, or some of them, in the order of ``runs.h5``."""
+    """All or a subset of the stored estimates of one plan, in the order of ``runs.h5``."""
 
     def __init__(self, export: Export, times: Times | None = None, places: range | IndexArray | None = None) -> None:
         self.export = export
         self._times = times
         self._places = places
-        #: All estimates where these are some, chosen one by one.
+        #: All estimates, if these are a subset selected one by one.
         self._all: Estimates | None = None
         self._read: dict[str, AnyArray] = {}
 
     @property
     def places(self) -> range | IndexArray:
-        """Return numbers of their rows in the export."""
+        """Row numbers in the export."""
         return range(self.export.count) if self._places is None else self._places
 
     def part(self, start: int, stop: int) -> Estimates:
-        """Return some that follow each other, whose columns are read without those of others."""
+        """Return a contiguous part; its columns are read separately."""
         return self._some(self.places[start:stop])
 
     def chosen(self, which: BoolArray | IndexArray) -> Estimates:
-        """Return some of them, whose columns are taken out of those of all."""
+        """Return a subset; its columns are selected from those of all estimates."""
         places, numbers = self.places, np.flatnonzero(which) if which.dtype == bool else which
-        # An array of a range would be as long as the export, for each of perhaps a thousand groups.
+        # Converting a range to an array would need memory for the whole export, for each of perhaps a thousand groups.
         some = self._some(places.start + numbers if isinstance(places, range) else places[numbers])
         some._all = self if self._places is None else self._all
         return some
@@ -117,17 +117,17 @@ class Estimates:
 
     @property
     def manifest(self) -> Manifest:
-        """Return the plan."""
+        """The plan."""
         return self.export.manifest
 
     @property
     def origins(self) -> tuple[Origin, ...]:
-        """Return where they come from."""
+        """Origins (code version, platform) of the estimates."""
         return self.export.origins
 
     @property
     def mixed(self) -> bool:
-        """Return whether several versions of the code, or platforms, computed what is compared here."""
+        """Whether the estimates come from several code versions or platforms."""
         return len(self.origins) > 1
 
     def __len__(self) -> int:
@@ -136,7 +136,7 @@ class Estimates:
     # --- columns ----------------------------------------------------------------------------------------------------
 
     def has(self, name: str) -> bool:
-        """Return whether there is such a column."""
+        """Return whether a column exists."""
         return name in CLOCKS or self.export.has(name)
 
     def column(self, name: str) -> AnyArray:
@@ -151,7 +151,7 @@ class Estimates:
         return self._read[name]
 
     def _span(self, read: Callable[[int, int], Any]) -> Any:
-        """Return what is read of the rows from the first to the last of them, without those between."""
+        """Read the rows from the first to the last place, and drop those in between that are not selected."""
         places = self.places
         if not len(places):
             return read(0, 0)
@@ -163,7 +163,7 @@ class Estimates:
         return found[inside] if isinstance(found, np.ndarray) else [found[k] for k in inside.tolist()]
 
     def values(self, name: str) -> list[Any]:
-        """Return a column as it is in rows: None where there is no value."""
+        """Return a column as values of rows: None for missing values."""
         known = {column.name: column for column in columns.COLUMNS}
         if name not in known:
             return self._by_block(lambda block: {**block.cell["swept"], **block.estimator["swept"]}.get(name))
@@ -184,13 +184,13 @@ class Estimates:
         return [one for block in self.blocks for one in [value(block)] * (block.last - block.first)]
 
     def _clocks(self) -> Array:
-        """Return times of the estimates [s], shape (2, n); NaN where they are not known."""
+        """Return the computing times of the estimates [s], shape (2, n); NaN if unknown."""
         found, unknown = np.full((2, len(self)), np.nan), (np.nan, np.nan)
         for block in self.blocks if self._times is not None else ():
             assert self._times is not None
             own = slice(block.first, block.last)
             replicates, starts = self.column("replicate")[own].tolist(), self.column("start")[own].tolist()
-            # Not those of the whole block: of a large one this is a small part.
+            # Not of the whole block: these can be a small part of a large one.
             times = self._times(block.cell["hash"], block.hash, min(replicates), max(replicates))
             keys = zip(replicates, (start.decode() for start in starts), strict=True)
             found[:, own] = np.array([times.get(key, unknown) for key in keys], dtype=float).T
@@ -198,7 +198,7 @@ class Estimates:
 
     @cached_property
     def blocks(self) -> list[Block]:
-        """Return the rows of every estimator on every data cell, which follow each other."""
+        """Contiguous rows, one block for each estimator on each data cell."""
         known = {(part["hash"], part["name"]): part for part in self.manifest["estimators"]}
         cells = {cell["hash"]: cell for cell in self.manifest["data_cells"]}
         parts = [self.column(name) for name in ("estimator_hash", "estimator", "cell")]
@@ -217,14 +217,14 @@ class Estimates:
 
     @property
     def failures(self) -> BoolArray:
-        """Return which of them failed."""
+        """Mask of the failed estimates."""
         return failures({"status": self.column("status")})
 
     # --- comparison with the truth ----------------------------------------------------------------------------------
 
     @cached_property
     def _truths(self) -> dict[str, dict[str, float]]:
-        """Return True values by name of every data cell."""
+        """True values by name, for each data cell."""
         if self._all is not None:
             return self._all._truths
         try:
@@ -235,13 +235,13 @@ class Estimates:
 
     @property
     def converged(self) -> BoolArray | None:
-        """Return which of them satisfy the rule of success; None where there is none for all of them."""
+        """Mask of the estimates that satisfy the success rule; None unless the rule applies to all of them."""
         found = self.judged
         return None if not len(found) or np.isnan(found).any() else found.astype(bool)
 
     @cached_property
     def judged(self) -> Array:
-        """Return 1 for those that satisfy the rule of success, 0 for others, NaN where there is none."""
+        """1 for estimates that satisfy the success rule, 0 for others, NaN if no rule applies."""
         found, success = np.full(len(self), np.nan), self.manifest["success"]
         if not success:
             return found
@@ -257,11 +257,11 @@ class Estimates:
         return found
 
     def found(self, names: Sequence[str]) -> Found:
-        """Return values, standard errors and quantiles under the true names, NaN where none is, shape (n, p)."""
+        """Return values, standard errors and quantiles under the true names, NaN if missing, shape (n, p)."""
         return found_under(names, self._arrays(*VALUES, *ERRORS), len(self))
 
     def _arrays(self, *names: str) -> dict[str, AnyArray]:
-        """Return those of some arrays that are there, with the names of their parts."""
+        """Return the named arrays that exist, and the names of their parts."""
         arrays = {name: self.column(name) for name in names if self.has(name)}
         parts = {names_of(name): np.array(self.export.parts(name), dtype=object) for name in arrays if name in _BY_NAME}
         return arrays | parts
@@ -270,7 +270,7 @@ class Estimates:
 
     @property
     def names(self) -> list[str]:
-        """Return names of what a row has."""
+        """Column names of a row."""
         own = [column.name for column in plans.row_columns(self.manifest)]
         compared = [column.name for column in columns.COLUMNS if column.source == "truth"]
         return [*own, *plans.swept_names(self.manifest), *compared]
@@ -279,7 +279,7 @@ class Estimates:
         return self.rows()
 
     def rows(self, *names: str) -> Iterator[dict[str, Any]]:
-        """Yield all of them one after the other, or some columns of them; some thousand are read at a time."""
+        """Yield all rows, or some columns of them, reading some thousand at a time."""
         for start in range(0, self.export.count, ROWS):
             inside = slice(*np.searchsorted(np.asarray(self.places), (start, start + ROWS)))
             some = self.part(inside.start, inside.stop)
@@ -288,18 +288,18 @@ class Estimates:
                 yield from (dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True))
 
     def slot(self, number: int) -> Slot:
-        """Return what an estimate is of."""
+        """Return the place of an estimate in the plan."""
         (block,) = (block for block in self.blocks if block.first <= number < block.last)
         start, replicate = self.column("start")[number].decode(), int(self.column("replicate")[number])
         return Slot(Key(block.cell["hash"], replicate, block.hash, start), block.cell, block.estimator)
 
     @cached_property
     def results(self) -> dict[Key, dict[str, Any]]:
-        """Return all results by key."""
+        """All results by key."""
         return dict(self.by_key())
 
     def by_key(self) -> Iterator[tuple[Key, dict[str, Any]]]:
-        """Yield the results as they were computed, each with its key."""
+        """Yield the results as computed, each with its key."""
         names = [column.name for column in columns.COLUMNS if column.source == "result"]
         for block in self.blocks:
             for row in self.part(block.first, block.last).rows("replicate", "start", *names):
@@ -307,15 +307,15 @@ class Estimates:
                 yield key, row
 
     def frame(self, names: Sequence[str] | None = None, types: Mapping[str, Any] | None = None) -> pd.DataFrame:
-        """Return all of them as a table, with the units of its columns; the types of swept fields may be given."""
+        """Return the estimates as a table, with the units of its columns; types of swept fields may be given."""
         import pandas as pd
 
-        # Where there is no system, the columns of one would be empty.
+        # Columns of systems would be empty for signals.
         left_out = "systems" if plans.is_of_signal(self.manifest) else ""
         known = {c.name: c for c in columns.COLUMNS}
         shown = [n for n in names or self.names if n not in known or known[n].of != left_out]
         dtypes = {name: known[name].dtype if name in known else (types or {}).get(name) for name in shown}
-        # Numbers are arrays already; a column that is not stored has no value.
+        # Numbers are already arrays; columns that are not stored have no value.
         arrays = {n for n in shown if n in known and known[n].type == "float64" and n != "true_delay" and self.has(n)}
         frame = pd.DataFrame(
             {n: pd.Series(self.column(n) if n in arrays else self.values(n), dtype=dtypes[n]) for n in shown}
@@ -340,7 +340,7 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
             continue
         for part, values in _parts(parts[name], estimates[name]):
             key, column = f"{parts[name].prefix}{part}", pd.Series(values, dtype="float64", index=estimates.index)
-            # Parameters that make a model are its coefficients too; other names that are taken get a longer one.
+            # Parameters of a model are also stored as its coefficients; other names already in use get a longer name.
             if key in estimates.columns and key != "delay":
                 key = f"parameters.{key}"
             flat[key] = flat[key].combine_first(column) if key in flat else column
@@ -348,15 +348,15 @@ def export_rows(estimates: pd.DataFrame) -> pd.DataFrame:
 
 
 def _parts(column: columns.Column, cells: Iterable[Any]) -> Iterator[tuple[Any, list[float | None]]]:
-    """Yield the parts of a column with several numbers in a cell, each with its values."""
-    # As mappings, coefficients are numbered from 0; the first one of a denominator is 1 and left out.
+    """Yield the parts of columns with several numbers per cell, each with its values."""
+    # As mappings, coefficients are numbered from 0; the leading 1 of a denominator is omitted.
     rows: list[Any] = [dict(enumerate(row)) if isinstance(row, list) else row or {} for row in cells]
     found: list[Any] = column.names(rows) if column.type == "by name" else []
     for part in found or sorted({k for row in rows for k in row if k or column.name != "denominator"}):
         yield part, [row.get(part) for row in rows]
 
 
-#: Keys that every estimate carries in machine-readable output, in this order.
+#: Keys of every estimate in machine-readable output, in this order.
 ESTIMATE_KEYS = (
     *("id", "experiment", "estimator", "cell", "replicate", "start", "status"),
     *("delay", "numerator", "denominator", "standard_errors", "cost", "fit_percent", "iterations", "seconds"),
@@ -364,7 +364,7 @@ ESTIMATE_KEYS = (
 
 
 def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
-    """An estimate for JSON: the documented keys first, then what else is stored."""
+    """Return an estimate for JSON: the documented keys first, then all other stored values."""
     keys = list(ESTIMATE_KEYS)
     if "parameters" in estimate:
         keys.insert(keys.index("standard_errors"), "parameters")
@@ -372,7 +372,7 @@ def as_object(estimate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_lines(stored: Estimates) -> Iterator[str]:
-    """The estimates as CSV, the head first."""
+    """Yield the estimates as lines of CSV, the header first."""
     types = _types(stored)
     head = _head(stored, types)
     yield str(head.to_csv(index=False, lineterminator="\n"))
@@ -382,7 +382,7 @@ def csv_lines(stored: Estimates) -> Iterator[str]:
 
 
 def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
-    """A table without rows, with the columns of an estimate that has all that any of them has."""
+    """Return an empty table with all columns that occur in the estimates."""
     import pandas as pd
 
     some: dict[str, Any] = dict.fromkeys(map(str, stored.part(0, 0).frame(types=types)))
@@ -400,7 +400,7 @@ def _head(stored: Estimates, types: Mapping[str, Any]) -> pd.DataFrame:
 
 
 def _types(stored: Estimates) -> dict[str, Any]:
-    """Types that columns of swept fields have over all estimates."""
+    """Return the types of the columns of swept fields over all estimates."""
     import pandas as pd
 
     swept = [{**block.cell["swept"], **block.estimator["swept"]} for block in stored.blocks]
@@ -408,7 +408,7 @@ def _types(stored: Estimates) -> dict[str, Any]:
 
 
 def json_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """The estimates as one list of objects."""
+    """Yield the estimates as lines of one JSON list of objects."""
     before = "[\n"
     for row in rows:
         yield before + indent(json.dumps(as_object(row), indent=1, allow_nan=False), " ")

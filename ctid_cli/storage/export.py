@@ -1,8 +1,8 @@
-"""``runs.h5``: every estimate that a plan asks for, in columns, with all that is needed to redo them.
+"""``runs.h5``: all estimates of a plan in columns, with everything needed to compute them again.
 
-The bytes of the file depend on the results alone: rows are in the order of the specification, and times, hosts and runs
-are not in it. It is made from the journal in memory, some rows at a time, and replaced whole; the journal keeps its
-SHA-256. Where there is no journal, HDF5's own checksums tell whether it is whole.
+The bytes of the file depend on the results only: rows are in the order of the specification; times, hosts and runs are
+not stored. It is built from the journal in memory, in batches of rows, and replaced atomically; the journal keeps its
+SHA-256. Without a journal, the checksums of HDF5 show whether the file is intact.
 """
 
 import hashlib
@@ -33,14 +33,14 @@ from ctid_cli.storage.sqlite_file import EXPORT, require_format
 from ctid_cli.written_files import write_file
 
 KIND, FORMAT = "ctid runs", 2
-#: A file format whose metadata have checksums too.
+#: HDF5 file format with checksums of metadata too.
 _VERSION = ("v110", "v110")
 
-#: Columns without which estimates are none.
+#: Columns that every file of estimates must have.
 REQUIRED = ("estimator_hash", "cell", "start", "id", "status")
 _ESTIMATOR_HASH = Column("estimator_hash", "str", "hash of the settings of the estimator", source="plan")
 
-#: Places in a plan with what was computed for them.
+#: Function that returns places in a plan with their results.
 Results = Callable[[], Iterable[tuple[Slot, Mapping[str, Any]]]]
 
 
@@ -48,7 +48,7 @@ Results = Callable[[], Iterable[tuple[Slot, Mapping[str, Any]]]]
 
 
 def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
-    """Write the estimates of the journal's plan to ``runs.h5``; returns their number and the SHA-256 of the file."""
+    """Write the estimates of the journal's plan to ``runs.h5``; return their number and the SHA-256 of the file."""
     path, noted = folder / EXPORT, log.exported()
     if noted is not None and sha256_of(path) == noted:
         return open_export(path).count, noted
@@ -66,14 +66,14 @@ def write_runs(folder: Path, log: Journal) -> tuple[int, str]:
 
 
 def export_in_memory(log: JournalReader) -> "Export":
-    """Return what would be exported of a journal's plan now."""
+    """Return the export that a journal's plan would give now."""
     return Export(h5py.File(_exported(log)[1], "r"), log.path)
 
 
 def _exported(log: JournalReader) -> tuple[int, io.BytesIO]:
-    """Return the number of the estimates of a journal's plan, and the bytes of ``runs.h5``.
+    """Return the number of estimates of a journal's plan, and the bytes of ``runs.h5``.
 
-    HDF5 reports a full disk in many ways, or not at all; so it writes to memory, about 100 bytes for each estimate.
+    HDF5 reports a full disk in many ways, or not at all; so it writes to memory, about 100 bytes per estimate.
     """
     manifest, image, sessions = log.manifest(), io.BytesIO(), set[str]()
 
@@ -88,7 +88,7 @@ def _exported(log: JournalReader) -> tuple[int, io.BytesIO]:
 def write_export(
     image: io.BytesIO, manifest: Manifest, origins: Callable[[], Sequence[Origin]], results: Results
 ) -> int:
-    """Write the file of some estimates; returns their number."""
+    """Write estimates to a file; return their number."""
     stored = _stored_columns(manifest)
     writers, count = [column_arrays.ColumnWriter(column) for column in stored], 0
     measured = [writer for writer in writers if not writer.is_fixed]
@@ -108,8 +108,8 @@ def write_export(
 
 
 def _stored_columns(manifest: Manifest) -> list[Column]:
-    """Return the columns of the file: those of a plan's rows, and its swept fields."""
-    # The name of the experiment is an attribute; times are not results.
+    """Return the columns of the file: those of the rows of a plan, and its swept fields."""
+    # The experiment name is an attribute; times are not results.
     of_rows = [c for c in plans.row_columns(manifest) if c.name != "experiment" and c.source != "clock"]
     parts = [*manifest["data_cells"], *manifest["estimators"]]
     swept = []
@@ -122,7 +122,7 @@ def _stored_columns(manifest: Manifest) -> list[Column]:
 def _rows(
     results: Iterable[tuple[Slot, Mapping[str, Any]]], manifest: Manifest, stored: Sequence[Column], size: int
 ) -> Iterator[list[dict[str, Any]]]:
-    """Yield what belongs into the columns, some rows at a time."""
+    """Yield the values of the columns in batches of rows."""
     texts = {column.name for column in stored if column.type == "str"}
     known: dict[tuple[str, str, str], dict[str, Any]] = {}
     waiting = iter(results)
@@ -160,11 +160,11 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
             "platform": " | ".join(dict.fromkeys(origin.platform for origin in sorted(origins))),
         }
     )
-    # Not sorted: swept fields are in the order of the specification. Attributes have a length limit.
+    # Not sorted: swept fields keep the order of the specification. HDF5 attributes have a length limit.
     text = json.dumps(manifest)
     encoded = column_arrays.encoded_texts([text], len(text.encode())).reshape(())
     dataset = file.create_dataset("manifest", data=encoded, track_times=False)
-    # Single texts have no checksum of HDF5.
+    # HDF5 has no checksum for scalar texts.
     dataset.attrs["sha256"] = hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -172,7 +172,7 @@ def _write_plan(file: h5py.File, manifest: Manifest, origins: Sequence[Origin]) 
 
 
 class Export:
-    """An open ``runs.h5``; untrusted: everything in it is checked before use."""
+    """An open ``runs.h5``. The file is untrusted: everything in it is checked before use."""
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         self.path = path
@@ -195,11 +195,11 @@ class Export:
                     raise ValueError(f"there is no column {column.name}")
 
     def has(self, name: str) -> bool:
-        """Return whether there is such an array."""
+        """Return whether an array exists."""
         return name in self._group
 
     def parts(self, name: str) -> list[str]:
-        """Return names of the columns of an array that has several."""
+        """Return the column names of an array with several columns."""
         with saying_where(self.path):
             return column_arrays.decoded_texts(self._group[column_arrays.names_of(name)][()])
 
@@ -209,7 +209,7 @@ class Export:
             return np.asarray(self._group[name][start:stop])
 
     def values(self, column: Column, start: int = 0, stop: int | None = None) -> list[Any]:
-        """Return values of a column, None where there is none."""
+        """Return values of a column, None if missing."""
         name, stop = column.name, self.count if stop is None else min(stop, self.count)
         if not self.has(name):
             return [None] * (stop - start)
@@ -217,13 +217,13 @@ class Export:
         with saying_where(self.path):
             values = column_arrays.decoded(column, lambda ending: self._group[name + ending][start:stop], names)
         if name == "standard_errors":
-            # An estimate with a model has a table of errors, if an empty one.
+            # An estimate with a model has a table of errors, which may be empty.
             models = (self.read("denominator_length", start, stop) != column_arrays.MISSING).tolist()
             return [one or ({} if there else None) for one, there in zip(values, models, strict=True)]
         return values
 
     def verify(self) -> None:
-        """Read all of it, so that HDF5 compares every part with its checksum."""
+        """Read the whole file, so that HDF5 verifies all checksums."""
         for item in self._group.values():
             for dataset in item.values() if isinstance(item, h5py.Group) else [item]:
                 with saying_where(self.path):
@@ -239,13 +239,13 @@ def open_export(path: Path) -> Export:
         try:
             file = h5py.File(path, "r")
         except BlockingIOError:
-            # It never changes; file systems without locks need not stop anyone from reading it.
+            # The file never changes, so file systems without locks can be used.
             file = h5py.File(path, "r", locking=False)
     return Export(file, path)
 
 
 def sha256_of(path: Path) -> str | None:
-    """Return SHA-256 of a file; None where it cannot be read."""
+    """Return the SHA-256 of a file; None if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
     return None
@@ -253,13 +253,13 @@ def sha256_of(path: Path) -> str | None:
 
 @contextmanager
 def saying_where(path: Path) -> Iterator[None]:
-    """Say of which file an error is, and that it cannot be read."""
+    """Add to an error which file cannot be read."""
     try:
         yield
     except DataError as error:
         raise StorageError(f"{path} cannot be read: {error}") from error
     except CtidError:
         raise
-    # HDF5 reports damage as whatever exception the damaged part happens to cause.
+    # HDF5 reports damage by many kinds of exceptions.
     except Exception as error:
         raise StorageError(f"{path} is damaged or cannot be read ({str(error)[:200]})") from error

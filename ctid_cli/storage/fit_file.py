@@ -1,8 +1,7 @@
-"""``fit.json``: a fit without loss, where its records lie, and how it is read again.
+"""``fit.json``: lossless storage of a fit and the paths of its records, and reading it again.
 
-The file has the numbers that people and programs read, as ``ctid fit --json`` prints them; beside them ``result``, the
-fit as it is in Python. What belongs to single samples is left out: it is computed from the records when it is asked
-for.
+The file has the numbers for people and programs, as printed by ``ctid fit --json``, and ``result``, the fit as in
+Python. Arrays with one value per sample are not stored; they are computed from the records when first used.
 """
 
 import os
@@ -25,9 +24,9 @@ from ctid_cli.signals.record import Loop, Record
 from ctid_cli.signals.table import ROLES
 from ctid_cli.storage.result_file import ResultKind, Source, decoded, encoded, path_and_sum, require, texts
 
-#: Format 2 has the formula of the standard errors and the bounds of the admissible models.
+#: Format 2 adds the formula of the standard errors and the bounds of the admissible models.
 FIT = ResultKind("ctid fit", 2, "fit", "ctid fit", "fit again", oldest=2)
-#: A path, as the caller gives it.
+#: A path as given by the caller.
 AnyPath = str | os.PathLike[str]
 
 
@@ -42,7 +41,7 @@ def fit_text(
     folder: Path,
     command: str | None = None,
 ) -> str:
-    """Return the file's text: what is said of a fit, the fit itself, and its records as seen from its folder."""
+    """Return the text of the file: the description of a fit, the fit, and its records relative to the file's folder."""
     whole = dict(content)
     whole["records"] = [
         {**said, **_source(item, folder)} for said, item in zip(content["records"], measurements, strict=True)
@@ -54,7 +53,7 @@ def fit_text(
 
 
 def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
-    """Return where a record lies and how it was read; of one that is no file its samples."""
+    """Return the path of a record and how it was read, or its samples if it is not a file."""
     if measurement.path is None:
         return {"path": None, "series": encoded(measurement.record)}
     return {
@@ -68,7 +67,7 @@ def _source(measurement: Measurement, folder: Path) -> dict[str, Any]:
 
 
 def _loop(measurement: Measurement) -> dict[str, Any]:
-    """Return the loop of a record, if it is known."""
+    """Return the loop of a record, if known."""
     loop = measurement.record.loop
     if loop is None:
         return {}
@@ -86,12 +85,12 @@ class RecordSource(Source):
     """A record as ``fit.json`` names it."""
 
     def read(self) -> Measurement:
-        """Return the record, as it was read for the fit."""
+        """Return the record as it was read for the fit."""
         content = self.content
         if content["path"] is None:
             series = dict(content["series"])
             if "input" in series:
-                # A file of a version that had one input only.
+                # Older files have one input only.
                 series["inputs"] = series.pop("input")
             return Measurement.of(decoded(series, Record, "series"))
         self.require_same()
@@ -115,7 +114,7 @@ class StoredFit:
     """A ``fit.json``, with the records that it names."""
 
     path: Path
-    #: What the file says, as in the documentation of machine-readable output.
+    #: Content of the file, as in the documentation of machine-readable output.
     content: Mapping[str, Any]
     result: Identification
     sources: tuple[RecordSource, ...]
@@ -128,15 +127,15 @@ class StoredFit:
 
     @cached_property
     def measurements(self) -> tuple[Measurement, ...]:
-        """Return the records that the fit was estimated from."""
+        """The records that the fit was estimated from."""
         return tuple(source.read() for source in self.sources)
 
     @cached_property
     def validation(self) -> Measurement | None:
-        """Return the record that it was judged on."""
+        """The validation record."""
         return None if self.validation_source is None else self.validation_source.read()
 
-    # What is filled in later: methods, since these can be pickled with what they belong to.
+    # Deferred fields are filled by methods, which can be pickled with their objects.
 
     def _records(self) -> dict[str, Any]:
         return {"records": tuple(item.record for item in self.measurements)}
@@ -168,21 +167,21 @@ def load_fit(
     path : path
         The file, such as ``fit.json``.
     record : path or sequence of path, optional
-        Where the records of the fit are now, in their order, if they moved.
+        New paths of the records of the fit, in their order, if they moved.
     validation : path, optional
-        The same of the validation record.
+        New path of the validation record, if it moved.
 
     Returns
     -------
     Identification
         What :func:`~ctid_cli.estimators.identification.identify` returned, equal in all numbers. Residuals,
-        sensitivities and records are read and computed anew when they are first asked for.
+        sensitivities and records are computed again or read when first used.
 
     Raises
     ------
     DataError
-        If the file is damaged, of a newer ctid, or no fit; or, where the records are needed, if they are not there or
-        are not those of the fit.
+        If the file is damaged, from a newer ctid, or not a fit; or, when records are needed, if they are missing or
+        differ from those of the fit.
 
     Examples
     --------
@@ -203,7 +202,7 @@ def load_fit(
 def read_fit(
     path: AnyPath, record: AnyPath | Sequence[AnyPath] | None = None, validation: AnyPath | None = None
 ) -> StoredFit:
-    """Return the file with everything in it; :func:`load_fit` says the rest."""
+    """Return the file with all its content; see :func:`load_fit`."""
     file = os.fspath(path)
     content = FIT.content(file)
     moved = [] if record is None else [record] if isinstance(record, str | os.PathLike) else list(record)
@@ -240,7 +239,7 @@ def read_fits(files: Sequence[Path]) -> list[StoredFit]:
 
 
 def _require_sources(content: Mapping[str, Any]) -> None:
-    """Refuse a file that does not say of its records what is needed to read them."""
+    """Refuse a file without the information needed to read its records."""
     require("units", list(content["units"]) == ["time", "input", "output"] and texts(content["units"].values()))
     require("command", content["command"] is None or isinstance(content["command"], str))
     for each in (*content["records"], *([content["validation"]] if content["validation"] else [])):

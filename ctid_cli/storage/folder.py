@@ -1,7 +1,7 @@
-"""The folder of one experiment: what lies in it, who may write to it, and when it must be left alone.
+"""Folder of one experiment: its files, its lock, and when writing is refused.
 
-``spec.yaml`` (the user's text), ``journal.sqlite`` (the live log) and ``runs.h5`` (the estimates that the latest plan
-asks for).
+The files are ``spec.yaml`` (the user's text), ``journal.sqlite`` (the live log) and ``runs.h5`` (the estimates of the
+latest plan).
 """
 
 import fcntl
@@ -20,7 +20,7 @@ from ctid_cli.storage.manifest import Manifest
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, SPEC, who_runs
 from ctid_cli.written_files import TAKEN, is_leftover
 
-#: How long to wait for a command that only reads to let go of the folder [s].
+#: Time to wait for a reading command to release the folder [s].
 PATIENCE = 2.0
 _ASIDE = re.compile(r"\.aside-\d{8}T\d{6}(-\d+)?$")
 ELSEWHERE = (
@@ -35,7 +35,7 @@ class InUseError(RefusedError):
 
 @contextmanager
 def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> Iterator[None]:
-    """Hold the folder's lock; the operating system lets go of it when the process ends, however it ends."""
+    """Hold the folder's lock; the operating system releases it when the process ends for any reason."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError as error:
@@ -59,7 +59,7 @@ def lock(folder: Path, *, shared: bool = False, patience: float = PATIENCE) -> I
             _refuse_links(folder)
         yield
     finally:
-        # It is closed whatever the system says, and nothing was written to it.
+        # Errors on closing are ignored: nothing was written to the lock file.
         with suppress(OSError):
             os.close(descriptor)
 
@@ -79,7 +79,7 @@ def _is_open(folder: Path, descriptor: int) -> bool:
 
 
 def clear(folder: Path) -> None:
-    """Remove what killed runs have left half written; this process holds the lock, so that no other is at it."""
+    """Remove incomplete files of killed runs; this process holds the lock, so no other process is writing."""
     for path in folder.glob(".*"):
         if is_leftover(path.name) and path.name[1:].startswith((SPEC, EXPORT)):
             with suppress(OSError):
@@ -87,7 +87,7 @@ def clear(folder: Path) -> None:
 
 
 def _wait(folder: Path, deadline: float) -> None:
-    """Give the process that has a folder a moment more, if there is time."""
+    """Wait a moment for the process that holds a folder, unless the deadline has passed."""
     if time.monotonic() > deadline:
         running = who_runs(folder)
         owner = f"process {running['pid']} on {running['host']}" if running else "another process"
@@ -96,7 +96,7 @@ def _wait(folder: Path, deadline: float) -> None:
 
 
 def check_free(folder: Path, manifest: Manifest, origin: Origin | None, advice: str = ELSEWHERE) -> None:
-    """Refuse a folder, whose lock this process holds, that must not be added to; without an origin any may be there."""
+    """Refuse a locked folder that must not be extended; without an origin, estimates of any origin are accepted."""
     with saying_what_is_safe(folder), read_journal(folder / FILE_NAME) as log:
         if log is None:
             if (folder / EXPORT).exists():
@@ -117,17 +117,17 @@ def check_free(folder: Path, manifest: Manifest, origin: Origin | None, advice: 
 
 @contextmanager
 def reading_journal(folder: Path) -> Iterator[JournalReader | None]:
-    """Read the folder's journal, while a run writes to it or not; if it is damaged, say what is safe."""
+    """Read the folder's journal, also during a run; if it is damaged, state what is safe."""
     deadline = time.monotonic() + PATIENCE
     with saying_what_is_safe(folder), ExitStack() as stack:
         while not (found := _opened(folder, stack)):
-            # A run is just opening the journal, or closing it.
+            # A run is opening or closing the journal.
             _wait(folder, deadline)
         yield found[0]
 
 
 def _opened(folder: Path, stack: ExitStack) -> tuple[JournalReader | None] | None:
-    """Return the journal, if there is one; nothing while another process is opening or closing it."""
+    """Return the journal, if it exists; None while another process is opening or closing it."""
     with ExitStack() as tried:
         live = False
         try:
@@ -148,7 +148,7 @@ def _opened(folder: Path, stack: ExitStack) -> tuple[JournalReader | None] | Non
 
 @contextmanager
 def writing(folder: Path) -> Iterator[None]:
-    """Say of what cannot be written in a folder that nothing is lost."""
+    """Add to a write error in a folder that no data are lost."""
     try:
         yield
     except OSError as error:
@@ -158,7 +158,7 @@ def writing(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def saying_what_is_safe(folder: Path) -> Iterator[None]:
-    """Add to a report of damage what is safe."""
+    """Add to a report of damage which data are safe."""
     try:
         yield
     except DamageError as error:
@@ -168,7 +168,7 @@ def saying_what_is_safe(folder: Path) -> Iterator[None]:
 
 
 def move_aside(folder: Path) -> Path | None:
-    """Move a folder out of the way, without deleting anything."""
+    """Rename a folder without deleting anything."""
     if not folder.exists():
         return None
     inside = [path for path in experiment_folders(folder) if path != folder]
@@ -190,7 +190,7 @@ def move_aside(folder: Path) -> Path | None:
 
 
 def experiment_folders(results: Path) -> list[Path]:
-    """Return folders of experiments, in a results folder or anywhere below."""
+    """Return the folders of experiments in a results folder, at any depth."""
     found = []
     for path, folders, files in os.walk(results):
         folders[:] = sorted(name for name in folders if not _ASIDE.search(name))

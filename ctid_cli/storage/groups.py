@@ -1,7 +1,7 @@
-"""Estimates by data cell, estimator and start, and the errors of their parameters, as tidy tables.
+"""Estimates by data cell, estimator and start, and their parameter errors, as tidy tables.
 
-Every estimate with a value for each parameter of the system counts, whether its iterations converged or not. An
-estimate that failed, or cannot be written in these parameters, has no error.
+Every estimate with a value for each parameter of the system counts, converged or not. An estimate that failed, or has
+no value in these parameters, has no error.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from ctid_cli.storage.truth import Found
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Columns of errors of parameters.
+#: Columns of parameter errors.
 COLUMNS = ("group", "parameter", "replicate", "true", "value", "standard_error", "quantile")
 
 
 def planned_groups(manifest: Manifest) -> pd.DataFrame:
-    """Return what is planned: the places of data cell and estimator in the plan, and the start; numbered from 0."""
+    """Return the planned groups, numbered from 0: data cell and estimator by their places in the plan, and start."""
     import pandas as pd
 
     cells, estimators = (range(len(manifest[part])) for part in ("data_cells", "estimators"))
@@ -40,7 +40,7 @@ def planned_groups(manifest: Manifest) -> pd.DataFrame:
 
 
 def group_numbers(stored: Estimates) -> IndexArray:
-    """Return the number of the planned group that each estimate is in, shape (n,)."""
+    """Return the number of the planned group of each estimate, shape (n,)."""
     manifest = stored.manifest
     groups = planned_groups(manifest).itertuples(index=False, name=None)
     numbers = {group: number for number, group in enumerate(groups)}
@@ -56,18 +56,18 @@ def group_numbers(stored: Estimates) -> IndexArray:
 
 
 def places_of(numbers: IndexArray) -> dict[int, IndexArray]:
-    """Return the places of the estimates of each group, from the numbers of the groups of all."""
+    """Return the places of the estimates of each group, from the group numbers of all estimates."""
     order = np.argsort(numbers, kind="stable")
     groups, first = np.unique(numbers[order], return_index=True)
     return dict(zip(groups.tolist(), np.split(order, first[1:]), strict=True)) if len(order) else {}
 
 
 def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
-    """Return a row for each parameter of each estimate of a simulated system, from the numbers of their groups.
+    """Return one row for each parameter of each estimate of a simulated system, from their group numbers.
 
-    Columns: ``group``, ``parameter``, ``replicate``; ``true``; ``value``: estimate minus true value, NaN where the
-    estimate does not count; its ``standard_error``, NaN where there is none; ``quantile``, standard errors to each side
-    of the 95 % interval [-]. A delay that is no estimate, always the same and without an error, has no rows.
+    Columns: ``group``, ``parameter``, ``replicate``; ``true``; ``value``: estimate minus true value, NaN if the
+    estimate does not count; its ``standard_error``, NaN if missing; ``quantile``, half-width of the 95 % interval in
+    standard errors [-]. A given delay, which is constant and without an error, has no rows.
     """
     import pandas as pd
 
@@ -83,7 +83,7 @@ def error_frame(stored: Estimates, numbers: IndexArray) -> pd.DataFrame:
         names, true = np.array([*truth], dtype=object)[kept], np.array([*truth.values()])[kept]
         values, errors, quantiles = values[:, kept], errors[:, kept], quantiles[:, kept]
         values[~monte_carlo.complete(values)] = np.nan
-        # Results of before quantiles were stored, and estimators that give none.
+        # Quantiles are missing in older results and from estimators that give none.
         quantiles = np.where(np.isnan(quantiles), monte_carlo.QUANTILE, quantiles)
         replicates = members[number].column("replicate")
         parts.append(errors_of_group(number, replicates, names, true, values, errors, quantiles))
@@ -119,7 +119,7 @@ def errors_of_group(
 def _given_delays(
     groups: pd.DataFrame, truths: Sequence[dict[str, float]], found: dict[int, Found]
 ) -> set[tuple[int, str]]:
-    """Return the places of estimators with the names of delays that are no estimates of theirs."""
+    """Return the places of estimators with the names of the delays that they do not estimate."""
     delays: dict[tuple[int, str], list[Array]] = {}
     for number, (values, errors, _) in found.items():
         cell, estimator = groups.iloc[number, :2].tolist()

@@ -1,9 +1,9 @@
-"""Where results come from: the code that computed them, the machine's arithmetic, and the circumstances of a run.
+"""Origin of results: code version, numeric platform, and circumstances of a run.
 
-Estimates are only put side by side when code and arithmetic agree. The *code version* is a hash of the syntax trees,
-without docstrings and comments, of all layers that compute and of the custom components of a plan, and of the versions
-of the numerical libraries. The *numeric platform* covers what makes the same code give other last bits: the kernels
-that OpenBLAS and NumPy choose for the processor, the processor that Numba compiles for, and the Python version.
+Estimates are compared only if code and arithmetic agree. The *code version* is a hash of the syntax trees, without
+docstrings and comments, of all computing layers and of the custom components of a plan, and of the versions of the
+numerical libraries. The *numeric platform* is what changes the last bits of results of the same code: the kernels that
+OpenBLAS and NumPy choose for the processor, the processor that Numba compiles for, and the Python version.
 """
 
 import ast
@@ -27,16 +27,16 @@ from ctid_cli import custom_code
 from ctid_cli.canonical import content_hash
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Folders and modules of the package whose sources decide what is computed.
+#: Folders and modules of the package whose sources affect results.
 COMPUTING = (
     *("arrays.py", "canonical.py", "signals", "models", "filtering", "inference", "estimation", "estimators"),
     *("frequency", "simulation", "specification", "running/plan.py", "running/job.py"),
 )
-#: Libraries whose version decides what is computed.
+#: Libraries whose versions affect results.
 NUMERICAL_LIBRARIES = ("numpy", "scipy", "numba")
-#: Libraries whose version is worth knowing.
+#: Libraries whose versions are recorded only.
 OTHER_LIBRARIES = ("pandas", "h5py", "joblib", "pydantic", "pyyaml")
-#: The hash of the syntax trees by that of the sources, because walking through them takes seconds.
+#: Cache of syntax tree hashes by source hash, because parsing takes seconds.
 _KEPT = ROOT / "__pycache__" / "syntax_trees.json"
 
 _CORE_NAME_FUNCTIONS = (
@@ -48,7 +48,7 @@ _CORE_NAME_FUNCTIONS = (
 
 
 class Origin(NamedTuple):
-    """Where estimates come from."""
+    """Origin of estimates: code version and numeric platform."""
 
     code_version: str
     platform: str
@@ -61,13 +61,13 @@ class Origin(NamedTuple):
 
 
 def origin_of(*options: Any) -> Origin:
-    """Return where estimates come from that this process and its workers compute with some options."""
+    """Return the origin of estimates that this process and its workers compute with the given options."""
     packages = (("python", platform.python_version()), *package_versions(NUMERICAL_LIBRARIES).items())
     return Origin(code_version(set().union(*map(modules_of, options))), numeric_platform(), packages)
 
 
 def origin_differences(one: Origin, other: Origin, of_one: str, of_other: str) -> str:
-    """Return in words what of two origins differs; empty where they are the same."""
+    """Describe the differences of two origins in words; empty if they are equal."""
     left, right = dict(one.packages), dict(other.packages)
     pairs: list[tuple[str, str | None, str | None]] = [("code version", one.code_version, other.code_version)]
     pairs += [(name, left.get(name), right.get(name)) for name in left | right]
@@ -76,13 +76,13 @@ def origin_differences(one: Origin, other: Origin, of_one: str, of_other: str) -
 
 
 def code_version(modules: Iterable[str] = (), root: Path = ROOT) -> str:
-    """Return hash of the layers that compute, of the numerical libraries, and of the custom ones of some modules."""
+    """Return the hash of the computing layers, the numerical libraries, and the custom code among some modules."""
     custom = sorted(set(_custom_modules(modules).values()))
     return content_hash([package_versions(NUMERICAL_LIBRARIES), _layers_hash(root), custom])[:12]
 
 
 def modules_of(value: Any) -> set[str]:
-    """Return the modules of the classes that options and their fields have."""
+    """Return the modules of the classes of options and their fields."""
     fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
     parts = [modules_of(getattr(value, part.name)) for part in fields]
     parts += [modules_of(item) for item in value] if isinstance(value, list | tuple) else []
@@ -90,7 +90,7 @@ def modules_of(value: Any) -> set[str]:
 
 
 def _custom_modules(names: Iterable[str]) -> dict[str, str]:
-    """Return hashes of the custom modules among some, and of those that these import, directly or not."""
+    """Return hashes of the custom modules among the named ones, and of those that they import, directly or not."""
     found: dict[str, str] = {}
     waiting = list(names)
     while waiting:
@@ -103,7 +103,7 @@ def _custom_modules(names: Iterable[str]) -> dict[str, str]:
                 tree = _without_docstrings(source.content)
             except (SyntaxError, ValueError):
                 tree = hashlib.sha256(source.content).hexdigest()
-            # What a module contains matters, not what it is called.
+            # The content of a module is hashed, not its name.
             found[name] = content_hash([tree, source.data])
             waiting += custom_code.imports_of(source, name)
     return found
@@ -113,7 +113,7 @@ def _layers_hash(root: Path) -> str:
     places = [root / name for name in COMPUTING]
     files = sorted(file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place]))
     sources = [(file.relative_to(root).as_posix(), file.read_bytes()) for file in files]
-    # What the hash is made by belongs to its key.
+    # The key depends on the hash function too.
     key = hashlib.sha256(repr((sys.version, Path(__file__).read_bytes(), sources)).encode()).hexdigest()
     with suppress(OSError, ValueError, KeyError, TypeError):
         return str(json.loads(_KEPT.read_text(encoding="utf-8"))[key])
@@ -127,7 +127,7 @@ def _layers_hash(root: Path) -> str:
 
 
 def _without_docstrings(source: bytes) -> str:
-    """Return hash of a syntax tree without docstrings; comments are not in it."""
+    """Return the hash of a syntax tree without docstrings (and comments, which it does not contain)."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -139,7 +139,7 @@ def _without_docstrings(source: bytes) -> str:
 
 
 def package_versions(names: tuple[str, ...] = NUMERICAL_LIBRARIES + OTHER_LIBRARIES) -> dict[str, str]:
-    """Return versions of installed packages."""
+    """Return the versions of installed packages."""
     return {name: _version(name) for name in names}
 
 
@@ -153,7 +153,7 @@ def _version(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def numeric_platform() -> str:
-    """Return what decides the last bits of floating-point results on this machine."""
+    """Return the numeric platform of this machine, which determines the last bits of floating-point results."""
     import numpy as np
 
     # stubs leave the modes of show_config untyped
@@ -166,7 +166,7 @@ def numeric_platform() -> str:
 
 
 def _numba_target() -> str:
-    """Return the processor that Numba compiles for, and a hash of what it may use of it."""
+    """Return the processor that Numba compiles for, and a hash of its enabled features."""
     from llvmlite import binding  # type: ignore[import-untyped,unused-ignore]
 
     processor = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
@@ -194,12 +194,12 @@ def _openblas_kernels() -> Iterator[str]:
 
 
 def now() -> str:
-    """Return the present time in UTC, for example ``2026-11-21T04:00:00Z``."""
+    """Return the current time in UTC, for example ``2026-11-21T04:00:00Z``."""
     return as_text(datetime.now(UTC))
 
 
 def as_text(moment: datetime) -> str:
-    """Return a time in UTC, as it is stored."""
+    """Return a time in UTC in stored form."""
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
@@ -218,8 +218,8 @@ def session_info(spec_text: str) -> dict[str, Any]:
 
 
 def git_commit(root: Path) -> str | None:
-    """Return commit of a checkout; None where there is none, or no git."""
-    # An installed package may lie in a folder of some other repository.
+    """Return the commit of a checkout; None without a repository or git."""
+    # An installed package may lie inside another repository.
     if (root / ".git").exists():
         with suppress(OSError, subprocess.CalledProcessError):
             asked = ["git", "-C", str(root), "rev-parse", "HEAD"]

@@ -1,12 +1,12 @@
-"""The live log of an experiment: an SQLite file that only the process of the run writes.
+"""Live log of an experiment: an SQLite file that only the process of the run writes.
 
-What a commit has acknowledged survives the death of the process and of the machine (write-ahead log, full
-synchronisation), and is where the path says: a folder that was renamed, replaced or deleted is noticed before. The file
-holds every estimate ever computed in the folder, also those that the latest plan does not ask for, and a line for each
-run with everything that is no result: times, host, command, limits, versions.
+Committed estimates survive a crash of the process or machine (write-ahead log, full synchronisation). Before each
+commit the path is checked: a folder that was renamed, replaced or deleted is detected. The file holds every estimate
+ever computed in the folder, including those outside the latest plan, and one row per run for everything that is not a
+result: times, host, command, limits, versions.
 
-Every row carries a checksum, which is compared whenever the row is read. A damaged file is never repaired in place.
-Others may read while the run writes: each sees the file as it was when it began to read.
+Every row carries a checksum, which is verified on every read. A damaged file is never repaired in place. Other
+processes may read during a run: each sees the file as it was when reading began.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from ctid_cli.storage.identity import Origin
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, Slot, planned_parts, read_json, require_manifest
 from ctid_cli.written_files import write_file
 
-#: How long a reader waits for a moment at which the file can be read [s].
+#: Time that a reader waits for a readable state of the file [s].
 _PATIENCE = 2.0
 
 _KEY = "data_hash, estimator_hash, replicate, start"
@@ -38,7 +38,7 @@ _SCHEMA = (
     "CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT, checksum TEXT) WITHOUT ROWID",
     """CREATE TABLE sessions (
         id TEXT PRIMARY KEY, origin TEXT, started TEXT, stopped TEXT, reason TEXT, info TEXT, checksum TEXT)""",
-    # In the order of a plan, in which they are read; what is long stands last.
+    # In the order of a plan, in which they are read; long columns last.
     f"""CREATE TABLE estimates (
         data_hash TEXT, estimator_hash TEXT, replicate INTEGER, start TEXT,
         status TEXT, seconds REAL, cpu_seconds REAL, session TEXT, checksum TEXT, result TEXT,
@@ -46,13 +46,13 @@ _SCHEMA = (
     f"PRAGMA application_id={sqlite_file.APPLICATION}",
     f"PRAGMA user_version={sqlite_file.FORMAT}",
 )
-#: What is noted: the plan of the latest run, and the SHA-256 of runs.h5 as long as it holds what that asks for.
-#: And how many estimates there are, so that none goes unnoticed.
+#: Keys of notes: the plan of the latest run; the SHA-256 of runs.h5 while it is up to date with that plan; and the
+#: number of estimates, so that missing ones are detected.
 _MANIFEST, _EXPORTED, _COUNT = "manifest", "exported", "count"
 
 
 class Row(NamedTuple):
-    """An estimate as it is stored."""
+    """A stored estimate."""
 
     data_hash: str
     estimator_hash: str
@@ -67,7 +67,7 @@ class Row(NamedTuple):
 
     @classmethod
     def of(cls, outcome: Outcome, session: str) -> "Row":
-        """Return an estimate that was computed just now."""
+        """Return the row of an estimate that was just computed."""
         key, result, *times = outcome
         of_key = (key.data_hash, key.estimator_hash, key.replicate, key.start)
         seconds, cpu_seconds = (None if t is None or not math.isfinite(t) else float(t) for t in times)
@@ -76,17 +76,17 @@ class Row(NamedTuple):
 
     @property
     def key(self) -> Key:
-        """Return its identity."""
+        """Identity of the estimate."""
         return Key(self.data_hash, self.replicate, self.estimator_hash, self.start)
 
     @property
     def is_intact(self) -> bool:
-        """Return whether it is what was written."""
+        """Whether the row is as it was written."""
         return self.checksum == _digest(*self[:-2], self.result)
 
     @property
     def content(self) -> dict[str, Any]:
-        """Return its result."""
+        """Its result."""
         found: dict[str, Any] = json.loads(self.result)
         return found
 
@@ -94,27 +94,27 @@ class Row(NamedTuple):
 class Session(NamedTuple):
     """A run that has written to a journal."""
 
-    #: As no other run has it, so that runs keep theirs where journals are merged.
+    #: Unique among all runs, so that ids stay the same when journals are merged.
     id: str
     origin: Origin
     started: str
-    #: None while it goes on, and of one that was killed.
+    #: None for running and killed sessions.
     stopped: str | None
     reason: str | None
     info: dict[str, Any]
 
 
 class JournalReader:
-    """An open journal, as far as it is read."""
+    """Reading interface of an open journal."""
 
     def __init__(self, connection: sqlite3.Connection, path: Path, *, live: bool = False) -> None:
         self._connection = connection
         self.path = path
-        #: Whether a run is writing to it while it is read.
+        #: Whether a run writes to it during reading.
         self.live = live
 
     def experiment(self) -> str:
-        """Return name of the experiment."""
+        """Return the name of the experiment."""
         return str(self.manifest()["experiment"])
 
     def manifest(self) -> Manifest:
@@ -123,15 +123,15 @@ class JournalReader:
             return require_manifest(read_json(self._meta(_MANIFEST) or ""))
 
     def exported(self) -> str | None:
-        """Return SHA-256 of ``runs.h5``; None if estimates or another plan came after it."""
+        """Return the SHA-256 of ``runs.h5``; None if estimates or the plan have changed since."""
         return self._meta(_EXPORTED)
 
     def sessions(self) -> list[Session]:
-        """Return every run that has written here, the oldest first."""
+        """Return all runs that wrote to this journal, the oldest first."""
         return self._sessions("ORDER BY rowid")
 
     def session(self, id: str) -> Session:
-        """Return one of these runs."""
+        """Return the run with an id."""
         (found,) = self._sessions("WHERE id = ?", id)
         return found
 
@@ -144,27 +144,27 @@ class JournalReader:
             ]
 
     def origins(self) -> tuple[Origin, ...]:
-        """Return where the stored estimates come from."""
+        """Return the origins of the stored estimates."""
         return self.origins_of(id for (id,) in self._rows("SELECT DISTINCT session FROM estimates"))
 
     def origins_of(self, sessions: Iterable[str]) -> tuple[Origin, ...]:
-        """Return where the estimates of some runs come from."""
+        """Return the origins of the estimates of some runs."""
         known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
             return tuple(sorted({known[id] for id in sessions}))
 
     def made(self) -> set[tuple[str, Origin]]:
-        """Return the data cells of the stored estimates, and where these come from."""
+        """Return the data cells of the stored estimates, with their origins."""
         known = {session.id: session.origin for session in self.sessions()}
         with self._guard():
             return {(data, known[id]) for data, id in self._rows("SELECT DISTINCT data_hash, session FROM estimates")}
 
     def count(self) -> int:
-        """Return how many estimates are stored."""
+        """Return the number of stored estimates."""
         return int(self._rows("SELECT count(*) FROM estimates")[0][0])
 
     def counts(self) -> Counter[tuple[str, str]]:
-        """Return number of estimates of each run with each status."""
+        """Return the number of estimates for each run and status."""
         rows = self._rows("SELECT session, status, count(*) FROM estimates GROUP BY 1, 2")
         return Counter({(session, status): count for session, status, count in rows})
 
@@ -174,16 +174,16 @@ class JournalReader:
         yield from self._selected("")
 
     def require_count(self) -> int:
-        """Return how many estimates are stored; fewer than were written, or than a killed run reported, are refused."""
+        """Return the number of stored estimates; refuse fewer than were written or than a killed run reported."""
         written, there = int(self._meta(_COUNT) or 0), self.count()
-        # What a run reports while this is read can be more than there was when reading began.
+        # A live run may report more estimates than existed when reading began.
         written = written if self.live else max(written, sqlite_file.reported(self.path.parent))
         if written != there:
             raise DamageError(f"{self.path} is damaged: {written} estimates were written, {there} are there")
         return there
 
     def planned_rows(self, manifest: Manifest) -> Iterator[tuple[Slot, Row]]:
-        """Yield the stored estimates that a plan asks for, in its order."""
+        """Yield the stored estimates of a plan, in its order."""
         for estimator, cell, replicates in planned_parts(manifest):
             for row in self.rows_of(estimator, cell, replicates):
                 yield Slot(row.key, cell, estimator), row
@@ -191,7 +191,7 @@ class JournalReader:
     def rows_of(
         self, estimator: Mapping[str, Any], cell: Mapping[str, Any], replicates: Sequence[int]
     ) -> Iterator[Row]:
-        """Yield the stored estimates of a planned estimator on some data sets of a data cell, in their order."""
+        """Yield the stored estimates of a planned estimator on some data sets of a data cell, in order."""
         order = {start: number for number, start in enumerate(estimator["starts"])}
         wanted = replicates if isinstance(replicates, range) else frozenset(replicates)
         found = self._selected("WHERE data_hash = ? AND estimator_hash = ?", cell["hash"], estimator["hash"])
@@ -213,14 +213,14 @@ class JournalReader:
         return {(row.replicate, row.start): (row.seconds, row.cpu_seconds) for row in rows}
 
     def check(self, *, fully: bool = False) -> None:
-        """Refuse a file that SQLite finds damaged; fully, compare indices with tables too."""
+        """Refuse a file that SQLite reports as damaged; a full check compares indices with tables too."""
         found = self._rows(f"PRAGMA {'integrity' if fully else 'quick'}_check(1)")
         if found != [("ok",)]:
             raise DamageError(f"{self.path} is damaged: {found[0][0] if found else 'SQLite says nothing of it'}")
         self.require_count()
 
     def _selected(self, where: str, *values: Any) -> Iterator[Row]:
-        """Yield some estimates, compared with their checksums."""
+        """Yield selected estimates after verifying their checksums."""
         with self._guard():
             for values_of_row in self._connection.execute(f"SELECT {_COLUMNS} FROM estimates {where}", values):
                 row = Row(*values_of_row)
@@ -233,7 +233,7 @@ class JournalReader:
             return self._connection.execute(query, values).fetchall()
 
     def _checked(self, table: str, names: str, where: str = "", *values: Any) -> list[Any]:
-        """Return rows of a table, compared with their checksums; ``names`` are all its columns but that."""
+        """Return rows of a table after verifying their checksums; ``names`` are all other columns."""
         rows = self._rows(f"SELECT {names}, checksum FROM {table} {where}", *values)
         for *row, checksum in rows:
             if _digest(table, *row) != checksum:
@@ -253,51 +253,51 @@ class JournalReader:
 
 
 class Journal(JournalReader):
-    """A journal that is open for writing."""
+    """A journal open for writing."""
 
     def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
         super().__init__(connection, path)
-        #: Its folder and files as they were when it was opened; empty until its tables are there.
+        #: Identity of its folder and files when it was opened; empty until its tables exist.
         self.places: dict[Path, tuple[int, int] | None] = {}
 
     def write_spec(self, data: bytes) -> None:
-        """Write the specification beside the journal, if it is not there already."""
+        """Write the specification next to the journal, unless it is already there."""
         path = self.path.with_name(sqlite_file.SPEC)
         if not path.exists() or path.read_bytes() != data:
             write_file(path, data)
 
     def begin(self, manifest: Manifest, origin: Origin, started: str, info: dict[str, Any]) -> str:
-        """Note that a run begins, and where its estimates will come from."""
+        """Record the start of a run, and the origin of its estimates."""
         with self.transaction():
             self.note_plan(manifest)
             return self.note_session(Session(new_id(), origin, started, None, None, info))
 
     def note_session(self, session: Session) -> str:
-        """Note a run, whose id is returned; inside a transaction."""
+        """Record a run and return its id; must be called inside a transaction."""
         id, origin, *times, info = session
         self._insert("sessions", id, canonical_json(origin._asdict()), *times, canonical_json(info))
         return id
 
     def replan(self, manifest: Manifest) -> None:
-        """Note that the plan of the present run has changed."""
+        """Record a changed plan of the current run."""
         with self.transaction():
             self.note_plan(manifest)
 
     def note_plan(self, manifest: Manifest) -> None:
-        """Note the latest plan; inside a transaction."""
-        # Not sorted: the order of swept fields and starts is that of the specification.
+        """Record the latest plan; must be called inside a transaction."""
+        # Not sorted: swept fields and starts keep the order of the specification.
         text = json.dumps(manifest, allow_nan=False)
         if self._meta(_MANIFEST) != text:
             self._insert("meta", _MANIFEST, text)
             self._connection.execute("DELETE FROM meta WHERE name = ?", (_EXPORTED,))
 
     def add(self, outcomes: Iterable[Outcome], session: str) -> None:
-        """Store estimates, in place of earlier ones if there are any; when this returns, they are safe."""
+        """Store estimates, replacing earlier ones; they are durable when this returns."""
         with self.transaction():
             self.add_rows(Row.of(outcome, session) for outcome in outcomes)
 
     def add_rows(self, rows: Iterable[Row]) -> None:
-        """Store rows, in place of earlier ones if there are any; inside a transaction."""
+        """Store rows, replacing earlier ones; must be called inside a transaction."""
         execute, marks, new = self._connection.execute, ", ".join("?" * len(Row._fields)), 0
         for row in rows:
             new += execute(f"SELECT 1 FROM estimates WHERE {_IS_KEY}", row[:4]).fetchone() is None
@@ -306,33 +306,33 @@ class Journal(JournalReader):
         self._insert("meta", _COUNT, str(int(self._meta(_COUNT) or 0) + new))
 
     def note_export(self, sha256: str) -> None:
-        """Note that ``runs.h5`` holds the present estimates of the present plan."""
+        """Record that ``runs.h5`` holds the current estimates of the current plan."""
         with self.transaction():
             self._insert("meta", _EXPORTED, sha256)
 
     def end(self, session: str, stopped: str, reason: str) -> None:
-        """Note that a run ends."""
+        """Record the end of a run."""
         with self.transaction():
             self.note_session(self.session(session)._replace(stopped=stopped, reason=reason))
 
     def require_in_place(self) -> None:
-        """Refuse to go on in a file that its path does not lead to any more."""
+        """Refuse to continue if the path no longer leads to the open file."""
         sqlite_file.require_places(self.places)
 
     def close(self) -> None:
-        """Close the file; closing cannot lose what was acknowledged, so it does not complain."""
+        """Close the file; errors are ignored because committed data cannot be lost."""
         with suppress(sqlite3.Error):
             self._connection.close()
 
     def _insert(self, table: str, *row: Any) -> None:
-        """Store a row and its checksum, in place of one with the same key."""
+        """Store a row and its checksum, replacing a row with the same key."""
         marks = ", ".join("?" * (len(row) + 1))
         self._connection.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", (*row, _digest(table, *row)))
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
-        """Return commit what is done inside, or undo all of it if an exception ends it."""
-        # The connection commits, or rolls back what an exception has left undone.
+        """Commit the enclosed changes, or roll them back if an exception occurs."""
+        # The connection commits, or rolls back after an exception.
         with self._guard(writing=True), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield
@@ -340,7 +340,7 @@ class Journal(JournalReader):
 
 
 def open_journal(path: Path) -> Journal:
-    """Open a journal for writing, and make it if there is none."""
+    """Open a journal for writing; create it if it does not exist."""
     sqlite_file.require_whole(path)
     with ExitStack() as stack:
         try:
@@ -365,7 +365,7 @@ def open_journal(path: Path) -> Journal:
 
 @contextmanager
 def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | None]:
-    """Open a journal for reading without touching its files, ``live`` while a run writes to it."""
+    """Open a journal for reading without changing its files; ``live`` during a run."""
     if not path.exists():
         yield None
         return
@@ -375,7 +375,7 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
             address = stack.enter_context(sqlite_file.readable(path, live=live))
             connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=_PATIENCE)
             stack.callback(connection.close)
-            # All that is read from here on is of one moment.
+            # All following reads see one consistent state.
             connection.execute("BEGIN")
             planned = connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchone()
             if planned:
@@ -391,10 +391,10 @@ def read_journal(path: Path, *, live: bool = False) -> Iterator[JournalReader | 
 
 
 def new_id() -> str:
-    """Return an id as no other run has it."""
+    """Return a unique id of a run."""
     return uuid.uuid4().hex[:16]
 
 
 def _digest(*values: Any) -> str:
-    """Return checksum of a row."""
+    """Return the checksum of a row."""
     return hashlib.sha256(repr(values).encode("utf-8", "surrogatepass")).hexdigest()[:32]

@@ -1,8 +1,8 @@
-"""A plan as plain data: what the stored estimates are compared with, sorted by and described from.
+"""A plan as plain data (manifest), used to compare, sort and describe stored estimates.
 
-Journal and ``runs.h5`` keep the manifest, so that results can be listed, counted and exported without the specification
-that made them. A shard is the part of a plan that one of several runs computes: whose a data set is follows from its
-place in the plan and the number of shards alone, and what is dealt stays where it is when ``runs`` is raised.
+Journal and ``runs.h5`` keep the manifest, so that results can be listed, counted and exported without their
+specification. A shard is the part of a plan that one of several runs computes: the shard of a data set depends only on
+its place in the plan and the number of shards, and does not change when ``runs`` is increased.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from ctid_cli.models.transfer_function import TransferFunction
 
 Manifest = dict[str, Any]
-#: Estimates that one plan may ask for.
+#: Maximum number of estimates of one plan.
 MAX_ESTIMATES = 100_000_000
 
 
 class Key(NamedTuple):
-    """Identity of an estimate: what it was computed from."""
+    """Identity of an estimate: the inputs of its computation."""
 
     data_hash: str
     replicate: int
@@ -40,25 +40,25 @@ class Key(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Return short name of the estimate."""
+        """Short name of the estimate."""
         return hashlib.sha256(f"{self[0]}/{self[1]}/{self[2]}/{self[3]}".encode()).hexdigest()[:12]
 
 
 class Outcome(NamedTuple):
-    """One estimate, or how it failed."""
+    """One estimate or its failure."""
 
-    #: Which estimate.
+    #: Identity of the estimate.
     key: Key
-    #: Values of the columns that come from a result.
+    #: Values of the columns with source "result".
     result: dict[str, Any]
-    #: Time for preparing the record and fitting [s]; None where nothing was measured.
+    #: Wall time for preparing the record and fitting [s]; None if not measured.
     seconds: float | None
-    #: The same of the processor [s].
+    #: Processor time for preparing the record and fitting [s].
     cpu_seconds: float | None = None
 
 
 class Slot(NamedTuple):
-    """One place in the table of estimates: which estimate belongs there and how it is labelled."""
+    """A place in the table of estimates: key and labels of the estimate."""
 
     key: Key
     cell: Mapping[str, Any]
@@ -66,13 +66,13 @@ class Slot(NamedTuple):
 
     @property
     def swept(self) -> dict[str, Any]:
-        """Return values of the swept fields."""
+        """Values of the swept fields."""
         return {**self.cell["swept"], **self.estimator["swept"]}
 
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """One of several shards, counted from 1."""
+    """One shard of several, numbered from 1."""
 
     number: int
     of: int
@@ -82,31 +82,31 @@ class Shard:
 
     @classmethod
     def read(cls, text: str) -> Self:
-        """Return the shard that a text such as ``2/3`` names."""
+        """Return the shard given by a text such as ``2/3``."""
         found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
         if found is None or not 1 <= int(found[1]) <= int(found[2]):
             raise UsageError(f"--shard {text}: write k/n, for example 2/3 for the second of three, with k from 1 to n")
         return cls(int(found[1]), int(found[2]))
 
     def folder(self, experiment: str) -> str:
-        """Return name of the folder of its results."""
+        """Return the name of its results folder."""
         return f"{experiment}.shard-{self.number}-of-{self.of}"
 
     def has(self, cell: int, replicate: int, cells: int) -> bool:
-        """Return whether a data set is among those of this shard."""
+        """Return whether a data set belongs to this shard."""
         return owner(cell, replicate, cells, self.of) == self.number
 
 
 def owner(cell: int, replicate: int, cells: int, of: int) -> int:
-    """Return number of the shard that a data set is dealt to."""
+    """Return the number of the shard of a data set."""
     index = replicate * cells + cell
-    # Dealt in turn, a number of cells that has a factor in common with that of the shards would give some shards the
-    # same cells over and over; so each turn through both begins one shard later.
+    # Assigned in turn, if the number of cells has a factor in common with the number of shards, some shards would
+    # always get the same cells; so each pass through both starts one shard later.
     return (index + index // lcm(cells, of)) % of + 1
 
 
 def read_json(text: str) -> Any:
-    """Return JSON without the numbers that it has no words for."""
+    """Parse JSON; refuse numbers that are not valid JSON."""
 
     def refuse(constant: str) -> NoReturn:
         raise ValueError(f"{constant} is no JSON number")
@@ -115,7 +115,7 @@ def read_json(text: str) -> Any:
 
 
 def require_manifest(found: Any) -> Manifest:
-    """Return the plan in an untrusted file; a ValueError says what is wrong with it."""
+    """Return the plan of an untrusted file; a ValueError describes what is wrong."""
     from pydantic import ValidationError
 
     try:
@@ -137,14 +137,14 @@ def require_manifest(found: Any) -> Manifest:
 
 
 def planned_most(plan: Manifest) -> int:
-    """Return the number of estimates of a plan, whatever its shard."""
+    """Return the number of estimates of a whole plan, ignoring shards."""
     data_sets: int = sum(cell["replicates"] for cell in plan["data_cells"])
     return data_sets * sum(len(estimator["starts"]) for estimator in plan["estimators"])
 
 
 @cache
 def _plan_model() -> Any:
-    """Return what checks the form of a plan."""
+    """Return the validator of the form of a plan."""
     from typing import Annotated
 
     from pydantic import BaseModel, Field, FiniteFloat
@@ -190,7 +190,7 @@ def _plan_model() -> Any:
 
 
 def slots(manifest: Manifest) -> Iterator[Slot]:
-    """Yield every estimate that a plan asks for, or that its shard is to compute."""
+    """Yield the place of every estimate in a plan or its shard."""
     for estimator, cell, replicates in planned_parts(manifest):
         for replicate in replicates:
             for start in estimator["starts"]:
@@ -198,7 +198,7 @@ def slots(manifest: Manifest) -> Iterator[Slot]:
 
 
 def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mapping[str, Any], Sequence[int]]]:
-    """Yield every estimator on every data cell, in the order of the plan, with the data sets that are asked for."""
+    """Yield every estimator on every data cell with its data sets, in the order of the plan."""
     cells, shard = manifest["data_cells"], shard_of(manifest)
     asked: list[Sequence[int]] = [range(cell["replicates"]) for cell in cells]
     if shard is not None:
@@ -210,22 +210,22 @@ def planned_parts(manifest: Manifest) -> Iterator[tuple[Mapping[str, Any], Mappi
 
 
 def planned_count(manifest: Manifest) -> int:
-    """Return how many estimates that are, those that two names share counted twice."""
+    """Return the number of planned estimates; estimates shared by two names count twice."""
     return sum(len(replicates) * len(estimator["starts"]) for estimator, _, replicates in planned_parts(manifest))
 
 
 def shard_of(manifest: Manifest) -> Shard | None:
-    """Return which shard of the experiment it is; None for the whole."""
+    """Return the shard of a plan; None for a whole experiment."""
     return Shard(*manifest["shard"]) if "shard" in manifest else None
 
 
 def whole(manifest: Manifest) -> Manifest:
-    """Return the plan that a shard was dealt from."""
+    """Return the whole plan of a shard."""
     return {name: value for name, value in manifest.items() if name != "shard"}
 
 
 def row_columns(manifest: Manifest) -> list[columns.Column]:
-    """Return the columns of a row as it is computed, before it is compared with the truth."""
+    """Return the columns of a row as computed, before comparison with the true values."""
     here = {"all", "systems", "signals" if is_of_signal(manifest) else ""}
     return [column for column in columns.COLUMNS if column.of in here and column.source != "truth"]
 
@@ -236,13 +236,13 @@ def is_of_signal(manifest: Manifest) -> bool:
 
 
 def swept_names(manifest: Manifest) -> list[str]:
-    """Return names of the swept fields."""
+    """Return the names of the swept fields."""
     parts = [*manifest["data_cells"], *manifest["estimators"]]
     return list(dict.fromkeys(name for part in parts for name in part["swept"]))
 
 
 def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | MultiInputModel | None:
-    """Return the system that a data cell simulates; None for a custom one, a measured record or a signal."""
+    """Return the system of a data cell; None for a custom system, a measured record or a signal."""
     from ctid_cli.models.additive import AdditiveModel, Submodel
     from ctid_cli.models.several_inputs import MultiInputModel
     from ctid_cli.models.transfer_function import TransferFunction
@@ -251,7 +251,7 @@ def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | M
     if inputs := content.get("inputs"):
         return MultiInputModel.of({name: TransferFunction(**one["system"]) for name, one in inputs.items()})
     system = content.get("system") or {}
-    # An option of a custom system may be called delay.
+    # A custom system may have an option named delay.
     if "additive" in system:
         parts = [Submodel(**item) for item in system["additive"]]
         return AdditiveModel(parts, float(system.get("delay") or 0.0))
@@ -261,10 +261,10 @@ def true_system(cell: Mapping[str, Any]) -> TransferFunction | AdditiveModel | M
 
 
 def true_values(cell: Mapping[str, Any]) -> dict[str, float]:
-    """Return true values of the system that a data cell simulates, by name; empty for a measured record or a signal.
+    """Return the true values of the simulated system by name; empty for a measured record or a signal.
 
-    ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator; the
-    parameters of the submodels of a sum, and its delay; those of several inputs; what a custom system gives.
+    These are ``a1`` ..., ``b0`` ..., ``delay`` of a transfer function, in descending powers with a monic denominator;
+    the submodel parameters of a sum, and its delay; those of several inputs; or the values given by a custom system.
     """
     from ctid_cli.models.additive import AdditiveModel
     from ctid_cli.models.several_inputs import parameters_of

@@ -1,8 +1,8 @@
-"""Rows of other journals: merging shards as if one run had computed them, and keeping what is left of damaged results.
+"""Merging shards into one set of results, and recovering readable rows of damaged results.
 
-The folders that are read are not changed. Rows go over with their times, and the runs that computed them with all that
-is known of these, in one transaction: where anything is in the way, nothing is written. The export comes from the rows
-alone, so that it has the bytes of a single run's.
+Source folders are not changed. Rows are copied with their times, and with all data of the runs that computed them, in
+one transaction: if there is any conflict, nothing is written. The export depends on the rows only, so it has the bytes
+of a single run's export.
 """
 
 import re
@@ -23,33 +23,33 @@ from ctid_cli.storage.journal import Journal, JournalReader, Row, Session, new_i
 from ctid_cli.storage.manifest import Key, Manifest, Outcome, Shard, owner, shard_of, slots, whole
 from ctid_cli.storage.sqlite_file import EXPORT, FILE_NAME, SPEC
 
-#: Statuses of estimates that exceeded a limit, and the limits, of which the first counts first.
+#: Statuses of estimates that exceeded a limit, and the limits in order of precedence.
 LIMITED = ("TIMEOUT", "MEMORY")
 LIMITS = ("wall_seconds", "cpu_seconds", "memory_mb")
-#: Estimates that a refusal names.
+#: Maximum number of estimates named in an error message.
 NAMED = 5
 _SHARD = re.compile(r"\.shard-\d+-of-\d+$")
 
 
 @dataclass(frozen=True)
 class Merged:
-    """What a merge has made."""
+    """Result of a merge."""
 
     experiment: str
     folder: Path
     sources: int
     planned: int
     stored: int
-    #: Estimates that were not in the folder before, or exceeded a limit there.
+    #: Number of estimates that are new in the folder, or exceeded a limit there.
     new: int
     mixed: bool
     checksum: str
-    #: What is not there, in words; empty for nothing.
+    #: Description of what is missing; empty if complete.
     missing: str
 
 
 def find_sources(paths: Iterable[Path]) -> list[Path]:
-    """Return the folders that are meant: of experiments as they are given, of all shards below others."""
+    """Return the folders to merge: given folders of experiments, and all shards below other folders."""
     found: dict[Path, Path] = {}
     for path in paths:
         if (path / FILE_NAME).exists():
@@ -65,7 +65,7 @@ def find_sources(paths: Iterable[Path]) -> list[Path]:
 def merge_all(
     folders: Iterable[Path], out: Path, *, allow_mixed: bool = False, partial: bool = False
 ) -> Iterator[Merged]:
-    """Merge folders, those of each experiment into the one of its name."""
+    """Merge the folders of each experiment into the folder of its name."""
     experiments: dict[str, list[Path]] = defaultdict(list)
     for folder in folders:
         experiments[_plan_of(folder)["experiment"]].append(folder)
@@ -74,12 +74,12 @@ def merge_all(
 
 
 def merge(folders: Iterable[Path], target: Path, *, allow_mixed: bool = False, partial: bool = False) -> Merged:
-    """Merge folders of one experiment into another one, which may hold some of its estimates already."""
+    """Merge folders of one experiment into a target, which may already hold some of the estimates."""
     others = [folder for folder in folders if not (target.exists() and folder.samefile(target))]
     if not others:
         raise UsageError(f"there is nothing to merge into {target} but itself")
     plans = {folder: _plan_of(folder) for folder in others}
-    # In the same order whatever the order they are named in.
+    # A fixed order, independent of the order on the command line.
     others.sort(key=lambda folder: (shard_of(plans[folder]) or Shard(0, 0), str(folder)))
     plan = _common_plan([(folder, plans[folder]) for folder in others])
     keys = dict.fromkeys(slot.key for slot in slots(plan))
@@ -123,7 +123,7 @@ def _plan_of(folder: Path) -> Manifest:
 
 
 def _common_plan(plans: Sequence[tuple[Path, Manifest]]) -> Manifest:
-    """Return the plan that all folders are of."""
+    """Return the common plan of all folders."""
     first, plan = plans[0][0], whole(plans[0][1])
     for folder, found in plans[1:]:
         other = whole(found)
@@ -140,7 +140,7 @@ def _common_plan(plans: Sequence[tuple[Path, Manifest]]) -> Manifest:
 
 @contextmanager
 def _new_folder(target: Path) -> Iterator[None]:
-    """Return a folder that is removed again if it was made here and what follows fails."""
+    """Create a folder; if the enclosed code fails, remove it again unless it existed before."""
     made = not target.exists()
     try:
         with place.writing(target):
@@ -153,22 +153,22 @@ def _new_folder(target: Path) -> Iterator[None]:
 
 
 class _Taken:
-    """What has been taken over from several folders into a journal, in one transaction."""
+    """Rows and runs copied from several folders into a journal in one transaction."""
 
     def __init__(
         self, target: Path, log: Journal, plan: Manifest, planned: Container[Key], *, allow_mixed: bool
     ) -> None:
         self._log, self._planned, self._allow_mixed = log, planned, allow_mixed
-        #: Where the runs of the journal come from, by their ids.
+        #: Folder and data of each run of the journal, by id.
         self._places = {session.id: (target, session) for session in log.sessions()}
         cells = {cell["hash"] for cell in plan["data_cells"]}
         self._origins = {origin: target for data, origin in log.made() if data in cells}
         self._conflicts: list[tuple[Key, Path, Path]] = []
-        #: Estimates that were not there before, or exceeded a limit there.
+        #: Estimates that are new, or exceeded a limit before.
         self.changed: set[Key] = set()
 
     def new_rows(self, folder: Path, other: JournalReader) -> Iterator[Row]:
-        """Yield the rows of a folder that are to be stored; their runs are noted."""
+        """Yield the rows of a folder to store, and record their runs."""
         sessions = {session.id: session for session in other.sessions()}
         for row in other.rows():
             if row.key not in self._planned:
@@ -182,7 +182,7 @@ class _Taken:
                 yield row
 
     def _require_origin(self, folder: Path, origin: Origin) -> None:
-        """Refuse what other code or another processor has computed than the rest."""
+        """Refuse results of another code version or processor than the rest."""
         if self._allow_mixed or origin in self._origins or not self._origins:
             self._origins.setdefault(origin, folder)
             return
@@ -194,7 +194,7 @@ class _Taken:
         )
 
     def _is_better(self, row: Row, session: Session, present: Row, folder: Path) -> bool:
-        """Return whether a row replaces the present one, as where this exceeded a limit; a conflict is noted."""
+        """Return whether a row replaces the present one, which exceeded a limit; record conflicts."""
         if row.result == present.result:
             return False
         where, of_present = self._places[present.session]
@@ -204,7 +204,7 @@ class _Taken:
         return False
 
     def require_no_conflict(self) -> None:
-        """Name the estimates that are one thing here and another there."""
+        """Refuse conflicts, naming the estimates that differ."""
         if self._conflicts:
             key, one, other = self._conflicts[0]
             count = len(self._conflicts)
@@ -217,14 +217,14 @@ class _Taken:
 
 
 def _rank(row: Row, session: Session) -> tuple[bool, list[float], str]:
-    """Return which of two is better, where one exceeded a limit: a result, or else what had the higher limits."""
+    """Return the rank of a row of an estimate that exceeded a limit: a result first, then higher limits."""
     limits = session.info.get("limits") or {}
     allowed = [inf if (limit := limits.get(name)) is None else float(limit) for name in LIMITS]
     return row.status not in LIMITED, allowed, row.result
 
 
 def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]) -> str:
-    """Return what is not there, by shard where all folders are of the same dealing; empty for nothing."""
+    """Describe what is missing, by shard if all folders have the same number of shards; empty if complete."""
     dealings = {0 if shard is None else shard.of for shard in shards}
     if not keys or len(dealings) > 1 or 0 in dealings:
         return f"{len(keys)} estimates are missing" if keys else ""
@@ -237,7 +237,7 @@ def _missing(plan: Manifest, shards: Sequence[Shard | None], keys: Sequence[Key]
 
 
 def shards_text(numbers: Iterable[int], of: int) -> str:
-    """Return some shards in words, with numbers as job arrays take them: ``shards 1-3,7 of 9``."""
+    """Return shards as text, with numbers in the form of job arrays: ``shards 1-3,7 of 9``."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and runs[-1][-1] == number - 1:
@@ -248,15 +248,15 @@ def shards_text(numbers: Iterable[int], of: int) -> str:
     return f"{'shard' if text.isdigit() else 'shards'} {text} of {of}"
 
 
-# --- what can be read of damaged results, copied from the folder that was moved aside --------------------------------
+# --- recovery of readable results from a damaged folder that was moved aside ------------------------------------------
 
 
 @dataclass(frozen=True)
 class Kept:
-    """What was kept of a folder that was moved aside."""
+    """Result of recovering a folder that was moved aside."""
 
     planned: int
-    #: Estimates out of its journal, and out of ``runs.h5``.
+    #: Number of estimates from its journal, and from ``runs.h5``.
     from_journal: int
     from_export: int
 
@@ -266,10 +266,10 @@ class Kept:
 
 
 def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, allow_mixed: bool = False) -> Kept:
-    """Copy what can be read of a folder that was moved aside into a new journal.
+    """Copy all readable estimates of a folder that was moved aside into a new journal.
 
-    Row by row: what SQLite still reads of the old journal and agrees with its checksum; where a row is lost, that of
-    ``runs.h5`` if this is whole. Results of other code or arithmetic are left out unless they may be mixed.
+    Each row comes from the old journal if SQLite can read it and its checksum is right, otherwise from ``runs.h5`` if
+    that file is intact. Results of other code or arithmetic are left out unless mixing is allowed.
     """
     keys = dict.fromkeys(slot.key for slot in slots(plan))
     kept, noted = set[Key](), set[str]()
@@ -292,10 +292,10 @@ def keep_readable(aside: Path, log: Journal, plan: Manifest, origin: Origin, *, 
 
 
 def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]:
-    """Yield the rows of a journal that can be read, each with its run."""
+    """Yield the readable rows of a journal, each with its run."""
     with suppress(CtidError), read_journal(aside / FILE_NAME) as old:
         for key in keys if old is not None else ():
-            # Whatever a damaged page hides, the other rows are worth reading.
+            # A damaged page must not stop the other rows from being read.
             with suppress(CtidError, ValueError):
                 assert old is not None
                 if (row := old.row(key)) is not None:
@@ -303,7 +303,7 @@ def _readable(aside: Path, keys: Iterable[Key]) -> Iterator[tuple[Row, Session]]
 
 
 def _exported(aside: Path) -> Iterator[tuple[Row, Session]]:
-    """Yield the estimates of ``runs.h5``, if it is whole; of several origins it does not say which an estimate has."""
+    """Yield the estimates of ``runs.h5`` if it is intact and of a single origin (origins of rows are not stored)."""
     with suppress(CtidError):
         export = open_export(aside / EXPORT)
         export.verify()

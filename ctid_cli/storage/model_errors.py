@@ -1,4 +1,4 @@
-"""Estimated models beside the system that they are of: poles, and distances between responses."""
+"""Errors of estimated models: poles, and distances between responses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Distance = Callable[[TransferFunction, TransferFunction], float]
 
 
 def system_of(cell: Mapping[str, Any], name: str) -> TransferFunction:
-    """Return the system that a data cell simulates, as one fraction, for a measure that needs it."""
+    """Return the simulated system of a data cell as one fraction, for a measure that needs it."""
     system = true_system(cell)
     model = unfactored(system) if isinstance(system, AdditiveModel) else system
     if not isinstance(model, TransferFunction):
@@ -37,7 +37,7 @@ def system_of(cell: Mapping[str, Any], name: str) -> TransferFunction:
 
 
 def distances(system: TransferFunction, rows: Estimates, name: str) -> Array:
-    """Return the distances of estimates that a measure is about [%]; where there is no model, it is infinitely far."""
+    """Return the distances of estimates for a measure [%]; infinite if there is no model."""
     base, _, argument = name.partition(":")
     known: dict[str, Distance] = {"h2": h2_distance, "hinf": hinf_distance}
     distance = partial(response_distance, frequency=float(argument)) if base == "response" else known[base]
@@ -50,10 +50,10 @@ def _model(row: Mapping[str, Any]) -> TransferFunction:
 
 
 def pole_errors(group: int, system: TransferFunction, rows: Estimates) -> pd.DataFrame:
-    """Return errors of poles in the place of parameters, each with the true one that it goes with [rad/s].
+    """Return pole errors in the form of parameter errors, each with the matched true pole [rad/s].
 
-    ``pole_1`` ..., fastest first; of two complex ones ``pole_1_real`` and ``pole_1_imag``. Of a model with another
-    number of poles there are none.
+    Names are ``pole_1`` ..., fastest first; ``pole_1_real`` and ``pole_1_imag`` for complex pairs. A model with another
+    number of poles has no errors.
     """
     true = system.poles
     found = np.array([true, *(matched_poles(true, denominator) for denominator in rows.values("denominator"))])

@@ -1,7 +1,7 @@
-"""Files of one result each, such as ``fit.json``: kind, format, checksum, and the records that they are of.
+"""Files of one result each, such as ``fit.json``: kind, format, checksum, and records.
 
-The result is in them as plain data without loss: every number to its last bit, every array with its shape. What is read
-back is what the annotations of the result's classes name, and nothing else: a file cannot ask for a class.
+Results are stored as plain data without loss: numbers to the last bit, arrays with their shapes. Only classes in the
+annotations of the result's classes are created when reading: a file cannot name a class.
 """
 
 import dataclasses
@@ -28,32 +28,32 @@ from ctid_cli.signals.files import require_file
 from ctid_cli.simulation.dataset import file_sha256
 from ctid_cli.storage.manifest import read_json
 
-#: Bytes of the largest file that is read; ten thousand draws of a bootstrap need less.
+#: Maximum size of a file that is read [bytes]; ten thousand bootstrap draws need less.
 MAX_BYTES = 200_000_000
 
 
 class ResultKind(NamedTuple):
-    """A kind of file."""
+    """A kind of result file."""
 
     kind: str
-    #: The format that is written, and the newest that is read.
+    #: The format that is written, and the newest that can be read.
     format: int
-    #: What it is, as in "this is no fit", and the command that makes it.
+    #: Noun for messages, as in "this is no fit", and the command that makes it.
     noun: str
     command: str
-    #: What to do instead of using another record, as in "or fit again".
+    #: Alternative to using another record, for messages, as in "or fit again".
     again: str
-    #: The oldest format that is read.
+    #: The oldest format that can be read.
     oldest: int = 1
 
     def text(self, content: Mapping[str, Any], command: str | None) -> str:
-        """Return the text of a file, with what every reader compares."""
+        """Return the text of a file, including the fields that every reader verifies."""
         whole = {"kind": self.kind, "format": self.format, "ctid": ctid_cli.__version__, "command": command, **content}
         text = json.dumps(whole, allow_nan=False)
         return json.dumps(whole | {"checksum": content_hash(json.loads(text))}, allow_nan=False)
 
     def content(self, file: str) -> dict[str, Any]:
-        """Return what a file says, if it is one of this kind as it was written."""
+        """Return the content of a file after verifying its kind and checksum."""
         content = self._json(file)
         if not isinstance(content, dict) or content.get("kind") != self.kind:
             self.refuse(file, self._what_else(content))
@@ -67,20 +67,20 @@ class ResultKind(NamedTuple):
         return content
 
     def kind_in(self, file: str) -> str | None:
-        """Return which kind of result a file says that it is; refuse one that cannot be read as of a kind."""
+        """Return the kind of result in a file; refuse a file that cannot be read."""
         content = self._json(file)
         return content["kind"] if isinstance(content, dict) and isinstance(content.get("kind"), str) else None
 
     @contextmanager
     def refusing(self, file: str) -> Iterator[None]:
-        """Refuse a file of which a part is not what it should be."""
+        """Refuse a file with invalid content."""
         try:
             yield
         except (KeyError, TypeError, IndexError, AttributeError, ValueError, DataError, OverflowError) as error:
             self.refuse(file, f"is damaged ({str(error)[:200]})")
 
     def refuse(self, file: str, what: str) -> NoReturn:
-        """Say what is wrong with a file, and what writes such files."""
+        """Raise an error with the reason and the command that writes such files."""
         raise DataError(f"{file} {what}; {self.command} writes such a file")
 
     def _json(self, file: str) -> Any:
@@ -95,7 +95,7 @@ class ResultKind(NamedTuple):
             self.refuse(file, f"is no JSON, or damaged ({str(error)[:200]})")
 
     def _what_else(self, content: Any) -> str:
-        """Return what a file is that is of another kind."""
+        """Describe a file of another kind."""
         if not isinstance(content, dict):
             return f"is no {self.noun}"
         if isinstance(content.get("kind"), str):
@@ -106,7 +106,7 @@ class ResultKind(NamedTuple):
 
 
 def path_and_sum(path: str | os.PathLike[str], folder: Path) -> dict[str, Any]:
-    """Return where a record lies, seen from a folder, and its SHA-256."""
+    """Return the path of a record relative to a folder, and its SHA-256."""
     place, home = Path(os.path.abspath(path)), Path(os.path.abspath(folder))
     below = place.is_relative_to(home)
     shown = place.relative_to(home).as_posix() if below else str(place)
@@ -115,27 +115,27 @@ def path_and_sum(path: str | os.PathLike[str], folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Source:
-    """A record as the file of a result names it."""
+    """A record named in the file of a result."""
 
     kind: ResultKind
-    #: The file that names it.
+    #: The file that names the record.
     owner: str
     content: Mapping[str, Any]
-    #: Where it is now, if it moved.
+    #: Its new path, if it moved.
     moved: str | None = None
 
     @property
     def name(self) -> str:
-        """Return how the record was called."""
+        """Name of the record."""
         return str(self.content["file"])
 
     @property
     def place(self) -> str:
-        """Return where the record is looked for."""
+        """Path from which the record is read."""
         return self.moved or str(Path(os.path.abspath(self.owner)).parent / str(self.content["path"]))
 
     def require_same(self) -> None:
-        """Refuse another file than the result is of."""
+        """Refuse a record that differs from that of the result."""
         if self.moved is None and not Path(self.place).exists():
             cure = "say where it is now: --record FILE"
             raise DataError(f"{self.owner}: its record {self.place} does not exist; {cure}")
@@ -150,7 +150,7 @@ def texts(values: Iterable[Any]) -> bool:
 
 
 def require(what: str, right: bool) -> None:
-    """Refuse a file of which a part is not what it should be."""
+    """Refuse a file in which a part is invalid."""
     if not right:
         raise DataError(f"its {what}")
 
@@ -162,7 +162,7 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 def encoded(value: Any) -> Any:
-    """Return a result as JSON can hold it, without what it computes later."""
+    """Return a result as JSON-compatible data, without deferred fields."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         kept = {name: encoded(getattr(value, name)) for name in _hints(type(value))}
         return {"type": type(value).__name__, **kept}
@@ -187,7 +187,7 @@ def _number(value: Any) -> Any:
 
 
 def decoded(content: Any, hint: Any, place: str = "result") -> Any:
-    """Return the value of an annotation that was encoded."""
+    """Return the value of an annotated type from encoded data."""
     origin, choices = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return _one_of(content, choices, place)
@@ -245,7 +245,7 @@ def _array(content: Any, dtype: Any, place: str) -> Any:
 def _instance(content: Any, kind: type, place: str) -> Any:
     hints = _hints(kind)
     defaults = {each.name: each.default for each in dataclasses.fields(kind)}
-    # Files of earlier versions lack what has been added since.
+    # Older files lack fields added since.
     later = {name for name in hints if defaults[name] is not dataclasses.MISSING}
     known = isinstance(content, Mapping) and content.get("type") == kind.__name__
     if not known or not {*hints} - later <= {*content} - {"type"} <= {*hints}:
@@ -267,7 +267,7 @@ def _plain(content: Any, hint: Any, place: str) -> Any:
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    """Return the fields that are written, with their annotations."""
+    """Return the stored fields with their annotations."""
     late = kind.deferred if issubclass(kind, DeferredFields) else ()
     hints = get_type_hints(kind)
     return {each.name: hints[each.name] for each in dataclasses.fields(kind) if each.init and each.name not in late}

@@ -1,4 +1,4 @@
-"""Journals as files: their format, how they are opened, what keeps one from being used, and who is writing to it."""
+"""Journals as files: format, opening, causes of refusal, and the process that is writing."""
 
 import json
 import os
@@ -13,22 +13,22 @@ from typing import Any, NoReturn
 
 from ctid_cli.errors import DamageError, RefusedError, StorageError
 
-#: The journal, what is exported of it, and the specification of the latest run.
+#: The journal, its export, and the specification of the latest run.
 FILE_NAME, EXPORT, SPEC = "journal.sqlite", "runs.h5", "spec.yaml"
-#: Another one for every change after which another ctid could misread the file.
+#: Increased by every change that another version of ctid could misread.
 FORMAT = 5
 #: Marks an SQLite file as a journal of ctid ("ctid" in ASCII).
 APPLICATION = 0x63746964
-#: What can go wrong while a file is read that may hold anything.
+#: Errors that can occur when an untrusted file is read.
 ERRORS = (sqlite3.Error, ValueError, TypeError, KeyError, IndexError, OverflowError)
-#: What keeps SQLite from reading or writing a file that is in order; all else that it reports is damage.
+#: SQLite errors of an intact file that cannot be read or written; all others mean damage.
 _HINDRANCES = ("READONLY", "CANTOPEN", "FULL", "IOERR", "PERM", "AUTH", "BUSY", "LOCKED", "NOMEM", "PROTOCOL")
-#: Bytes at the beginning of a write-ahead log.
+#: Bytes of the header of a write-ahead log.
 _LOG_HEADER = 32
 
 
 def set_up(connection: sqlite3.Connection) -> None:
-    """Make commits durable, and let others read meanwhile where the file system has shared memory for it."""
+    """Make commits durable, and allow concurrent readers if the file system supports shared memory for it."""
     for locking in ("NORMAL", "EXCLUSIVE"):
         connection.execute(f"PRAGMA locking_mode={locking}")
         if connection.execute("PRAGMA journal_mode=WAL").fetchone() == ("wal",):
@@ -37,7 +37,7 @@ def set_up(connection: sqlite3.Connection) -> None:
 
 
 def require_whole(path: Path, *, planned: bool = True, live: bool = False) -> None:
-    """Refuse a file that was emptied: SQLite would remove its log, and a run would begin anew."""
+    """Refuse a file that was emptied: SQLite would remove its log, and a run would start from the beginning."""
     log, folder = path.with_name(f"{path.name}-wal"), path.parent
     emptied = path.exists() and path.stat().st_size == 0 and log.exists() and log.stat().st_size > _LOG_HEADER
     if emptied or (not planned and ((folder / EXPORT).exists() or (not live and reported(folder)))):
@@ -46,13 +46,13 @@ def require_whole(path: Path, *, planned: bool = True, live: bool = False) -> No
 
 @contextmanager
 def readable(path: Path, *, live: bool) -> Iterator[str]:
-    """Return an address at which SQLite reads a journal and changes nothing.
+    """Yield an address at which SQLite can read a journal without changing it.
 
-    After a kill, acknowledged estimates stand in the write-ahead log beside the file. SQLite reads it in place if its
-    index is there, however stale; else a copy is read. A file without a writer and without a log needs no locks.
+    After a kill, committed estimates are in the write-ahead log next to the file. SQLite reads it in place if its index
+    exists, even an outdated one; otherwise a copy is read. A file without a writer and a log needs no locks.
     """
     log, index = (path.with_name(f"{path.name}-{end}") for end in ("wal", "shm"))
-    # A log that was only begun holds nothing, and SQLite does not get on with its index.
+    # A log with a header only holds no data, and SQLite cannot handle its index.
     empty = not log.exists() or log.stat().st_size <= _LOG_HEADER
     if live or (index.exists() and not empty):
         yield f"{path.resolve().as_uri()}?mode=ro&readonly_shm=1"
@@ -67,7 +67,7 @@ def readable(path: Path, *, live: bool) -> Iterator[str]:
 
 
 def refuse(path: Path, error: Exception, *, writing: bool = False) -> NoReturn:
-    """Say what keeps a journal from being read or written."""
+    """Raise an error with the reason why a journal cannot be read or written."""
     name = getattr(error, "sqlite_errorname", "") or ""
     reason = (error.strerror if isinstance(error, OSError) else None) or error
     if writing and name not in ("SQLITE_CORRUPT", "SQLITE_NOTADB"):
@@ -79,7 +79,7 @@ def refuse(path: Path, error: Exception, *, writing: bool = False) -> NoReturn:
 
 
 def require_journal(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse an SQLite file that is no journal, or one of another format."""
+    """Refuse an SQLite file that is not a journal, or has another format."""
     (application,) = connection.execute("PRAGMA application_id").fetchone()
     (written,) = connection.execute("PRAGMA user_version").fetchone()
     if application != APPLICATION:
@@ -88,7 +88,7 @@ def require_journal(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def require_format(path: Path, written: int, known: int) -> None:
-    """Refuse a file of another format than the one that this program reads."""
+    """Refuse a file of a format that this version cannot read."""
     if written != known:
         raise RefusedError(
             f"{path} has format {written}; this ctid reads format {known}. Use the ctid that wrote it, another results "
@@ -97,14 +97,14 @@ def require_format(path: Path, written: int, known: int) -> None:
 
 
 def places_of(path: Path) -> dict[Path, tuple[int, int] | None]:
-    """Return the folder and files of a journal, each with what tells it from another one of its name."""
-    # While it is open no other file can get the numbers of its files.
+    """Return the folder and files of a journal with their file numbers, which identify them."""
+    # No other file can get these numbers while the journal is open.
     places = (path.parent, path, path.with_name(f"{path.name}-wal"))
     return {place: _identity_of(place) for place in places if place.exists()}
 
 
 def require_places(known: Mapping[Path, tuple[int, int] | None]) -> None:
-    """Refuse to go on in a file that its path does not lead to any more."""
+    """Refuse to continue if a path no longer leads to the open file."""
     for place, identity in known.items():
         if _identity_of(place) != identity:
             advice = "Nothing that was computed since is counted as stored. Bring it back to go on, or run anew"
@@ -120,17 +120,17 @@ def _identity_of(path: Path) -> tuple[int, int] | None:
 
 # --- who is writing ---------------------------------------------------------------------------------------------------
 
-#: Says who runs in a folder, for those who find it locked, and how many estimates were reported there. What a killed
-#: run leaves of it tells how many estimates the journal holds at least: SQLite drops the end of a damaged write-ahead
-#: log without a word.
+#: File that names the process running in a folder, for messages about a locked folder, and the reported number of
+#: estimates. After a kill it gives a lower bound of the number in the journal: SQLite silently drops the end of a
+#: damaged write-ahead log.
 RUNNING = "running.json"
 
 
 def announce(folder: Path, experiment: str, started: str, done: int, total: int, stored: int = 0) -> None:
-    """Say who runs, how many data sets of how many are done, and how many estimates the journal holds."""
+    """Record the running process, its finished and total data sets, and the number of stored estimates."""
     running = {"experiment": experiment, "pid": os.getpid(), "host": platform.node()}
     running |= {"started": started, "done": done, "total": total, "stored": stored}
-    # A courtesy to readers, written over and over: neither worth a synchronisation nor worth failing for.
+    # Informative and often rewritten: not synchronised, and write errors are ignored.
     with suppress(OSError):
         temporary = folder / f"{RUNNING}.tmp"
         temporary.write_text(json.dumps(running), encoding="utf-8")
@@ -138,7 +138,7 @@ def announce(folder: Path, experiment: str, started: str, done: int, total: int,
 
 
 def retract(folder: Path) -> None:
-    """Take back what was announced, unless another process announced it."""
+    """Remove the record of the running process, unless another process wrote it."""
     running = who_runs(folder)
     if running is not None and (running["pid"], running["host"]) == (os.getpid(), platform.node()):
         with suppress(OSError):
@@ -146,7 +146,7 @@ def retract(folder: Path) -> None:
 
 
 def who_runs(folder: Path) -> dict[str, Any] | None:
-    """Return what the run that writes to a folder says about itself."""
+    """Return the record of the run that writes to a folder."""
     try:
         running = json.loads((folder / RUNNING).read_text(encoding="utf-8"))
         return running if isinstance(running, dict) and {"pid", "host"} <= running.keys() else None
@@ -155,6 +155,6 @@ def who_runs(folder: Path) -> dict[str, Any] | None:
 
 
 def reported(folder: Path) -> int:
-    """Return how many estimates were reported as stored by a run that has not ended; 0 where nothing says so."""
+    """Return the number of stored estimates reported by a run that has not ended; 0 if there is no report."""
     stored = (who_runs(folder) or {}).get("stored")
     return stored if isinstance(stored, int) else 0

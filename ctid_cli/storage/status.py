@@ -1,4 +1,4 @@
-"""How much of an experiment is stored, where one estimate is, and whether all is as it was written."""
+"""Progress of experiments, search for an estimate, and verification of stored files."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ from ctid_cli.written_files import is_leftover
 
 #: A data cell and an estimator by their hashes.
 Part = tuple[str, str]
-#: A plan, how many of its estimates are stored and failed, and whether they are of several origins.
+#: A plan, the numbers of its stored and failed estimates, and whether they have several origins.
 Counted = tuple[Manifest, dict[Part, tuple[int, int]], bool]
-#: What may be published of a run: nothing that names a machine, a user or a folder.
+#: Data of a run that may be published: nothing that names a machine, a user or a folder.
 PUBLIC = ("jobs", "processors", "packages")
 
 
 @dataclass(frozen=True)
 class FoundEstimate:
-    """One estimate among those of its plan."""
+    """One estimate found in its plan."""
 
     folder: Path
-    #: It alone.
+    #: This estimate only.
     stored: Estimates
 
     @cached_property
     def row(self) -> dict[str, Any]:
-        """Return its row."""
+        """Its row."""
         return next(self.stored.rows())
 
     @cached_property
     def slot(self) -> Slot:
-        """Return what it is of."""
+        """Its place in the plan."""
         return self.stored.slot(0)
 
 
 def find_estimate(results: Path, prefix: str) -> FoundEstimate:
-    """Find one estimate among all experiments."""
+    """Find one estimate among all experiments by a prefix of its id."""
     matches: dict[str, FoundEstimate] = {}
     in_use = ""
     for folder in place.experiment_folders(results):
@@ -74,7 +74,7 @@ def find_estimate(results: Path, prefix: str) -> FoundEstimate:
 
 
 def public_sessions(folder: Path) -> list[dict[str, Any]]:
-    """Return the runs that computed an experiment, as far as they may be published."""
+    """Return the publishable data of the runs that computed an experiment."""
     with place.reading_journal(folder) as log:
         if log is None:
             return []
@@ -95,7 +95,7 @@ def public_sessions(folder: Path) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Progress:
-    """How many estimates are asked for, are stored, and are stored as failures."""
+    """Numbers of planned, stored and failed estimates."""
 
     planned: int
     done: int
@@ -103,7 +103,7 @@ class Progress:
 
     @property
     def todo(self) -> int:
-        """Return estimates that are still to be computed."""
+        """Number of estimates still to compute."""
         return self.planned - self.done
 
 
@@ -126,25 +126,25 @@ class ExperimentStatus(Progress):
     mixed: bool
     running: dict[str, Any] | None
     groups: tuple[GroupStatus, ...]
-    #: Which shard it is, of how many; None for all of an experiment.
+    #: Shard number and number of shards; None for a whole experiment.
     shard: tuple[int, int] | None = None
 
 
 def experiment_status(folder: Path) -> ExperimentStatus:
-    """Count what is done and what is missing."""
+    """Count stored and missing estimates."""
     try:
         with place.reading_journal(folder) as log:
             running = _running(folder) if log is not None and log.live else None
             return _status(folder, log, running)
     except InUseError:
-        # A run that is just beginning has nothing to read yet.
+        # A run that has just started has nothing to read yet.
         running = _running(folder)
         name = str(running.get("experiment") or folder.name)
         return ExperimentStatus(0, 0, 0, name, folder, None, False, running, ())
 
 
 def _running(folder: Path) -> dict[str, Any]:
-    """Return who runs, how far it is, how fast, and when it will have ended at that speed."""
+    """Return the data of the running process, its speed and the predicted end."""
     running = who_runs(folder)
     if running is None:
         return {"pid": None, "host": None}
@@ -161,7 +161,7 @@ def _running(folder: Path) -> dict[str, Any]:
 
 def _status(folder: Path, log: JournalReader | None, running: dict[str, Any] | None) -> ExperimentStatus:
     manifest, counted, mixed = _in_export(folder) if log is None else _in_journal(log)
-    # Two names may share estimates, which are stored once in a journal.
+    # Estimates shared by two names are stored once in a journal.
     left_aside = None if log is None else log.require_count() - sum(done for done, _ in counted.values())
     groups = []
     for estimator, cell, replicates in planned_parts(manifest):
@@ -176,7 +176,7 @@ def _status(folder: Path, log: JournalReader | None, running: dict[str, Any] | N
 
 
 def _in_journal(log: JournalReader) -> Counted:
-    """Count the estimates that a journal holds of its plan."""
+    """Count the stored estimates of a journal's plan."""
     manifest, counted, sessions = log.manifest(), dict[Part, tuple[int, int]](), set[str]()
     for estimator, cell, replicates in planned_parts(manifest):
         done = failed = 0
@@ -189,7 +189,7 @@ def _in_journal(log: JournalReader) -> Counted:
 
 
 def _in_export(folder: Path) -> Counted:
-    """Count the estimates that ``runs.h5`` holds."""
+    """Count the estimates in ``runs.h5``."""
     stored = stored_in(folder, None)
     failures, counted = stored.failures, dict[Part, tuple[int, int]]()
     for block in stored.blocks:
@@ -199,38 +199,38 @@ def _in_export(folder: Path) -> Counted:
 
 
 State = Literal["intact", "damaged", "missing", "stale", "left over"]
-# --- whether what is stored is what was written ----------------------------------------------------------------------
+# --- verification of stored files ------------------------------------------------------------------------------------
 
-#: What is wrong; all else is in order.
+#: Findings that are errors; all others are in order.
 WRONG = ("damaged", "missing")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found of one file."""
+    """Result of checking one file."""
 
     #: Relative to the folder.
     file: str
     state: State
-    #: What is in it, or what is wrong with it.
+    #: Description of its content or of the error.
     message: str
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What was found in the folder of an experiment."""
+    """Result of checking the folder of an experiment."""
 
     folder: Path
     findings: tuple[Finding, ...]
 
     @property
     def is_intact(self) -> bool:
-        """Return whether nothing is wrong."""
+        """Whether no file is damaged or missing."""
         return not any(finding.state in WRONG for finding in self.findings)
 
 
 def verify(folder: Path) -> Verification:
-    """Read and check everything that a run has stored."""
+    """Read and check everything stored by a run."""
     live, noted, findings = False, None, []
     try:
         with place.reading_journal(folder) as log:
@@ -252,7 +252,7 @@ def _journal(log: JournalReader) -> Finding:
     log.check(fully=True)
     manifest, sessions = log.manifest(), log.sessions()
     planned = {slot.key for slot in slots(manifest)}
-    # Reading compares each row with its checksum.
+    # Reading verifies the checksum of each row.
     there = Counter(row.key in planned for row in log.rows())
     message = f"{there[True]} of {len(planned)} estimates"
     message += f", {there[False]} set aside" if there[False] else ""

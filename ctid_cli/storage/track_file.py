@@ -1,7 +1,7 @@
-"""``track.json``: a track without loss, where its record lies and how it was read, and how it is read again.
+"""``track.json``: lossless storage of a track and the path of its record, and reading it again.
 
-The file has what ``ctid track --json`` prints; beside it ``record``, where the signal is, and ``result``, the track as
-it is in Python. The samples are read from the record when they are asked for.
+The file has the output of ``ctid track --json``, and ``record``, the source of the signal, and ``result``, the track
+as in Python. The samples are read from the record when first used.
 """
 
 import os
@@ -19,7 +19,7 @@ TRACK = ResultKind("ctid track", 2, "track", "ctid track", "track again")
 
 @dataclass(frozen=True)
 class Reading:
-    """How a signal was read from its file: what ``ctid track`` was given, before units of time are converted."""
+    """Options for reading a signal from its file, as given to ``ctid track``, before unit conversion of times."""
 
     time: str | None = None
     signal: str | None = None
@@ -29,14 +29,14 @@ class Reading:
     stop: float | None = None
 
     def read(self, path: str | os.PathLike[str]) -> SampledSignal:
-        """Return the signal, with its times in seconds."""
+        """Return the signal with times in seconds."""
         return read_sampled_signal(path, **asdict(self)).in_seconds()
 
 
 def track_file_text(
     track: Track, content: Mapping[str, Any], record: Path, reading: Reading, folder: Path, command: str | None
 ) -> str:
-    """Return the file's text: what is said of a track, its record as seen from the folder of the file, and its rows."""
+    """Return the text of the file: description of a track, its record relative to the file's folder, and its rows."""
     source = {
         **path_and_sum(record, folder),
         "columns": {"time": reading.time, "signal": reading.signal},
@@ -51,7 +51,7 @@ class SignalSource(Source):
     """A record as ``track.json`` names it."""
 
     def read(self) -> SampledSignal:
-        """Return the record, as it was read for the track."""
+        """Return the record as it was read for the track."""
         self.require_same()
         content = self.content
         columns = content["columns"]
@@ -69,14 +69,14 @@ class StoredTrack:
     """A ``track.json``, with the record that it names."""
 
     path: Path
-    #: What the file says, as in the documentation of machine-readable output.
+    #: Content of the file, as in the documentation of machine-readable output.
     content: Mapping[str, Any]
     track: Track
     source: SignalSource
 
 
 def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | None = None) -> StoredTrack:
-    """Return the file with everything in it; its record may have moved."""
+    """Return the file with all its content; its record may have moved."""
     file = os.fspath(path)
     content = TRACK.content(file)
     with TRACK.refusing(file):
@@ -88,7 +88,7 @@ def read_track(path: str | os.PathLike[str], record: str | os.PathLike[str] | No
 
 
 def _require_said(content: Mapping[str, Any]) -> None:
-    """Refuse a file that does not say what is needed to show it."""
+    """Refuse a file without the information needed to show it."""
     record = content["record"]
     require("path", texts([record["path"], record["sha256"], content["file"], content["method"]]))
     require("columns", all(each is None or isinstance(each, str) for each in record["columns"].values()))

@@ -1,4 +1,4 @@
-"""Estimates compared with the true values: their numbers under the true names, and the rule of success.
+"""Comparison of estimates with true values: estimates under the true names, and the success rule.
 
 An estimate has *converged* if it satisfies every condition of the specification's ``success``:
 
@@ -6,14 +6,14 @@ An estimate has *converged* if it satisfies every condition of the specification
   fraction of it;
 - ``fit_percent``: the fit on the record it was estimated from is at least this [%];
 - ``parameter_relative_error``: every parameter but the delay differs from the true one by at most this fraction;
-- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal came into the band around the true one to stay there,
-  counted from the start, and after its last step from that.
+- ``band`` [rad/s] and ``by`` [s]: every frequency of a signal enters the band around the true one and stays there
+  within this time after the start and after its last step.
 
-Its status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one that
-settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
-converged and counts in every percentage. Without ``success``, or without true values to compare with, nothing is said.
+The status does not matter: an estimate that stopped at the iteration limit with the right delay has converged, one
+that settled elsewhere has not. An estimate without a result (``FAILED``, ``CRASHED``, ``TIMEOUT``, ``MEMORY``) has not
+converged and counts in every percentage. Without ``success``, or without true values, convergence is undefined.
 
-What is compared are the arrays of ``runs.h5`` by name; :func:`arrays_of_rows` makes them of rows.
+The comparison uses the arrays of ``runs.h5`` by name; :func:`arrays_of_rows` makes them from rows.
 """
 
 import re
@@ -27,25 +27,25 @@ from ctid_cli.models.several_inputs import is_delay
 from ctid_cli.storage import columns
 from ctid_cli.storage.column_arrays import AnyArray, ColumnWriter, names_of
 
-#: Columns with what estimates are compared by.
+#: Columns used in the comparison.
 _NAMES = ["status", "fit_percent", "delay", "numerator", "denominator", "parameters", "standard_errors", "quantiles"]
 _COLUMNS = [column for column in columns.COLUMNS if column.name in _NAMES]
-#: Arrays that the values under true names are found in, and those of their standard errors and quantiles.
+#: Arrays of estimated values, and arrays of their standard errors and quantiles.
 VALUES = ("delay", "numerator", "numerator_length", "denominator", "denominator_length", "parameters")
 ERRORS = ("standard_errors", "standard_errors_present", "quantiles")
 
 
 class Found(NamedTuple):
-    """Numbers of estimates under the names of the true parameters, NaN where there is none, shape (n, p)."""
+    """Estimates under the names of the true parameters, NaN if missing, shape (n, p)."""
 
     values: Array
     standard_errors: Array
-    #: Standard errors to each side of 95 % intervals [-].
+    #: Half-widths of 95 % intervals in standard errors [-].
     quantiles: Array
 
 
 def arrays_of_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
-    """Return what rows are compared by, as arrays."""
+    """Return the arrays needed for a comparison from rows."""
     arrays: dict[str, AnyArray] = {}
     for column in _COLUMNS:
         writer = ColumnWriter(column)
@@ -57,15 +57,15 @@ def arrays_of_rows(rows: Sequence[Mapping[str, Any]]) -> dict[str, AnyArray]:
 
 
 def found_of_rows(rows: Sequence[Mapping[str, Any]], names: Iterable[str]) -> Found:
-    """Return numbers of rows under the true names."""
+    """Return the estimates of rows under the true names."""
     return found_under(tuple(names), arrays_of_rows(rows), len(rows))
 
 
 def found_under(names: Sequence[str], arrays: Mapping[str, AnyArray], count: int) -> Found:
-    """Return estimated values, standard errors and quantiles of intervals under the names of the true ones.
+    """Return estimated values, standard errors and interval quantiles under the true names.
 
-    Coefficients go together by their power of s: of a model with more zeros than the system, ``b1`` may be what is
-    ``b0`` in truth. Those of a model with another number of poles have nothing to be compared with.
+    Coefficients are matched by their power of s: for a model with more zeros than the system, the true ``b0`` may be
+    ``b1`` of the model. Coefficients of a model with another number of poles have no true values.
     """
     values, errors, quantiles = (_by_name(name, arrays) for name in ("parameters", "standard_errors", "quantiles"))
     if "delay" in arrays:
@@ -76,7 +76,7 @@ def found_under(names: Sequence[str], arrays: Mapping[str, AnyArray], count: int
         alike = (arrays["denominator_length"] == poles + 1) & (lengths >= 0)
         if alike.any():
             _add_coefficients(values, arrays, alike, poles, zeros)
-            # A leading zero is dropped by the model; the names of its standard errors keep their powers.
+            # The model drops a leading zero; the names of its standard errors keep their powers.
             there = arrays.get("standard_errors_present", np.zeros((count, 0)))
             own = [there[:, k] for k, name in enumerate(errors) if re.fullmatch(r"b\d+", name)]
             longest = np.maximum(lengths, np.sum(own, axis=0, dtype=int) if own else 0)
@@ -97,7 +97,7 @@ def _align_inputs(
     quantiles: dict[str, Array],
     count: int,
 ) -> None:
-    """Put coefficients of several inputs under the true names, whose prefixes are those of the inputs."""
+    """Store coefficients of several inputs under the true names, whose prefixes are the input names."""
 
     def known(start: str) -> IndexArray:
         there = [np.isfinite(own) for name, own in values.items() if re.fullmatch(rf"{re.escape(start)}\d+", name)]
@@ -122,14 +122,14 @@ def _by_name(name: str, arrays: Mapping[str, AnyArray]) -> dict[str, Array]:
 
 
 def coefficients_of(letter: str, names: Iterable[str]) -> int:
-    """Return how many of some names are those of coefficients: a letter, or a prefix and a letter, and a number."""
+    """Return the number of coefficient names with a letter: an optional prefix, the letter, and a number."""
     return sum(re.fullmatch(rf"{re.escape(letter)}\d+", name) is not None for name in names)
 
 
 def _add_coefficients(
     values: dict[str, Array], arrays: Mapping[str, AnyArray], alike: BoolArray, poles: int, zeros: int
 ) -> None:
-    """Put coefficients under the true names where the model has as many poles as the system."""
+    """Store coefficients under the true names if the model and the system have the same number of poles."""
     numerator, denominator, none = arrays["numerator"], arrays["denominator"], np.full(len(alike), np.nan)
     for k in range(1, poles + 1):
         values[f"a{k}"] = np.where(alike, denominator[:, k], values.get(f"a{k}", none))
@@ -142,7 +142,7 @@ def _add_coefficients(
 def _shift_numerator(
     numbers: dict[str, Array], alike: BoolArray, shifts: IndexArray, zeros: int, prefix: str = ""
 ) -> None:
-    """Put numbers of coefficients ``b`` under the true names, which are shifted by a number of powers in each model."""
+    """Store values of coefficients ``b`` under the true names, shifted by a number of powers in each model."""
     none, own = np.full(len(alike), np.nan), dict(numbers)
     for k in range(zeros):
         found = own.get(f"{prefix}b{k}", none)
@@ -152,7 +152,7 @@ def _shift_numerator(
 
 
 def failures(arrays: Mapping[str, AnyArray]) -> BoolArray:
-    """Return which estimates failed."""
+    """Return the mask of the failed estimates."""
     return np.isin(arrays["status"], [name.encode() for name in columns.FAILURES])
 
 
@@ -163,7 +163,7 @@ def judged(
     values: Array,
     measures: Sequence[Mapping[str, float | None] | None] | None,
 ) -> BoolArray | None:
-    """Return which estimates satisfy the rule of success, from their values under the true names; None without one."""
+    """Return the mask of estimates that satisfy the success rule, from values under the true names; None if no rule."""
     rule, found = success or {}, dict(zip(truth, values.T, strict=True))
     conditions: list[BoolArray] = []
     for name in truth:

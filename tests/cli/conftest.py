@@ -1,4 +1,4 @@
-"""A command line that runs inside the test, and a folder in which every command has been used once."""
+"""A command line inside the test, and a folder in which every command has been used once."""
 
 import contextlib
 import itertools
@@ -16,12 +16,12 @@ from tests.cli.records import SPECIFICATIONS, first_order, rows, tones, write
 
 @pytest.fixture(autouse=True)
 def compiled_in_silence(monkeypatch):
-    """Compiled functions may be cached or not: what a command says while it waits for them is no part of a test."""
+    """Suppress compilation messages, since functions may be cached or not."""
     monkeypatch.setattr(_compiling, "SILENT", 3600.0)
 
 
 class Here:
-    """Workers in this process: for tests of what is computed, not of how processes are treated."""
+    """Workers in this process: for tests of results, not of processes."""
 
     count = 1
 
@@ -38,7 +38,7 @@ class Here:
 
 @pytest.fixture(scope="module")
 def without_workers():
-    """Runs compute in the process of the test."""
+    """Make runs compute in the process of the test."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine, "LocalWorkers", Here)
         yield
@@ -46,7 +46,7 @@ def without_workers():
 
 @pytest.fixture(scope="session")
 def ctid():
-    """Run a command: ``ctid("table 1 --out", folder, code=2)``; the first words are as in a shell."""
+    """Return a function to run a command: ``ctid("table 1 --out", folder, code=2)``; first words as in a shell."""
     from ctid_cli.cli.main import app
 
     def call(command, *arguments, code=0):
@@ -60,7 +60,7 @@ def ctid():
 
 @pytest.fixture(scope="session")
 def used(tmp_path_factory, ctid):
-    """Folder with specifications, their results, records, two fits and a track, made once."""
+    """Return a folder with specifications, their results, records, two fits and a track, made once."""
     folder = tmp_path_factory.mktemp("used")
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(folder):
         patch.setattr(engine, "LocalWorkers", Here)
@@ -83,14 +83,14 @@ def used(tmp_path_factory, ctid):
 
 @pytest.fixture
 def home(used, monkeypatch):
-    """The used folder as working directory; a test that writes there removes what it wrote."""
+    """Use the used folder as working directory; a test that writes there removes its files."""
     monkeypatch.chdir(used)
     return used
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A new folder with the tiny and the measured experiment as working directory."""
+    """Use a new folder with the tiny and the measured experiment as working directory."""
     for name in ("tiny", "measured-tiny"):
         (tmp_path / f"{name}.yaml").write_text(SPECIFICATIONS[name], encoding="utf-8")
     write(tmp_path / "measured.csv", first_order())
@@ -99,5 +99,5 @@ def here(tmp_path, monkeypatch):
 
 
 def contents(folder):
-    """Bytes of every file in a folder."""
+    """Return the bytes of every file in a folder."""
     return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}

@@ -1,4 +1,4 @@
-"""Records and specifications as the files that commands read."""
+"""Records and specifications as files for commands."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from ctid_cli.custom_code import STUDIES
 from ctid_cli.filtering.loop import simulate_loop
 from ctid_cli.models.controller import DiscreteController
 
-#: Command lines: what they print, and how they are refused.
+#: Command lines: their output, and their refusals.
 COMMANDS = yaml.safe_load((Path(__file__).parent / "commands.yaml").read_text(encoding="utf-8"))
 #: A controller, and the file that names it.
 CONTROLLER = DiscreteController([0.8, -0.7], [1.0, -1.0])
@@ -23,13 +23,13 @@ SPECIFICATIONS = {
     name: (Path(__file__).parent / "specifications" / f"{name}.yaml").read_text(encoding="utf-8")
     for name in ("tiny", "measured-tiny", "loop", "beat")
 }
-# The folder of the studies lies elsewhere on every machine; the code that they name may run.
+# The folder of the studies depends on the machine; their code may be run.
 SPECIFICATIONS["beat"] = SPECIFICATIONS["beat"].replace("STUDIES", str(STUDIES))
 TINY = SPECIFICATIONS["tiny"]
 
 
 def rows(seed=0, n=500, noise=0.02, offset=0.0):
-    """Samples of t, u and y, shape (n, 3)."""
+    """Return samples of t, u and y, shape (n, 3)."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(n)
     u = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
@@ -38,14 +38,14 @@ def rows(seed=0, n=500, noise=0.02, offset=0.0):
 
 
 def tones(n=3000):
-    """Samples of t and of a signal of 12 and 19 Hz with noise, shape (n, 2)."""
+    """Return samples of t and of a signal of 12 and 19 Hz with noise, shape (n, 2)."""
     t = 0.002 * np.arange(n)
     y = 1.5 * np.sin(2 * np.pi * 12.0 * t) + np.sin(2 * np.pi * 19.0 * t + 1.0)
     return np.column_stack((t, y + 0.05 * np.random.default_rng(0).standard_normal(n)))
 
 
 def first_order(n=300):
-    """Samples of the response of y' = -2 y + 2 u to a square wave, with noise, shape (n, 3)."""
+    """Return samples of the response of y' = -2 y + 2 u to a square wave, with noise, shape (n, 3)."""
     t, k = 0.1 * np.arange(n), np.arange(n)
     u = np.where((k // 15 + k // 40) % 2, 1.0, -1.0)
     y = 1.0 + simulate(TransferFunction([2.0], [1.0, 2.0]), HeldSignal(t, u), t)
@@ -53,7 +53,7 @@ def first_order(n=300):
 
 
 def in_loop(file):
-    """A record of 2/(p + 1.5) under the controller of LOOP with coloured noise: u, y, r, and u with noise as v."""
+    """Write a record of 2/(p + 1.5) under the controller of LOOP with coloured noise: u, y, r, and noisy u as v."""
     rng = np.random.default_rng(4)
     t = 0.05 * np.arange(1500)
     r = np.repeat(rng.choice([-1.0, 1.0], 150), 10)
@@ -64,7 +64,7 @@ def in_loop(file):
 
 
 def write(file, values, header="t,u,y"):
-    """A text file of rows, or of a tuple of columns."""
+    """Write a text file of rows, or of a tuple of columns."""
     if isinstance(values, tuple):
         values = np.column_stack(values)
     np.savetxt(file, values, "%.12g", ",", header=header, comments="")

@@ -1,4 +1,4 @@
-"""``ctid accuracy``: the numbers of theory, the formula that they come from, and where there are none."""
+"""``ctid accuracy``: theoretical values, their formula, and cases without a theory."""
 
 import re
 
@@ -6,7 +6,7 @@ import pytest
 
 from tests.running.accuracy_cases import CASES, specification
 
-#: Warnings about what these experiments do on purpose.
+#: Intended warnings of these experiments.
 EXPECTED = re.compile("direct: ignores the loop|: is taken as |can only come near|do not hold the delay")
 
 

@@ -1,4 +1,4 @@
-"""Help, start-up, and errors that nobody expected."""
+"""Help, start-up, and unexpected errors."""
 
 import errno
 import re
@@ -15,7 +15,7 @@ from ctid_cli.reporting import study_table
 
 COMMANDS = typer.main.get_group(app).commands
 
-#: What may be imported before a command needs it: half a second of imports each would be longer than the work.
+#: Modules that may be imported before a command needs them: half a second each would be longer than the work.
 HELP = (
     "from ctid_cli.cli.main import app\ntry: app(['--help'])\nexcept SystemExit: pass",
     {"numpy", "scipy", "pandas", "numba", "h5py", "joblib", "pydantic", "rich"},
@@ -33,7 +33,7 @@ WORKER = (
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself_and_its_options_in_80_columns(ctid, command):
     summary = re.search(rf"^  {command} +([A-Z].*)$", ctid("--help").stdout, re.MULTILINE)[1]
-    # A longer one would be cut.
+    # A longer one would be truncated.
     assert summary.endswith(".")
     assert not summary.endswith("...")
     lines = ctid(f"{command} --help").stdout.splitlines()
@@ -74,7 +74,7 @@ def test_errors_of_the_program_and_of_the_machine(ctid, monkeypatch, tmp_path, s
     (tmp_path / "results").mkdir()
     message = ctid("table tiny", code=code).stderr
     assert re.sub(r"error-[\d-]+\.txt", "error-(time).txt", message) == snapshot
-    # Details of what is a mistake of the program lie where the results are.
+    # Details of program errors are in the folder of the results.
     reports = [path.read_text(encoding="utf-8") for path in (tmp_path / "results").iterdir()]
     assert len(reports) == (code == ExitCode.INTERNAL)
     assert all("Traceback" in report and str(error) in report for report in reports)

@@ -1,4 +1,4 @@
-"""Fitted models in use: ``ctid compare``, ``ctid fit --csv``, ``ctid export --as``, and the same in Python."""
+"""Use of fitted models: ``ctid compare``, ``ctid fit --csv``, ``ctid export --as``, and their Python functions."""
 
 import json
 import runpy

@@ -1,4 +1,4 @@
-"""Who waits for compiled functions is told so: once, on stderr, and only where there is something to wait for."""
+"""A command that compiles functions says so: once, on stderr, and only if there is a delay."""
 
 import pytest
 import typer
@@ -13,7 +13,7 @@ STORED = {"status", "export", "verify", "merge", "init"}
 
 
 class Clock:
-    """A clock and timers that go as the test says: each compilation takes six seconds."""
+    """Simulated clock and timers: each compilation takes six seconds."""
 
     def __init__(self):
         self.now = 0.0
@@ -44,7 +44,7 @@ def test_one_sentence_when_compilation_takes_long_in_all(silent, waits, times, m
     monkeypatch.setattr(_compiling, "SILENT", silent)
     notice = CompilationNotice()
     for _ in range(3):
-        # A function that calls another one is compiled once that is.
+        # A function that calls another one is compiled after it.
         notice.on_start(None)
         notice.on_start(None)
         notice.on_end(None)

@@ -1,4 +1,4 @@
-"""``ctid fit``: from files to a model, or to one sentence."""
+"""``ctid fit``: from files to a model, or to a one-sentence error."""
 
 import io
 import json
@@ -37,7 +37,7 @@ def test_fit_prints_a_table_and_writes_two_files_here(ctid, record, tmp_path, mo
     assert Path("fit.svg").read_bytes().startswith(b"<?xml")
     assert text.endswith("\n\nWritten: fit.json, fit.svg\n")
     stored = Path("fit.json").read_text(encoding="utf-8")
-    # JSON is what is written, every time the same.
+    # The printed JSON equals the file, in every run.
     assert ctid(*arguments, "--json").stdout == stored == Path("fit.json").read_text(encoding="utf-8")
     check_model(json.loads(stored)["model"])
 
@@ -74,7 +74,7 @@ def test_a_noise_model_is_printed_written_and_read_back(ctid, tmp_path):
     noise = content["noise_model"]
     assert noise["denominator"][1] == pytest.approx(-0.8, abs=4 * noise["covariance"][0][0] ** 0.5)
     assert noise["prediction_fits"]["1"] > noise["prediction_fits"]["5"] > content["fit_percent"]
-    # On the record of the fit itself the validation says the same.
+    # On the record of the fit, validation gives equal values.
     assert content["validation"]["prediction_fits"] == pytest.approx(noise["prediction_fits"], rel=1e-6)
     again, record = load_fit(tmp_path / "fit.json"), Record.from_arrays(*values.T)
     assert again.fit.prediction_fit(5) == pytest.approx(noise["prediction_fits"]["5"], rel=1e-9)

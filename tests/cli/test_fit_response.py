@@ -13,7 +13,7 @@ RESPONSE = np.geomspace(0.1, 20.0, 60)
 
 
 def response_file(folder):
-    """Values of 2 / (p + 1) exp(-p/2) with standard errors."""
+    """Write values of 2 / (p + 1) exp(-p/2) with standard errors."""
     rng = np.random.default_rng(0)
     values = 2.0 * np.exp(-0.5j * RESPONSE) / (1j * RESPONSE + 1.0)
     values = values + 0.02 * (rng.standard_normal(60) + 1j * rng.standard_normal(60)) / np.sqrt(2.0)

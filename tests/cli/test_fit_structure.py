@@ -34,7 +34,7 @@ def fitted(ctid, *arguments):
 
 
 def near(content, expected, errors=5.0):
-    """Whether parameters are within so many standard errors of what they should be."""
+    """Return whether parameters are within a number of standard errors of the expected values."""
     found = {item["name"]: item for item in content["parameters"]}
     for name, value in expected.items():
         assert found[name]["estimate"] == pytest.approx(value, abs=errors * found[name]["standard_error"])
@@ -67,7 +67,7 @@ def test_integrators_belong_to_the_first_submodel(ctid, tmp_path):
     near(content, {"g1_b0": 0.5, "g2_b0": 2.0, "g2_a1": 0.2, "g2_a2": 0.3})
     assert content["parameters"][0]["unit"] == "out/in/s"
     assert content["warnings"] == []
-    # An integrator beside poles needs no other options.
+    # An integrator in addition to poles needs no other options.
     file = record(tmp_path / "one.csv", AdditiveModel([Submodel([1.0], [0.5, 1.0], 1)]))
     content = fitted(ctid, file, "--poles", 1, "--integrators", 1, "--out", tmp_path)
     near(content, {"a1": 2.0, "b0": 2.0})
@@ -109,7 +109,7 @@ def test_a_loop_removes_the_bias_that_coloured_noise_makes(ctid, closed, tmp_pat
     direct = fitted(ctid, *options)
     estimates, plain = ({one["name"]: one["estimate"] for one in each["parameters"]} for each in (ignored, direct))
     assert estimates == plain
-    # What is known to be biased has no standard error; without the loop nobody knows.
+    # Estimates known to be biased have no standard errors; without the loop the bias is unknown.
     assert all(one["standard_error"] is None for one in ignored["parameters"])
     assert "estimate is biased" in ignored["covariance"]["reason"]
 

@@ -1,4 +1,4 @@
-"""What `ctid init` writes is right, explained, runs, and never replaces what is there."""
+"""The files of `ctid init` are valid, explained, can be run, and never replace existing ones."""
 
 import re
 from importlib import resources
@@ -23,7 +23,7 @@ def test_the_templates_are_valid_and_run(ctid, tmp_path, monkeypatch):
     assert {path.name for path in (resources.files("ctid_cli") / "templates").iterdir()} - {"__pycache__"} == written
     files = [names[0] for _, names in TEMPLATES.values()]
     for file in files:
-        # What is unwise in them is there on purpose.
+        # Their warnings are intended.
         assert all("ignores_the_loop: ignores the loop" in warning for warning in load_spec(tmp_path / file).warnings)
     ctid("run --runs 1 --quiet", *files)
     for kind in TEMPLATES:

@@ -1,4 +1,4 @@
-"""``ctid order``: from a file to the table of structures, or to one sentence."""
+"""``ctid order``: from a file to the table of structures, or to a one-sentence error."""
 
 import json
 
@@ -34,7 +34,7 @@ def test_table_and_files(ctid, record, tmp_path, monkeypatch, snapshot):
 
 
 def test_sums_of_submodels(ctid, tmp_path, snapshot, monkeypatch):
-    """Two modes are found as two, and what is recommended is a command of ctid fit."""
+    """Two modes are found as two, and the recommendation is a command of ctid fit."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(3)
     t = 0.05 * np.arange(1200)

@@ -1,4 +1,4 @@
-"""``ctid figure`` and ``ctid report``: files and where they go; what they show is tested where it is made."""
+"""``ctid figure`` and ``ctid report``: their files; the content is tested elsewhere."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -62,7 +62,7 @@ def test_the_page_of_a_file_is_the_same_when_its_record_has_moved(ctid, home, tm
     if name == "track":
         assert ctid("report", stored).stdout == f"{page}\n"
     first = page.read_text(encoding="utf-8")
-    # Paths are told from the folder of the file on.
+    # Paths are relative to the folder of the file.
     assert f"ctid {name} {record.name}" in first
     record.rename(tmp_path / "moved.csv")
     said = ctid("report", stored, code=2).stderr

@@ -1,4 +1,4 @@
-"""What commands print in a pipe: text read by eye when it changes, and JSON with the keys and types that it has."""
+"""Output of commands in a pipe: text, to be read when it changes, and JSON with its keys and types."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from tests.cli.records import COMMANDS
 @pytest.mark.parametrize("command", COMMANDS["text"], ids=str)
 def test_text(ctid, home, snapshot, command):
     done = ctid(command)
-    # The last digits of numbers that are written in full are those of a processor.
+    # The last digits of full-precision numbers depend on the processor.
     text = re.sub(r"\d+\.\d{6,}(e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", done.stdout)
     assert [text, done.stderr] == snapshot
 
@@ -22,7 +22,7 @@ def test_text(ctid, home, snapshot, command):
 def test_one_estimate_in_full(ctid, home, snapshot, name):
     estimates = json.loads(ctid(f"export {name} --json").stdout)
     some = {each["estimator"]: each for each in estimates}
-    # A beginning of the identifier is enough; code of a study is named by a path of this machine.
+    # A prefix of the identifier is enough; code of a study is named by a path of this machine.
     shown = [ctid(f"export --id {each['id'][:10]}").stdout for each in some.values() if ":" not in each["kind"]]
     assert shown == snapshot
     for each in some.values():
@@ -34,7 +34,7 @@ def test_one_estimate_in_full(ctid, home, snapshot, name):
 
 
 def structure(*found):
-    """Keys and types of what was found in one place of plain data."""
+    """Return the keys and types of the values at one place of plain data."""
     items = [item for each in found if isinstance(each, list) for item in each]
     parts = [each for each in found if isinstance(each, dict)]
     if parts:
@@ -52,7 +52,7 @@ def test_json(ctid, home, snapshot, command):
     except ValueError:
         found = [json.loads(line) for line in shown.splitlines()]
     if "result" in found:
-        del found["result"]  # the fit as it is in Python, to be read again
+        del found["result"]  # the fit as in Python
     assert structure(found) == snapshot
 
 
@@ -67,7 +67,7 @@ def test_csv_holds_what_json_holds(ctid, home, name):
         flat |= each.get("measures") or {}
         flat |= {f"se_{key}": value for key, value in (each.get("standard_errors") or {}).items()}
         flat |= each.get("parameters") or {}
-        # What no estimate of the experiment has is no column.
+        # Columns without any value in the experiment are omitted.
         assert {flat.pop(key) for key in [*flat] if key not in row} <= {None, "none", ""}
         assert {key: row[key] for key in flat} == {
             key: "" if value is None else str(value) for key, value in flat.items()
@@ -100,7 +100,7 @@ def test_the_rule_of_success(ctid, home):
         assert each["converged"] == (abs(each["delay"] - 0.35) <= 0.2 * 0.35)
     truth = {"g1_a1": 0.25, "g1_a2": 0.25, "g1_b0": 3.0, "g2_a1": 0.01, "g2_a2": 0.025, "g2_b0": 1.0}
     for each in json.loads(ctid("export loop --json").stdout):
-        # By natural frequency, although the specification has the faster one first.
+        # By natural frequency, although the faster one is first in the specification.
         errors = [abs(each["parameters"][name] / true - 1) for name, true in truth.items()]
         assert each["converged"] == (max(errors) <= 0.2)
     settling = ("settling_time_1", "settling_time_2", "settling_after_step_1", "settling_after_step_2")

@@ -1,4 +1,4 @@
-"""The Python surface gives what the commands print."""
+"""The Python interface gives the results printed by the commands."""
 
 import io
 import re
@@ -68,7 +68,7 @@ def test_results_are_those_of_the_commands(out, ctid, tmp_path):
     assert results.summary().strip() == ctid("table group/study --out", out).stdout.strip()
     assert repr(results).startswith("group/study: 12 of 12 estimates by one, other, 0 failed\n  in 1 data cell")
     assert "<td" in results._repr_html_()
-    # A mapping and a file are the same experiment.
+    # A mapping and a file with equal content are one experiment.
     again = run_experiment(out / "group" / "study" / "spec.yaml", out, jobs=1)
     assert set(again.estimates["id"]) == set(results.estimates["id"])
 

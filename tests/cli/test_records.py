@@ -1,4 +1,4 @@
-"""``ctid frf`` and ``ctid track``: from a file to numbers, whatever its clock, units and format."""
+"""``ctid frf`` and ``ctid track`` on files of any clock, unit and format."""
 
 import json
 
@@ -14,7 +14,7 @@ T, Y = tones().T
 
 
 def answered(file, u, seed=0, header="t [s],u [V],y [mm]", times=None):
-    """The response of 2 / (p + 1), with noise."""
+    """Write the response of 2 / (p + 1), with noise."""
     t = 0.1 * np.arange(u.size) if times is None else times
     y = simulate(TransferFunction([2.0], [1.0, 1.0]), HeldSignal(t, u), t)
     return write(file, (t, u, y + 0.1 * np.random.default_rng(seed + 100).standard_normal(t.size)), header)
@@ -38,7 +38,7 @@ def test_periods_realisations_and_units(ctid, tmp_path):
 
 
 def unusual(folder):
-    """The two tones in another unit of time, as sound, without times, and with single samples missing."""
+    """Write the two tones in another unit of time, as sound, without times, and with single samples missing."""
     number, keep = np.arange(T.size), np.random.default_rng(1).random(T.size) < 0.6
     wavfile.write(folder / "sound.wav", 500, (8000 * Y).astype(np.int16))
     write(folder / "ms.csv", (1e3 * T, Y), "t [ms],y")

@@ -1,4 +1,4 @@
-"""What is refused: the exit code, one message that says what is wrong, where and what is allowed, nothing written."""
+"""Refusals: exit code, one message with the error, its place and what is allowed, and no files written."""
 
 import re
 import shutil
@@ -38,7 +38,7 @@ CASES = [(command, code) for code, commands in COMMANDS["refused"].items() for c
 
 @pytest.fixture(scope="module")
 def prepared(used):
-    """The used folder with bad files, and with results of another experiment, of a newer format, and damaged."""
+    """Add bad files to the used folder, and results of another experiment, of a newer format, and damaged ones."""
     for name, text in FILES.items():
         (used / name).write_text(text, encoding="utf-8")
     (used / "modes.yaml").write_text("mine", encoding="utf-8")

@@ -49,7 +49,7 @@ def test_what_is_unwise_in_published_specifications_is_not_said_to_who_reproduce
 
 @pytest.fixture(scope="module")
 def profiled(tmp_path_factory, ctid, without_workers):
-    """Case 1 by the existing method, and by one that takes no start and never succeeds, at other settings."""
+    """Return case 1 by the existing method, and by one without starts that never succeeds, at other settings."""
     folder = tmp_path_factory.mktemp("profiled")
     content = yaml.safe_load((CONFIGS / "case1_regular.yaml").read_text(encoding="utf-8"))
     blind = {"kind": "delay_profile", "poles": 2, "zeros": 0, "delay_bounds": [0, 5]}
@@ -79,10 +79,10 @@ def test_one_data_set_fills_its_cells(ctid, tmp_path, case, tables):
         for method in methods
     ]
     for row in mine:
-        # The existing method gets there from some starts, the others from everywhere.
+        # The existing method succeeds from some starts, the others from all.
         assert row["percent"] == 100 or row["method"] == "existing"
         assert (row["published_percent"] is not None) == (row["method"] in ("existing", "redundancy"))
-    # Neither the committed tables nor the paper are contradicted.
+    # The results agree with the committed tables and the paper.
     assert check_tables(tables.split(), tmp_path).mismatches.empty
 
 
@@ -94,7 +94,7 @@ def test_a_method_without_a_start_stands_in_both_tables_with_the_same_numbers(ct
     text = " ".join(ctid("table 1 --out", profiled).stdout.split())
     assert "delay_profile was given no initial delay" in text
     assert "sampling.samples = 1000 (not 4000)" in text
-    # What is missing is named by the specification that would compute it, as it is found from here.
+    # Missing results are named by the specification that computes them, relative to the working directory.
     for folder, place in ((ROOT, ""), (tmp_path, f"{ROOT}/")):
         monkeypatch.chdir(folder)
         text = ctid("table 1 --out", profiled).stdout

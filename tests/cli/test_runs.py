@@ -1,4 +1,4 @@
-"""``ctid run``: what it says, how it ends, resumes and is divided; and where its files may not go."""
+"""``ctid run``: messages, exit, resuming, shards, and allowed places of files."""
 
 import contextlib
 import json
@@ -23,14 +23,14 @@ ARRAY = ROOT / "docs" / "examples" / "slurm" / "shards.sbatch"
 
 
 def start(folder, words):
-    """Run a command in a process of its own."""
+    """Run a command in a separate process."""
     command = [sys.executable, "-m", "ctid_cli.cli.main", *words.split()]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, **pipes)
 
 
 def untimed(text):
-    """A text without its durations and rates."""
+    """Return a text without its durations and rates."""
     return re.sub(r"[\d.]+(/s|/min| ms| min| s)\b( \d+ s)?", "(time)", text)
 
 
@@ -58,14 +58,14 @@ def test_a_run_until_it_is_precise_says_how_far_it_is(ctid, here, snapshot, monk
     assert min(sizes) > 4
     assert sum(group["done"] for group in found["groups"] if group["estimator"] == "known") == sum(sizes)
     assert found["precision"][0]["widest"]["half_width"] <= found["precision"][0]["widest"]["asked"]
-    # A number on the command line comes before the rule of the file.
+    # A number on the command line overrides the rule in the file.
     assert "6 of 6 estimates stored" in ctid("run tiny.yaml --runs 1").stdout
     assert "precision" not in json.loads(ctid("status tiny --json").stdout)
 
 
 @pytest.mark.usefixtures("without_workers")
 def test_estimates_depend_on_content_alone(ctid, used, here):
-    """Another folder, and another number of runs first, give the same ones; a record is found from another folder."""
+    """Results do not depend on the folder or an earlier number of runs; the record is found from another folder."""
     ctid("run tiny.yaml --runs 1 --quiet")
     ctid("run tiny.yaml --quiet")
     (here / "elsewhere").mkdir()
@@ -115,7 +115,7 @@ def test_three_processes_merged_are_one_run(here, snapshot):
 
 
 def test_the_tasks_of_an_array_compute_every_shard_once(tmp_path):
-    # Programs of these names that only note what they are asked.
+    # Programs of these names that only record their arguments.
     for name, text in {"srun": 'exec "$@"', "ctid": f'echo "$@" >> {tmp_path}/calls'}.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
         (tmp_path / name).chmod(0o755)

@@ -1,4 +1,4 @@
-"""``ctid fit`` with several inputs: from columns to a model, and what is refused."""
+"""``ctid fit`` with several inputs: from columns to a model, and refusals."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The commands of docs/tutorial.md run on the converter's record, and print what the page shows."""
+"""The commands of docs/tutorial.md run on the converter's record, with the output shown on the page."""
 
 import contextlib
 import io
@@ -19,12 +19,12 @@ CODE, PRINTED = re.search(r"^```py\n(.*?)^```$.*?^```text\n(.*?)^```$", PAGE, re
 
 
 def digits_of(line):
-    """A line with its numbers to three digits: what processors agree on."""
+    """Return a line with its numbers to three digits, which do not depend on the processor."""
     return re.sub(r"-?\d+\.\d+(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.3g}", " ".join(line.split()))
 
 
 def compare(printed, shown):
-    """The lines shown are printed, in their order."""
+    """Assert that the shown lines are printed, in their order."""
     lines = [digits_of(line) for line in printed.splitlines()]
     places = [lines.index(digits_of(line)) for line in shown.splitlines() if line != "..."]
     assert all(one < other for one, other in pairwise(places))

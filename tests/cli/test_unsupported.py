@@ -1,4 +1,4 @@
-"""What cannot be combined: docs/unsupported.md has every combination with the sentence that refuses it."""
+"""Unsupported combinations: docs/unsupported.md lists each one with the message that refuses it."""
 
 import shutil
 from pathlib import Path
@@ -22,7 +22,7 @@ CONTINUOUS = "loop: {controller: {continuous: {numerator: [1.5, 3.0], denominato
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Records of each kind, and files of loops."""
+    """Return a folder with records of each kind, and files of loops."""
     folder = tmp_path_factory.mktemp("unsupported")
     values = first_order()
     write(folder / "record.csv", values)

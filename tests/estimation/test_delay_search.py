@@ -1,4 +1,4 @@
-"""The search over the delay on costs whose minima are known, and its step against differences of the profile cost."""
+"""Search over the delay on costs with known minima, and its step against differences of the profile cost."""
 
 import math
 
@@ -35,7 +35,7 @@ SMALLEST = 1e-4
 
 
 class Artificial:
-    """A cost given by a formula and its step; writes down where it was asked for what."""
+    """A cost given by a formula and its step; it records its calls."""
 
     def __init__(self, cost, step):
         self.cost, self.formula = cost, step
@@ -49,7 +49,7 @@ class Artificial:
 
 
 def quadratic(at, floor=1.0):
-    """Cost (d - at)^2 + floor with Newton's step, which is exact."""
+    """Return the cost (d - at)^2 + floor with Newton's step, which is exact."""
     return Artificial(lambda d: (d - at) ** 2 + floor, lambda d: at - d)
 
 
@@ -58,7 +58,7 @@ def search(cost, delay, starts=START, *, max_iterations=50, tolerance=1e-9, larg
     return descend(cost, delay, starts, limits)
 
 
-#: Twice the distance lands as high on the other side of the minimum, which is no fall.
+#: A double step ends at the same cost on the other side of the minimum, which is no decrease.
 OVERSHOOTING = Artificial(lambda d: (d - 3.0) ** 2 + 1.0, lambda d: 2.0 * (3.0 - d))
 CLIFF = Artificial(lambda d: math.inf if d > 4.0 else (d - 3.0) ** 2 + 1.0, lambda d: 8.0 if d < 1.0 else 3.0 - d)
 #: The slope at 9 s and at 0 s points away from the valley.
@@ -68,18 +68,18 @@ FAR_AT_1 = Artificial(lambda d: (d - 4.0) ** 2, lambda d: -15.0 if d == 1.0 else
 BLIND_FROM_2 = Artificial(lambda d: (d - 9.0) ** 2, lambda d: 1.0 if d < 2 else math.nan)
 NEAR = 3.0 + 0.9 * SMALLEST
 MIRROR, FEW = {"reflect": True}, {"max_iterations": 3, "largest_step": 1.0}
-#: Cost, start, options; the delays that are asked for at first, and where and how the search ends.
+#: Cost, start, options; the first evaluated delays, and place and status of the end.
 SEARCHES = {
     "exact on a parabola": (quadratic(3.0), 7.0, {}, [7, 3], (3, Status.CONVERGED, 1)),
     "a cost of zero is the end": (quadratic(3.0, floor=0.0), 7.0, {}, [7, 3], (3, Status.CONVERGED, 1)),
     "no lower cost: halved": (OVERSHOOTING, 5.0, {}, [5, 1, 3], (3, Status.CONVERGED, 1)),
     "nothing can be computed: halved": (CLIFF, 0.5, {}, [0.5, 8.5, 4.5, 2.5, 3], (3, Status.CONVERGED, 2)),
-    # At the bound the step shrinks to nothing without another question.
+    # At the bound the step becomes zero without a further evaluation.
     "beyond the upper bound: halved": (quadratic(17.0), 9.0, {}, [9, 10], (10, Status.CONVERGED, 1)),
     "beyond the lower bound: halved": (quadratic(-7.0), 1.0, {}, [1, 0], (0, Status.CONVERGED, 1)),
     "beyond the upper bound: mirrored": (UP_AT_9, 9.0, MIRROR, [9, 7, 5], (5, Status.CONVERGED, 2)),
     "beyond the lower bound: mirrored": (DOWN_AT_0, 0.0, MIRROR, [0, 4, 5], (5, Status.CONVERGED, 2)),
-    # Mirror images of 17 and 13 s are no better, the one of 11 s is the start.
+    # Reflections at 17 and 13 s are not better, the one at 11 s is the start.
     "mirrored in vain: halved": (quadratic(17.0), 9.0, MIRROR, [9, 3, 7, 9, 10], (10, Status.CONVERGED, 1)),
     "mirrored beyond the other bound: halved": (FAR_AT_1, 1.0, MIRROR, [1, 6.5, 4], (4, Status.CONVERGED, 2)),
     "within the smallest step": (quadratic(3.0), NEAR, {}, [NEAR], (NEAR, Status.CONVERGED, 0)),
@@ -101,7 +101,7 @@ def test_coefficients_are_handed_on():
     search(cost, 7.0, largest_step=2.0)
     # Each trial starts from the coefficients of the last accepted delay.
     assert cost.starts == [([[3.0, 4.0]], False), ([[17.0, 7.0]], False), ([[5.0, 5.0]], False)]
-    # Without any the cost starts from its own.
+    # Without coefficients, the cost uses its default start.
     cost = quadratic(3.0)
     search(cost, 7.0, START[:0])
     assert cost.starts[0] == ([], True)
@@ -109,7 +109,7 @@ def test_coefficients_are_handed_on():
 
 @given(st.floats(0, 10), st.floats(-30, 40), st.floats(0.1, 3), st.floats(0.05, 10), st.booleans())
 def test_never_leaves_the_bounds_nor_rises(start, at, gain, largest_step, reflect):
-    # Wherever the minimum lies, and whatever the steps are worth.
+    # For any place of the minimum and any step gain.
     cost = Artificial(lambda d: (d - at) ** 2 + 1.0, lambda d: gain * (at - d))
     found = search(cost, start, max_iterations=500, tolerance=1e-12, largest_step=largest_step, reflect=reflect)
     assert all(0.0 <= delay <= 10.0 for delay in cost.asked)
@@ -165,7 +165,7 @@ def test_delay_step_follows_the_slope_of_the_profile_cost(model, delay, snr_db):
 
 
 def test_cheapest_of_several_starts_is_kept():
-    # Whatever the order: the result is that of the best start alone, bit for bit; those that are not finite are none.
+    # In any order, the result is that of the best start, bit for bit; starts that are not finite are ignored.
     problem = at_known_delay(filter_data(make_record(CASE_2, snr_db=15, n=2500), 9.0), Structure(4, 1))
     cost = SampledCost(problem, Steps(10, 1e-2, "guarded", 3), (25.0,))
     slow = np.concatenate((np.poly(np.full(4, -0.1))[1:], [1.0, 1.0]))
@@ -185,7 +185,7 @@ def test_cheapest_of_several_starts_is_kept():
 
 
 def test_delay_that_the_data_do_not_determine_has_no_step():
-    # The steady response to one tone has an amplitude and a phase: a pole and a gain explain them at any delay.
+    # The steady response to one tone has an amplitude and a phase: a pole and a gain match them at any delay.
     t = 0.05 * np.arange(3000)
     held = HeldSignal(t, np.sin(1.3 * t))
     y = simulate(TransferFunction([2.0], [1.0, 2.0], 1.0), held, t)
@@ -196,7 +196,7 @@ def test_delay_that_the_data_do_not_determine_has_no_step():
 
 
 def moments_of(psi, delay_sensitivity, error):
-    """Second moments from signals: psi to the coefficients, then the delay."""
+    """Return second moments from signals: coefficient sensitivities psi, then that of the delay."""
     full = np.column_stack((psi, delay_sensitivity))
     hessian = full.T @ full
     return Equations(hessian, full.T @ error, hessian, float(error @ error), 1.0)
@@ -204,7 +204,7 @@ def moments_of(psi, delay_sensitivity, error):
 
 @given(st.integers(0, 2**31), st.integers(1, 6), st.floats(-8, 8), st.floats(-8, 8))
 def test_delay_step_is_least_squares_on_what_the_coefficients_leave(seed, p, coefficient_decades, delay_decades):
-    # For an error that the coefficients cannot lower any more, in whatever units.
+    # For an error orthogonal to the coefficient sensitivities, in any units.
     rng = np.random.default_rng(seed)
     psi, slope, error = rng.standard_normal((40, p)), rng.standard_normal(40), rng.standard_normal(40)
     error -= psi @ np.linalg.lstsq(psi, error, rcond=None)[0]
@@ -220,7 +220,7 @@ def test_delay_that_the_coefficients_can_imitate_has_no_step():
     imitated = psi @ np.array([1.0, -2.0, 0.5])
     for columns, slope in ((psi, imitated), (psi, np.zeros(40)), (psi * 0, imitated)):
         assert np.isnan(delay_step(moments_of(columns, slope, error), LEAST_CURVATURE))
-    # A little of its own: 1e-5 of the signal, 1e-10 of the curvature.
+    # A small independent part: 1e-5 of the signal, 1e-10 of the curvature.
     own = rng.standard_normal(40)
     own -= psi @ np.linalg.lstsq(psi, own, rcond=None)[0]
     nearly = imitated + 1e-5 * own * np.linalg.norm(imitated) / np.linalg.norm(own)
@@ -229,7 +229,7 @@ def test_delay_that_the_coefficients_can_imitate_has_no_step():
 
 
 def one_delay(step, determined=1.0):
-    """Equations of one coefficient and the delay, whose step is given; a fraction of the curvature is the delay's."""
+    """Return equations of one coefficient and the delay, with a given step and curvature fraction of the delay."""
     overlap = np.sqrt(1.0 - determined)
     hessian = np.array([[1.0, overlap], [overlap, 1.0]])
     return Equations(hessian, np.array([0.0, step * determined]), hessian, 1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Fits to the spectra of a record behind low-pass filters, against columns written out and SciPy's least squares."""
+"""Fits to spectra of a low-pass filtered record, against explicit columns and SciPy's least squares."""
 
 from dataclasses import replace
 
@@ -29,13 +29,13 @@ CUTOFFS = [0.3, 1.0, 2.02]
 
 
 def spectral_data(record, highest, delay, lowpass=None, keep_mean=True):
-    """Frequencies, output, delayed input and weights as the kernels take them."""
+    """Return frequencies, output, delayed input and weights as arguments of the kernels."""
     spectra = record_spectra(record, GREATEST, highest, GREATEST, keep_mean=keep_mean)
     return spectra.frequencies, spectra.outputs, spectra.inputs(delay), lowpass_weight(spectra.frequencies, lowpass)
 
 
 def real_rows(data, columns):
-    """Weighted complex columns as real ones; a frequency above zero stands for its negative too."""
+    """Return weighted complex columns as real ones; a positive frequency also represents its negative."""
     frequencies, _, _, weights = data
     root = np.sqrt(weights * np.where(frequencies == 0, 1, 2))
     weighted = root[:, None] * np.column_stack(columns)
@@ -43,7 +43,7 @@ def real_rows(data, columns):
 
 
 def columns_of(data, theta, poles):
-    """Columns (dx/da, dx/db, dx/dtau, eps) and the output, the transient projected out by an orthogonal basis."""
+    """Return columns (dx/da, dx/db, dx/dtau, eps) and output, with the transient removed by an orthogonal basis."""
     frequencies, y, u, _ = data
     jw, a, b = 1j * frequencies, np.append(1.0, theta[:poles]), theta[poles:]
     inverse = 1 / np.polyval(a, jw)
@@ -59,7 +59,7 @@ def columns_of(data, theta, poles):
 
 
 def fitted(data, model, start, *, iterations=50, tolerance=1e-6):
-    """The fit from a denominator, which is at the head of the parameters of a start."""
+    """Return the fit from a denominator, which is at the head of the parameters of a start."""
     n = model.order
     start = np.concatenate((start[:n], np.zeros(model.numerator.size + n)))
     return least_cost(*data, start, n, n, iterations, tolerance, 12)
@@ -73,8 +73,8 @@ def disturbed(model):
 @pytest.mark.parametrize("lowpass", [None, Lowpass(30.0, 3)])
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_fit_is_where_scipy_ends(model, lowpass):
-    # By differences of the residual, scaled by the size of each parameter; the step of the delay too is the projection
-    # of the error on what the coefficients leave of its sensitivity.
+    # By differences of the residual, scaled by the size of each parameter. The delay step is the projection of the
+    # error on the delay sensitivity orthogonal to those of the coefficients.
     data = spectral_data(make_record(model, snr_db=10, regular=False, n=4000), HIGHEST[model], 8.02, lowpass)
     n, start = model.order, disturbed(model)
     theta, squared_error, step = fitted(data, model, start, iterations=100, tolerance=1e-12)
@@ -104,7 +104,7 @@ def test_noise_free_records_give_the_true_model(model, regular, tolerance):
 
 
 def test_initial_state_is_projected_out():
-    # A free response of the system, larger than the forced one, changes neither the estimate nor the cost.
+    # A free response larger than the forced one changes neither the estimate nor the cost.
     record = make_record(CASE_1)
     kick = HeldSignal([0.0, 10.0, 10.5], [0.0, 400.0, 0.0])
     free = simulate(TransferFunction([1.0, 3.0], CASE_1.denominator), kick, record.t)
@@ -116,7 +116,7 @@ def test_initial_state_is_projected_out():
 
 
 def test_with_fewer_bins_than_transient_coefficients_nothing_is_left():
-    # The mean and one frequency are three real equations; three coefficients of a transient explain them all.
+    # The mean and one frequency are three real equations, solved exactly by three transient coefficients.
     t = 0.1 * np.arange(200)
     y = np.random.default_rng(0).standard_normal(200)
     spectra = record_spectra(Record(t, y, HeldSignal(t, np.sign(np.sin(t)))), 2.0, 0.36, 2.0)
@@ -155,7 +155,7 @@ NONE = np.empty((0, 4))
 
 @pytest.mark.parametrize(("model", "cutoffs"), [(CASE_1, CUTOFFS), (CASE_2, [2.685, 26.85])])
 def test_least_cost_is_that_of_all_frequencies(model, cutoffs):
-    # Without the cut where a filter passes next to nothing.
+    # Without excluding frequencies at which a filter has almost no gain.
     record = make_record(model, snr_db=15, regular=False, n=2500)
     costs = costs_of(record, model, cutoffs)
     for k, cutoff in enumerate(cutoffs):
@@ -188,7 +188,7 @@ def test_own_start_is_the_least_squares_solution(model):
 
 
 def test_unstable_own_starts_are_reflected():
-    # A response that grows: the least-squares model is unstable, the start is its mirror image.
+    # A growing response: the least-squares model is unstable, the start is its reflection.
     t = 0.05 * np.arange(400)
     record = Record(t, 5 * np.exp(0.5 * t), HeldSignal(t, np.where(t < 1, 1.0, 0.0)))
     steps = Steps(0, 1e-9, "guarded", 12)
@@ -224,7 +224,7 @@ def test_costs_behind_all_filters_are_handed_down_and_up():
 
 
 def test_input_that_rests_while_it_counts_has_no_minimum():
-    # All that the output could tell of the input lies before the samples that count.
+    # All information of the output about the input is before the used samples.
     t = 0.05 * np.arange(1000)
     costs = costs_of(Record(t, np.sin(t), HeldSignal(t, np.where(t < t[-1], 0.0, 1.0))))
     squared_errors = scan(costs, [1.0] * 3, own=False).squared_errors

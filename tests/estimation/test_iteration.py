@@ -1,4 +1,4 @@
-"""The iteration: against the textbook formula, at its fixed points, and how it ends."""
+"""The iteration: against the textbook formula, at its fixed points, and its terminations."""
 
 import numpy as np
 import pytest
@@ -27,13 +27,13 @@ DEGREES = {CASE_1: Structure(2, 0), CASE_2: Structure(4, 1)}
 
 
 def problem_of(model, regular=True, hold_output="foh", snr_db=15):
-    """A problem with its delay held, and the true parameters."""
+    """Return a problem with a fixed delay, and the true parameters."""
     data = filter_data(make_record(model, snr_db=snr_db, regular=regular, n=3000), 12.0, hold_output)
     return at_known_delay(data, DEGREES[model]), np.append(theta_of(model), model.delay)
 
 
 def relative_gradient(equations, free):
-    """Cosines between the sensitivities and the output error."""
+    """Return the cosines between the sensitivities and the output error."""
     lengths = np.sqrt(np.diag(equations.hessian)[:free] * equations.squared_error)
     return np.abs(equations.instrument_error[:free] / lengths).max()
 
@@ -63,7 +63,7 @@ def test_plain_step_is_the_textbook_formula(model, hold_output, regular):
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_gradient_vanishes_at_convergence(model, regular):
-    # On noisy data: sum psi eps = 0, so the estimate minimises the output error, whatever the rule and the hold of y.
+    # On noisy data, sum psi eps = 0: the estimate minimises the output error for any rule and hold of y.
     found = []
     for rule, hold_output in (("plain", "foh"), ("guarded", "zoh")):
         problem, truth = problem_of(model, regular, hold_output)
@@ -75,7 +75,7 @@ def test_gradient_vanishes_at_convergence(model, regular):
 
 
 def test_guarded_iteration_never_raises_the_cost():
-    # From starts so far away that full steps do raise it, by more than it is in the end.
+    # Distant starts, from which full steps increase the cost above its final value.
     problem, truth = problem_of(CASE_2, snr_db=5)
     rng = np.random.default_rng(0)
     rises = []
@@ -89,7 +89,7 @@ def test_guarded_iteration_never_raises_the_cost():
 
 
 def test_step_of_convergence_is_free_of_units():
-    # The change of the output that a step makes, as a fraction of the output: here 1 % more gain.
+    # The relative change of the output caused by a step: here 1 % more gain.
     problem, theta = problem_of(CASE_1)
     step = np.array([0.0, 0.0, 0.01 * theta[2], 0.0])
     assert relative_change(problem.equations(theta), step) == pytest.approx(0.01)
@@ -99,7 +99,7 @@ def test_step_of_convergence_is_free_of_units():
 
 
 class Sequence:
-    """A problem that gives the same equations wherever it is asked, then none."""
+    """A problem with a fixed sequence of equations at any parameters, then none."""
 
     free = 1
 
@@ -133,8 +133,8 @@ def equations(hessian=1.0, error=1.0, cost=1.0):
     ],
 )
 def test_every_end_has_its_status(sequence, rule, status):
-    # A vanishing error means convergence; no equations at the trial means a step into the void; a cost that does
-    # not fall stalls, unless the step was below rounding anyway.
+    # A zero error means convergence; no equations at the trial point means an invalid step; a cost that does not
+    # decrease means a stall, unless the step is below rounding.
     followed = sequence + [equations(error=0.0, cost=0.0)] * (status is Status.CONVERGED)
     assert iterate(Sequence(followed), np.zeros(1), Steps(10, 1e-8, rule)).status is status
 
@@ -144,7 +144,7 @@ def test_start_that_is_not_admissible_gives_nothing():
 
 
 class Mirrored(Sequence):
-    """Parameters below zero are moved to the other side."""
+    """Negative parameters are reflected."""
 
     def admissible(self, theta):
         return np.abs(theta)
@@ -158,7 +158,7 @@ def test_a_last_step_that_was_mirrored_is_no_convergence(error, status, rule):
 
 
 def test_steps_that_give_less_than_they_promise_end_the_iteration():
-    # Each step is halved eight times before the cost falls, and then by a thousandth of what the full one promised.
+    # Each step is halved eight times before the cost decreases, by a thousandth of the prediction for the full one.
     sequence = [equations()]
     for k in range(SLOW_STEPS + 5):
         sequence += [equations(cost=2.0)] * 8 + [equations(cost=1.0 - 1e-3 * (k + 1))]
@@ -167,7 +167,7 @@ def test_steps_that_give_less_than_they_promise_end_the_iteration():
 
 
 class Scalar:
-    """One parameter whose full step is a function of it; no equations where it is too large."""
+    """One parameter with a given full step as a function of it; no equations if it is too large."""
 
     free = 1
 
@@ -179,7 +179,7 @@ class Scalar:
         self.asked.append(theta[0])
         if abs(theta[0]) > self.largest:
             return inadmissible(1)
-        # The regressor is twice the instrument: the step is not that of Gauss and Newton.
+        # The regressor is twice the instrument: the step is not the Gauss-Newton step.
         return Equations(np.array([[2.0]]), np.array([2.0 * self.step(theta[0])]), np.eye(1), 1.0 + theta[0] ** 2, 1.0)
 
     def admissible(self, theta):
@@ -187,14 +187,14 @@ class Scalar:
 
 
 def path(problem, begin, rule, max_iterations=200, tolerance=1e-9):
-    """All parameters on the way, and how it ended."""
+    """Return all parameters of the iterations, and the result."""
     result = iterate(problem, np.array([begin]), Steps(max_iterations, tolerance, rule))
     return result.path[:, 0], result
 
 
 def test_steps_that_overshoot_are_halved_and_failed_directions_not_tried_again():
-    # Steps of the instruments lead away from the minimum at 0, however short; those of Gauss and Newton, 3 from 2, land
-    # beyond it, where the cost is lower but not by the tenth of what its slope promises; half of it is taken.
+    # Instrumental steps lead away from the minimum at 0, however short; Gauss-Newton steps, 3 from 2, overshoot it to
+    # a lower cost, but not lower by a tenth of the prediction from its slope; half of the step is taken.
     class Misled(Scalar):
         def equations(self, theta):
             return super().equations(theta)._replace(instrument_regressor=np.array([[-1.0]]))
@@ -209,7 +209,7 @@ def test_steps_that_overshoot_are_halved_and_failed_directions_not_tried_again()
 
 @pytest.mark.parametrize("factor", [-2.0, -3.0])
 def test_relaxed_steps_end_a_cycle_that_full_steps_never_leave(factor):
-    # theta becomes -theta, or -2 theta, for ever; in the end -0.4 theta, or -theta/2.
+    # theta alternates to -theta, or -2 theta, without end; with relaxation to -0.4 theta, or -theta/2.
     problem = Scalar(lambda theta: factor * theta)
     assert path(problem, 1.0, "plain")[1].status is not Status.CONVERGED
     seen, result = path(problem, 1.0, "relaxed")
@@ -220,7 +220,7 @@ def test_relaxed_steps_end_a_cycle_that_full_steps_never_leave(factor):
 
 
 def test_cycle_that_is_entered_from_within_is_left_by_the_first_relaxation():
-    # From close to the solution, which full steps leave: how short they were there does not matter later.
+    # From near the solution, which full steps leave: earlier short steps have no effect later.
     seen, result = path(Scalar(lambda theta: -2.7 * np.tanh(theta)), 0.01, "relaxed", max_iterations=500)
     assert result.status is Status.CONVERGED
     assert np.abs(seen).max() > 0.5
@@ -228,7 +228,7 @@ def test_cycle_that_is_entered_from_within_is_left_by_the_first_relaxation():
 
 
 def test_relaxed_steps_into_the_void_are_halved_and_the_cost_may_rise():
-    # 1 -> 1 + 4 lies outside, 1 + 2 too, 1 + 1 does not: there the cost is higher, which guarded steps do not take.
+    # 1 -> 1 + 4 and 1 + 2 are outside, 1 + 1 is not, but has a higher cost and is refused by guarded steps.
     def four_once(theta):
         return 4.0 if theta == 1.0 else 0.0
 

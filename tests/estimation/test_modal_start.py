@@ -1,4 +1,4 @@
-"""Starts for sums of submodels, from the record alone."""
+"""Starts for sums of submodels, computed from the record only."""
 
 import numpy as np
 import pytest
@@ -24,12 +24,12 @@ MODE_2 = Submodel([1.0], [0.025, 0.01, 1.0])
 
 
 def start_of(record, system, **options):
-    """The start for a sum of the structure of a system, and of its delay."""
+    """Return the start for a sum with the structure and delay of a system."""
     return AdditiveSrivc(terms=system.terms, delay=system.delay, **options).prepare(record).laid_out.start
 
 
 def assert_in_basin(record, system, **options):
-    """The estimate from the automatic start is that from the truth."""
+    """Assert that the estimate from the automatic start is that from the true system."""
     prepared = AdditiveSrivc(terms=system.terms, delay=system.delay, **options).prepare(record)
     one, other = prepared.fit(), prepared.fit(Start(model=system))
     frequencies, expected = (

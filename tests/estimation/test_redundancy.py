@@ -1,4 +1,4 @@
-"""Escape from local minima by the paths of several costs, its record, and its end."""
+"""Escape from local minima by the paths of several costs: record and end of the search."""
 
 import math
 from itertools import pairwise
@@ -12,9 +12,9 @@ from ctid_cli.estimation.redundancy import SearchStatus, local_paths, minimise_r
 
 CHOICES = ["first", "best"]
 
-# Saw teeth on the integers: a descent that tries the lower neighbour first stops at the next multiple of the period
-# below, since the cost just beyond is higher by period - 1 - 1/2. The one global minimum is 0; each period traps in
-# places of its own, and all of them at once only in multiples of their least common multiple, 1001 for 7, 11 and 13.
+# Saw teeth on the integers: a descent that tries the lower neighbour first stops at the next lower multiple of the
+# period, since the cost just beyond is higher by period - 1 - 1/2. The global minimum is 0; each period has other local
+# minima, and all have common ones only at multiples of their least common multiple, 1001 for 7, 11 and 13.
 
 
 def saw(period):
@@ -75,7 +75,7 @@ def test_a_cost_that_is_not_finite_is_infinitely_bad(choice, bad):
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_no_decrease_at_zero_or_below_goes_round_for_ever(choice):
-    # (1 - improvement) J0 is J0 itself at zero, and above J0 where that is negative.
+    # (1 - improvement) J0 equals J0 at zero, and is above J0 for negative J0.
     for floor in (0.0, -5.0):
         found = minimise_redundantly(3.0, lambda x, floor=floor: x + floor, [to(0.0), to(0.004)], choice=choice)
         assert (found.point, found.rounds, found.status) == (0.0, 2, SearchStatus.EXHAUSTED)
@@ -100,7 +100,7 @@ def test_reference_is_asked_once_for_each_visit():
 
 
 def test_arrays_are_points():
-    # Two valleys: each path moves along one coordinate only, so that neither reaches the minimum alone.
+    # Two valleys: each path moves along one coordinate only, so neither reaches the minimum alone.
     target = np.array([1.0, -2.0])
     paths = [lambda x: [np.array([target[0], x[1]])], lambda x: [np.array([x[0], target[1]])]]
     found = minimise_redundantly(np.zeros(2), lambda x: float(np.sum((x - target) ** 2)), paths)
@@ -137,7 +137,7 @@ def families(draw):
 
 
 def as_printed(start, cost, tables, epsilon):
-    """Algorithm III in its own words, with the path kept and the end added; infinities as they are."""
+    """Run algorithm III as in the paper, with the stored path and end; infinities are kept."""
     point, i, failures = start, 0, 0
     while failures < len(tables):
         minima = tables[i][point]

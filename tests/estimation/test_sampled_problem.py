@@ -1,4 +1,4 @@
-"""The problem on samples: its moments, its start by least squares and the numerator of a given denominator."""
+"""Problem on samples: moments, least-squares start, and the numerator for a given denominator."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, make_record, th
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("model", [CASE_1, CASE_2])
 def test_start_is_the_least_squares_solution(model, regular):
-    # p^n/F y = phi' theta, solved from the filtered signals themselves by an orthogonal decomposition.
+    # p^n/F y = phi' theta, solved from the filtered signals by an orthogonal decomposition.
     n, m = model.order, model.numerator.size - 1
     cutoff = SVF_CUTOFF[model]
     data = filter_data(make_record(model, snr_db=15, regular=regular, n=2500), 9.0)
@@ -31,7 +31,7 @@ def test_start_is_the_least_squares_solution(model, regular):
 
 
 def test_numerator_is_the_best_for_its_denominator():
-    # Linear least squares of y on p^k/A u; the denominator stays.
+    # Linear least squares of y on p^k/A u with a fixed denominator.
     data = filter_data(make_record(CASE_2, snr_db=15, n=3000), 9.0)
     theta = np.append(theta_of(CASE_2) * 1.05, 8.0)
     rows = standard_rows(data, np.append(1.0, theta[:4]), np.zeros(1), 8.0)

@@ -10,7 +10,7 @@ from ctid_cli.estimation.sampled_problem import is_hurwitz, reflect_unstable, wi
 
 @st.composite
 def polynomials(draw):
-    """Roots of a polynomial of degree 1 to 8, none near the axis nor near one another, and a unit of time."""
+    """Draw polynomials of degree 1 to 8 with roots away from the axis and from each other, and a unit of time."""
     roots = []
     for _ in range(draw(st.integers(1, 4))):
         real = draw(st.floats(0.05, 5)) * draw(st.sampled_from([-1, -1, -1, 1]))

@@ -1,4 +1,4 @@
-"""The two published sums of submodels and a flexible beam, with seeded records, for the tests beside this file."""
+"""The two published sums of submodels and a flexible beam, with seeded records, for the tests in this folder."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -15,7 +15,7 @@ MODE = Term(2, 0)
 
 
 def modes(theta, delay=0.0):
-    """Second-order submodels without zeros: a1, a2, b0 of each."""
+    """Return second-order submodels without zeros: a1, a2, b0 of each."""
     return AdditiveModel.from_theta(theta, [MODE] * (len(theta) // 3), delay)
 
 
@@ -27,13 +27,13 @@ FOUR_MODES = AdditiveModel(
 #: The closed-loop example (section 6.2).
 TWO_MODES = modes([0.25, 0.25, 3.0, 0.01, 0.025, 1.0])
 PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
-#: The modes of a flexible beam as printed (section 7), and the values that its identification started from.
+#: The modes of a flexible beam as printed (section 7), and the initial values of its identification.
 BEAM = modes([0.0024, 0.023, 11.81, 2.33e-5, 1.65e-4, 0.159, 8.59e-7, 1.03e-5, 3.19e-4, 7.55e-7, 3.55e-6, 1.27e-4])
 BEAM_START = modes([0.001, 0.025, 10.0, 5e-5, 1.5e-4, 0.2, 8.5e-7, 2e-5, 0.001, 7.5e-7, 5e-6, 0.01])
 
 
 def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=None):
-    """Gaussian input, white output noise of a standard deviation."""
+    """Return a record of Gaussian input and white output noise with a standard deviation."""
     rng = np.random.default_rng(seed)
     t = interval * np.arange(n) if times is None else times
     u = HeldSignal(t, rng.standard_normal(n), hold)
@@ -42,7 +42,7 @@ def open_record(system, n, noise, seed, *, interval=INTERVAL, hold="zoh", times=
 
 
 def coloured_record(seed, n=2000):
-    """Four modes with the published noise, strong where the first two are."""
+    """Return a record of four modes with the published noise, whose power is largest at the first two."""
     rng = np.random.default_rng(seed)
     t = INTERVAL * np.arange(n)
     u = HeldSignal(t, rng.standard_normal(n))
@@ -51,9 +51,9 @@ def coloured_record(seed, n=2000):
 
 
 def beam_record(seed, noise=1e-5, periods=1):
-    """Two seconds of a multisine up to 500 Hz on a beam with a delay of four samples, its system and its noise.
+    """Return two seconds of a multisine up to 500 Hz on a beam with a delay of four samples, its system and its noise.
 
-    From rest in its first period.
+    The first period begins at rest.
     """
     rng = np.random.default_rng(seed)
     n, rate = 8192, 4096.0
@@ -71,7 +71,7 @@ def beam_record(seed, noise=1e-5, periods=1):
 def loop_record(
     system, n, noise, seed, *, controller=PID, interval=INTERVAL, enters="controller", filter=([1.0], [1.0])
 ):
-    """Gaussian reference, output noise that goes round the loop."""
+    """Return a record of Gaussian reference, with output noise in the loop."""
     rng = np.random.default_rng(seed)
     r = rng.standard_normal(n)
     v = noise * lfilter(*filter, rng.standard_normal(n))
@@ -81,16 +81,16 @@ def loop_record(
 
 
 def disturbed(system, seed, by=0.05):
-    """A start: every parameter wrong by up to a fraction."""
+    """Return a start with every parameter off by up to a fraction."""
     change = np.random.default_rng(seed).uniform(-by, by, system.theta.size)
     return AdditiveModel.from_theta(system.theta * (1.0 + change), system.terms, system.delay)
 
 
 def deviations(fit, system):
-    """Errors of an estimate in its own standard errors, submodels sorted on both sides."""
+    """Return the errors of an estimate in its standard errors, with submodels sorted on both sides."""
     return (fit.additive.theta - system.sorted().theta) / np.sqrt(np.diag(fit.covariance))
 
 
 def assert_parameters(fit, system, tolerance):
-    """Equal parameters, relative to each one's size."""
+    """Assert equal parameters, relative to their sizes."""
     np.testing.assert_allclose(fit.additive.theta, system.sorted().theta, rtol=tolerance)

@@ -1,4 +1,4 @@
-"""Records of the two benchmark systems, for the tests beside this file."""
+"""Records of the two benchmark systems, for the tests in this folder."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ SVF_CUTOFF = {CASE_1: 1.0, CASE_2: 25.0}
 
 
 def make_record(model=CASE_1, *, seed=1, replicate=0, snr_db=None, regular=True, n=None, clock_period=None):
-    """A data set whose input is known exactly; no noise without a signal-to-noise ratio."""
+    """Return a data set with exactly known input; without a signal-to-noise ratio there is no noise."""
     interval, low, high, samples = (0.05, 0.01, 0.09, 4000) if model.order <= 2 else (0.01, 0.01, 0.05, 8000)
     n = n or samples
     if regular:
@@ -34,12 +34,12 @@ def make_record(model=CASE_1, *, seed=1, replicate=0, snr_db=None, regular=True,
 
 
 def theta_of(model):
-    """Parameters (a1 ... an, b0 ... bm)."""
+    """Return the parameters (a1 ... an, b0 ... bm)."""
     return np.concatenate((model.denominator[1:], model.numerator))
 
 
 def assert_same_model(model, expected, tolerance):
-    """Equal coefficients and delay, relative to each one's size."""
+    """Assert equal coefficients and delay, relative to their sizes."""
     np.testing.assert_allclose(model.denominator, expected.denominator, rtol=tolerance)
     np.testing.assert_allclose(model.numerator, expected.numerator, rtol=tolerance)
     np.testing.assert_allclose(model.delay, expected.delay, rtol=tolerance)

@@ -1,4 +1,4 @@
-"""The least output error of sums: against one transfer function, against simulation, and with what is known."""
+"""Output error of sums: against one transfer function, against simulation, and with known parameters."""
 
 from dataclasses import replace
 

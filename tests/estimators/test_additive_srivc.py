@@ -41,7 +41,7 @@ from tests.estimators.records import assert_same_model
 TWO = (MODE, MODE)
 MIXED = AdditiveModel([Submodel([0.2, 2.0], [0.7, 1.0]), Submodel([0.4], [0.05, 0.01, 1.0])], 0.12)
 DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)
-#: One over p and one over p^2, each with a flexible mode.
+#: Sum of 1/p and 1/p^2, each with a flexible mode.
 DRIVE = AdditiveModel([Submodel([0.5], [0.4, 1.0], 1), Submodel([0.2], [0.02, 0.02, 1.0])])
 RIGID = AdditiveModel([Submodel([0.3], [1.0], 2), Submodel([0.2], [0.02, 0.02, 1.0])])
 
@@ -52,7 +52,7 @@ def fitted(record, start, **options):
 
 
 def published_step(record, model, hold_output):
-    """Equation (29) to the letter: a right-hand side for every submodel; the matrix of all of them."""
+    """Solve equation (29) as printed: a right-hand side for every submodel, and one matrix."""
     x = [simulate(TransferFunction(*_of(part), model.delay), record.input, record.t) for part in model.submodels]
     psi, phi, targets = [], [], []
     for part, own in zip(model.submodels, x, strict=True):
@@ -84,7 +84,7 @@ def _of(part):
 @pytest.mark.parametrize("hold_output", ["zoh", "foh"])
 @pytest.mark.parametrize("system", [TWO_MODES, MIXED, DRIVE, RIGID], ids=["modes", "mixed", "drive", "rigid"])
 def test_step_is_the_published_one(system, hold_output):
-    # Diagonal blocks are the new parameters; off the diagonal there is nothing but the common change.
+    # Diagonal blocks are the new parameters; off the diagonal is only the common change.
     record = open_record(system, 600, 0.1, 3)
     start = disturbed(system, 4)
     problem = AdditiveProblem(filter_data(record, system.delay, hold_output), system.terms, system.delay)
@@ -109,7 +109,7 @@ def reference_record():
 
 @pytest.mark.parametrize("variant", ["plain", "relaxed", "guarded"])
 def test_reference_estimate_of_four_modes(variant):
-    # Numbers of an independent implementation.
+    # Values of an independent implementation.
     fit = fitted(reference_record(), (FOUR_MODES, 1), variant=variant, tolerance=1e-10)
     assert fit.status is Status.CONVERGED
     gains = [2.90641429, 0.40364981, 0.19854286, 0.06228051]
@@ -118,7 +118,7 @@ def test_reference_estimate_of_four_modes(variant):
 
 
 def record_of(system, n, noise, seed, instruments, **options):
-    """In open loop or in closed loop."""
+    """Return a record in open or in closed loop."""
     return (open_record if instruments == "open_loop" else loop_record)(system, n, noise, seed, **options)
 
 
@@ -170,7 +170,7 @@ def test_one_submodel_is_srivc(submodel, instruments):
 
 
 def test_order_of_the_terms_does_not_matter():
-    # Submodels of different structure, so that they can be told from each other.
+    # Submodels of different structure, which are distinguishable.
     system = AdditiveModel([*TWO_MODES.submodels, Submodel([0.3, 1.5], [0.2, 1.0])])
     record = open_record(system, 3000, 0.2, 8)
     start = disturbed(system, 3)
@@ -178,7 +178,7 @@ def test_order_of_the_terms_does_not_matter():
     one, two = (fitted(record, model) for model in (start, turned))
     assert one.additive.terms == two.additive.terms
     assert one.parameter_names == two.parameter_names == one.additive.names
-    # Submodels are summed in one order, so that not even rounding differs.
+    # Submodels are summed in a fixed order, so that rounding is equal too.
     np.testing.assert_array_equal(one.additive.theta, two.additive.theta)
     np.testing.assert_array_equal(one.covariance, two.covariance)
     assert one.additive.order_of_sorting == (0, 1, 2)
@@ -229,7 +229,7 @@ def test_record_that_starts_in_motion_is_fitted_exactly(whole, system, instrumen
 @pytest.mark.parametrize("coloured", [False, True])
 def test_standard_errors_are_those_of_repeated_experiments(coloured):
     # The ratio of 100 observed to stated standard deviations lies within 0.72 and 1.28 with 99.99 % confidence; the
-    # covariance that ignores the colour of the noise is caught.
+    # covariance that ignores the colour of the noise is outside.
     system = modes([0.25, 0.25, 3.0, 0.02, 0.025, 1.0])
     n = 1000
     t = INTERVAL * np.arange(n)
@@ -256,7 +256,7 @@ def test_standard_errors_are_those_of_repeated_experiments(coloured):
 
 
 def test_flexible_beam_from_rough_initial_values():
-    # Frequencies wrong by up to a half; the upper modes contribute 57 dB less than the first.
+    # Frequencies off by up to a half; the upper modes contribute 57 dB less than the first.
     reached = 0
     for seed in range(8):
         record, _, sigma = beam_record(seed)
@@ -298,7 +298,7 @@ def test_unstable_start_is_reflected():
 
 
 def test_start_that_loses_a_pole_ends_in_words():
-    # Whatever happens on the way, a fit ends with a status or a sentence.
+    # Whatever happens during the iteration, a fit ends with a status or an error message.
     for theta in ([1e-5, 1e-12, 1.0, 0.01, 0.025, 1.0], [50.0, 900.0, 1.0, 0.01, 0.0251, 1.0], [9.0, 1e-9, 0, 1, 1, 0]):
         for variant in ("plain", "relaxed", "guarded"):
             fit = fitted(open_record(TWO_MODES, 400, 1.0, 15), modes(theta), variant=variant)

@@ -1,4 +1,4 @@
-"""What the estimators refuse, and how they say it."""
+"""Refusals of the estimators, and their messages."""
 
 import numpy as np
 import pytest

@@ -33,7 +33,7 @@ from tests.estimators.additive_records import (
 )
 
 TWO = (MODE, MODE)
-#: PD control of what integrates.
+#: PD control of integrating systems.
 PD = DiscreteController.from_pid(0.5, 0.0, 2.0)
 DELAYED = AdditiveModel(TWO_MODES.submodels, 0.12)
 BIPROPER = AdditiveModel([TWO_MODES.submodels[0], Submodel([0.3, 0.5], [0.1, 1.0])])
@@ -64,7 +64,7 @@ def test_reference_estimate(variant):
     assert fit.loop_radius < 1
 
 
-# Of the two published forms with one transfer function: a1, a2, b0, b1 of each mode after factoring.
+# Published forms with one transfer function: a1, a2, b0, b1 of each mode after factoring.
 DIRECT = [
     0.2614989003,
     0.2620573993,
@@ -96,7 +96,7 @@ def test_reference_estimates_of_the_unfactored_model(instruments, expected):
 
 
 def filtered(matrix, gain, source):
-    """States of a filter driven by a held signal, at the samples."""
+    """Return the states of a filter driven by a held signal, at the samples."""
     dynamics, drive, *_ = cont2discrete((matrix, gain, np.eye(len(matrix)), np.zeros_like(gain)), INTERVAL)
     states = np.zeros((source.size, len(matrix)))
     for k in range(source.size - 1):
@@ -119,7 +119,7 @@ def test_estimate_with_closed_loop_instruments_solves_the_equations_of_clsrivc()
     psi = np.column_stack((-states[:, n:], states[:, n - b.size : n]))
     correlation = psi.T @ eps / np.sqrt((psi**2).sum(axis=0) * (eps @ eps))
     assert np.abs(correlation).max() < 1e-8
-    # The direct estimate is another point.
+    # The direct estimate differs.
     direct = Srivc(4, 2, tolerance=1e-11).fit(record, Start(model=disturbed(TWO_MODES, 1)))
     assert np.abs(direct.model.numerator / b - 1).max() > 1e-4
 
@@ -135,7 +135,7 @@ def test_noise_free_loop_returns_the_true_model(system, enters):
 
 
 def test_relaxed_steps_end_a_cycle_of_full_ones():
-    # A short record on which full steps never settle.
+    # A short record on which full steps do not converge.
     record = loop_record(TWO_MODES, 500, 0.1, 150)
     start = disturbed(TWO_MODES, 1150)
     assert fitted(record, start, variant="plain").status is Status.MAX_ITERATIONS
@@ -150,7 +150,7 @@ def test_relaxed_steps_end_a_cycle_of_full_ones():
 
 
 def test_coloured_noise_in_a_loop_biases_direct_instruments_only():
-    # v = e/(1 - 0.9 q^-1) of variance 0.01: the direct estimates of the second mode are off by several deviations.
+    # v = e/(1 - 0.9 q^-1) of variance 0.01: direct estimates of the second mode are biased by several deviations.
     estimates = {"open_loop": [], "closed_loop": []}
     for seed in range(12):
         record = loop_record(TWO_MODES, 20000, 0.1 * np.sqrt(1 - 0.81), 300 + seed, filter=([1.0], [1.0, -0.9]))
@@ -162,7 +162,7 @@ def test_coloured_noise_in_a_loop_biases_direct_instruments_only():
     # The mean of 12 unbiased standardised estimates lies within 4/sqrt(12) = 1.15 of zero with 99.99 % confidence.
     assert np.abs(closed.mean(axis=0)).max() < 1.15
     assert (np.abs(direct.mean(axis=0))[[3, 5]] > 2.5).all()
-    # So do they scatter by one deviation: the mean square of 72 lies within 0.5 and 1.7.
+    # Their standard deviation is one: the mean square of 72 lies within 0.5 and 1.7.
     assert 0.5 < np.mean((closed - closed.mean(axis=0)) ** 2) * 12 / 11 < 1.7
 
 
@@ -210,7 +210,7 @@ def test_start_that_makes_an_unstable_loop_is_refused(estimator, model):
 
 
 def test_start_that_makes_a_slightly_unstable_loop_is_not():
-    # The loop of the start grows slowly; the record can be simulated with it, and the estimate makes it stable.
+    # The loop at the start grows slowly; the record can be simulated with it, and the estimate stabilises it.
     record = loop_record(TWO_MODES, 1000, 0.05, 2)
     start = modes([0.25, 0.25, 3.0, 0.004, 0.025, 2.0])
     assert 1 < loop_radius(start, PID, INTERVAL) < 1.01
@@ -221,7 +221,7 @@ def test_start_that_makes_a_slightly_unstable_loop_is_not():
 
 
 def test_loop_without_a_solution_is_refused():
-    # A direct gain of -1 round the loop at the start: there is no input that satisfies both sides.
+    # A direct loop gain of -1 at the start: no input satisfies the loop equations.
     record = open_record(BIPROPER, 200, 0.1, 1)
     looped = replace(record, loop=Loop(np.ones(200), DiscreteController([-1 / 3.0], [1.0])))
     assert BIPROPER.submodels[1].transfer_function().numerator[0] == pytest.approx(3.0)
@@ -232,7 +232,7 @@ def test_loop_without_a_solution_is_refused():
 @pytest.mark.parametrize("enters", ["controller", "input"])
 @pytest.mark.parametrize("controller", [PID, PD, DiscreteController([0.02, -0.004], [1.0, -0.5, 0.06])])
 def test_loop_of_the_record_is_the_one_that_instruments_are_simulated_in(controller, enters):
-    # A controller that acts a sample late has fewer numerator coefficients than the others.
+    # A controller with a delay of one sample has fewer numerator coefficients than the others.
     record = loop_record(DELAYED, 400, 0.1, 13, controller=controller, enters=enters)
     problem = AdditiveProblem(filter_data(record), DELAYED.terms, DELAYED.delay, loop_data(record, "closed_loop"))
     *_, output = problem.filter.rows(DELAYED.theta)

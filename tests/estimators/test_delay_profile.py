@@ -1,4 +1,4 @@
-"""The global search over the delay, and what belongs to measured records: states, offsets, gaps, experiments, units."""
+"""Global search over the delay, and measured records: states, offsets, gaps, experiments, units."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def random_input(rng, t, every=7):
 
 
 def record_of(model=SYSTEM, *, n=600, seed=0, noise=0.0, irregular=False, offset=0.0, past=0):
-    """A record; ``past`` samples of its beginning are cut off, with what their input left behind."""
+    """Return a record; the first ``past`` samples are removed, so that it begins with an initial state."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.uniform(0.05, 0.15, n)) if irregular else 0.1 * np.arange(n)
     signal = random_input(rng, t)
@@ -59,12 +59,12 @@ def test_sensitivities_are_the_derivatives_of_the_output(structure, delay, irreg
         ends = [theta + sign * step * np.eye(layout.size)[k] for sign in (1, -1)]
         moved = [sensitivities(problem, layout, end, [delay]) for end in ends]
         for (psi, _), (_, above), (_, below) in zip(parts, *moved, strict=True):
-            # The error falls where the simulated output rises.
+            # The error decreases with increasing simulated output.
             slope = (below - above) / (2 * step)
             np.testing.assert_allclose(psi[:, k], slope, atol=2e-8 * max(1.0, np.abs(slope).max()))
 
 
-# --- what is estimated with the model --------------------------------------------------------------
+# --- states and offsets ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("irregular", [False, True])
@@ -75,7 +75,7 @@ def test_initial_state_and_offset_of_a_noise_free_record_are_found(irregular):
     assert_same_model(fit.model, SYSTEM, 1e-6)
     assert fit.offsets == pytest.approx([21.5])
     assert fit.parameters["offset"] == fit.offsets[0]
-    # From rest and without an offset the same record gives another model.
+    # Assuming rest and no offset, the record gives another model.
     wrong = DelayProfile(2, 0, (0, 3)).fit(record)
     assert abs(wrong.model.dc_gain / SYSTEM.dc_gain - 1) > 0.01
 
@@ -150,13 +150,13 @@ def test_finds_the_delay_in_heavy_noise(model, regular, replicate):
     fit = DelayProfile(model.order, model.numerator.size - 1, (0, 15)).fit(record)
     assert fit.status is Status.CONVERGED
     assert abs(fit.model.delay - 8.0) < 0.08
-    # At least as low as the cost of the truth.
+    # At most the cost of the true system.
     assert fit.cost <= np.mean((record.y - record.noise_free) ** 2)
 
 
 @pytest.mark.parametrize("treated", [{}, {"offset": "estimate"}])
 def test_the_profile_is_lowest_next_to_the_estimate(treated):
-    # Behind a filter, or, where an offset is estimated, on every sample.
+    # With a filter, or on every sample if an offset is estimated.
     fit = DelayProfile(2, 0, (0, 15), **treated).fit(make_record(snr_db=15))
     profile = fit.profile
     assert (profile.cutoff is None) == bool(treated)
@@ -189,7 +189,7 @@ def test_errors_of_a_model_with_its_own_state_and_offset(initial_state):
     options = DelayProfile(2, 0, (0, 3), initial_state=initial_state, offset="estimate")
     fit = options.fit(record)
     applied = options.prepare(record).laid_out.errors_of(fit.model)
-    # The model's own record: its state and offset are the best already.
+    # On the model's own record, state and offset are already optimal.
     np.testing.assert_allclose(applied.residuals[0], fit.residuals[0], atol=1e-6)
     assert applied.offsets == pytest.approx(fit.offsets, abs=1e-6)
 

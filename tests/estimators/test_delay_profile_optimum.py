@@ -1,4 +1,4 @@
-"""The estimate is the least output error of its structure and of all that it contains."""
+"""The estimate has the minimum output error of its structure and of all structures that it contains."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ INTERVAL = 0.5
 
 
 def periodic_record(damping, noise=0.05, samples=100, seed=1):
-    """The last of many periods of a second-order system's answer."""
+    """Return the last of many periods of a second-order system's response."""
     rng = np.random.default_rng(seed)
     model = TransferFunction([0.6], [1.0, 2 * damping * 0.8, 0.64], 0.7)
     u = np.repeat(rng.choice([-1.0, 1.0], samples // 2), 2)
@@ -28,7 +28,7 @@ def periodic_record(damping, noise=0.05, samples=100, seed=1):
 
 
 def in_motion(seed=2, samples=160):
-    """A record that begins in the middle of another, on an offset."""
+    """Return a record that begins in the middle of another, with an offset."""
     rng = np.random.default_rng(seed)
     model = TransferFunction([0.6], [1.0, 0.4, 0.64], 0.7)
     whole = record_of(model, rng, samples=samples + 40, noise=0.1, offset=3.0)
@@ -49,14 +49,14 @@ def test_state_and_offset_end_where_a_general_optimiser_does_on_dense_matrices()
     record, model = in_motion()
     fit = DelayProfile(2, 0, (0.0, 2.0), initial_state="estimate", offset="estimate").fit(record)
     assert fit.status is Status.CONVERGED
-    # What came before is not known, so that samples count from the greatest delay on.
+    # The input before is unknown, so that samples count from the greatest delay on.
     y = np.where(record.t - record.t[0] < 2.0 - 1e-9, np.nan, record.y)
     known = Record(record.t, y, record.input)
     check(fit, model, lambda a, tau: residual(known, a, 0, tau, free_response=True, offset=True))
 
 
 def check(fit, model, residual_of):
-    """Compare with least squares from the truth in w, damping and delay, within the damping that is admissible."""
+    """Compare with least squares from the true w, damping and delay, within the admissible damping."""
 
     def errors(x):
         w, zeta = np.exp(x[:2])
@@ -67,7 +67,7 @@ def check(fit, model, residual_of):
     bounds = [-np.inf, np.log(1e-3), 0.0], [np.inf, np.inf, 2.0]
     found = least_squares(errors, start, bounds=bounds, x_scale="jac", xtol=1e-12, ftol=1e-14, gtol=1e-12)
     squared_error = fit.cost * fit.count
-    # The model has the cost that is said, and no other is found by the other route.
+    # The model has the reported cost, and the second method finds the same one.
     a = fit.model.denominator
     assert float(np.sum(residual_of(a, fit.model.delay) ** 2)) == pytest.approx(squared_error, rel=1e-7)
     assert np.concatenate(fit.residuals) @ np.concatenate(fit.residuals) == pytest.approx(squared_error, rel=1e-9)

@@ -1,4 +1,4 @@
-"""Fits to frequency responses: against what samples of a periodic record have, and against theory."""
+"""Fits to frequency responses: against samples of periodic records, and against theory."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ PERIOD = 200
 
 
 def sampled(model: TransferFunction, interval: float) -> FrequencyData:
-    """Values of the samples of a record in the steady state, from simulation and the discrete Fourier transform."""
+    """Return the values for samples of a record in steady state, from simulation and the discrete Fourier transform."""
     u = np.random.default_rng(1).standard_normal(PERIOD)
     u -= u.mean()
     stable = model.poles[model.poles != 0]
@@ -41,7 +41,7 @@ def sampled(model: TransferFunction, interval: float) -> FrequencyData:
 
 
 def noisy(model: TransferFunction, seed: int, level: float = 0.05) -> FrequencyData:
-    """Values with errors that grow with the gain."""
+    """Return values with errors proportional to the gain."""
     values, rng = model.frequency_response(LINES), np.random.default_rng(seed)
     error = level * (np.abs(values) + 0.1)
     parts = rng.standard_normal((2, LINES.size)) / np.sqrt(2.0)

@@ -1,4 +1,4 @@
-"""A fit with its uncertainty and diagnostics, from measured records."""
+"""A fit with its uncertainty and diagnostics, on measured records."""
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_a_delay_at_its_bound_has_no_standard_error():
 
 
 def test_a_zero_beside_a_delay_is_undetermined():
-    """A small zero shifts the response like a delay: the two are singular at b0 = 0."""
+    """A small zero shifts the response like a delay: the pair is singular at b0 = 0."""
     smooth = TransferFunction([4.0], [1.0, 4.0, 4.0], 0.5)
     result = identify([record_of(smooth, noise=0.02)], DelayProfile(2, 1, (0, 3)))
     items = by_name(result)
@@ -118,7 +118,7 @@ def test_equations_without_information_leave_everything_undetermined():
 
 
 def test_the_delay_has_a_profile_interval_where_the_cost_is_not_quadratic():
-    # A held input puts kinks into the cost, and noise makes the interval reach over them.
+    # A held input causes kinks in the cost, and with noise the interval extends over them.
     result = identify([record_of(n=60, noise=0.1, every=3)], OPTIONS)
     interval = result.delay_interval
     assert interval is not None
@@ -183,7 +183,7 @@ def test_a_bad_validation_record_is_refused():
 
 
 def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
-    """Those of the model whose parameters are the free pole and the numerator, from central differences."""
+    """They are those of the model with the free pole and the numerator, from central differences."""
     record = record_of(TransferFunction([1.0], [1.0, 2.0]), n=400, seed=3)
     result = identify([record], DelayProfile(2, 1, (0, 0)), covariance="white")
     slow, free = LIMITS["slowest"].rest / record.t[-1], float(result.fit.model.poles.real.min())
@@ -215,7 +215,7 @@ def test_a_record_too_short_for_its_noise_is_said():
 
 
 def test_one_submodel_of_a_band_limited_input_is_the_fraction():
-    # The finer clock of such an input is not that of the samples.
+    # The finer clock of a band-limited input differs from that of the samples.
     rng = np.random.default_rng(4)
     t = 0.2 * np.arange(400)
     u = HeldSignal(t, np.convolve(rng.standard_normal(404), np.ones(5) / 5, "valid"), "band-limited")

@@ -1,4 +1,4 @@
-"""Systems that integrate, through the same estimator as all others."""
+"""Integrating systems, with the same estimator as all others."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ NOISE = 0.02
 
 
 def integrating(seed, numerator, denominator, *, regular=True, free=None, noise=NOISE):
-    """A record of a system with a delay of .73 s and, if given, a free response."""
+    """Return a record of a system with a delay of .73 s and, if given, a free response."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(400) if regular else np.cumsum(rng.uniform(0.02, 0.18, 400))
     u = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], 80), 5))

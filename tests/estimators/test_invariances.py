@@ -1,4 +1,4 @@
-"""An estimate does not depend on the units, nor on the clock on the wall, nor on samples that are not there."""
+"""Invariance of estimates to units, to the origin of time, and to missing samples."""
 
 from functools import cache
 
@@ -20,7 +20,7 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 from tests.estimators.records import CASE_1, CASE_2, assert_same_model, make_record
 
-#: Estimators of the two systems, with their times in a unit [s], where they start [s], and how exactly they end.
+#: Estimators of the two systems with times in a unit [s], their starts [s], and their relative accuracy.
 ESTIMATORS = {
     "srivc": (CASE_1, lambda s: Srivc(2, 0, 8.0 * s, 1.0 / s, tolerance=1e-11), None, 1e-8),
     "srivc, two modes": (CASE_2, lambda s: Srivc(4, 1, 8.0 * s, 25.0 / s, tolerance=1e-11), None, 1e-8),
@@ -61,7 +61,7 @@ def fitted(name, record, seconds=1.0):
 
 
 def factor(name, model, seconds, gain, output):
-    """What a change of units does to a parameter."""
+    """Return the factor of a parameter under a change of units."""
     if name in ("delay", "offset"):
         return {"delay": seconds, "offset": output}[name]
     power = int(name[-1])
@@ -81,14 +81,14 @@ def factor(name, model, seconds, gain, output):
     st.sampled_from([1, -1]),
 )
 def test_units_and_the_origin_of_time(name, regular, seconds, shift, input_decades, output_decades, sign):
-    # From seconds to nanoseconds, days and anything between; a clock that reads 1000 s holds 13 digits of intervals.
+    # From seconds to nanoseconds, days and units between; a clock at 1000 s has 13 digits in its intervals.
     record, one = record_of(name, regular), reference(name, regular)
     inward, output = sign * 10**input_decades, 10**output_decades
     held = HeldSignal((record.input.t + shift) * seconds, record.input.values * inward, record.input.hold)
     two = fitted(name, Record((record.t + shift) * seconds, record.y * output, held), seconds)
     tolerance = ESTIMATORS[name][3]
     for parameter, value in one.parameters.items():
-        if parameter.startswith("x"):  # initial states, in units of their own
+        if parameter.startswith("x"):  # initial states have separate units
             continue
         scale = factor(parameter, one.model, seconds, output / inward, output)
         assert two.parameters[parameter] == pytest.approx(scale * value, rel=tolerance, abs=1e-9 * abs(scale))
@@ -104,7 +104,7 @@ def test_units_and_the_origin_of_time(name, regular, seconds, shift, input_decad
     [(Srivc(2, 0, 8.0, 1.0), None), (TdSrivc(2, 0, (0, 15), svf_cutoff=1.0, tolerance=1e-10), Start(7.5))],
 )
 def test_missing_outputs_are_as_good_as_absent_ones(estimator, start):
-    # A linear hold bridges a gap by the same line either way, so every number agrees.
+    # A linear hold bridges a gap by the same line in both cases, so all numbers agree.
     record = make_record(snr_db=15, regular=False)
     gone = np.random.default_rng(0).random(record.n_samples) < 0.1
     with_nan = Record(record.t, np.where(gone, np.nan, record.y), record.input)

@@ -1,4 +1,4 @@
-"""Parameters that are known, against fits of the reduced problem by SciPy on exact simulation."""
+"""Known parameters, against fits of the reduced problem by SciPy on exact simulation."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def record_of(n=400, noise=0.1, seed=0, offset=0.0):
 
 
 def reduced(record, fixed, start, offset=False):
-    """Least squares over what is not fixed: b0, b1, a1, a2, delay and the offset."""
+    """Fit the parameters that are not fixed: b0, b1, a1, a2, delay and the offset."""
     names = ["b0", "b1", "a1", "a2", "delay"] + ["offset"] * offset
     free = [name for name in names if name not in fixed]
 
@@ -84,7 +84,7 @@ SUM = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025,
     "fixed", [{"g1_b0": 3.0}, {"g1_a2": 0.026, "g2_b0": 2.9}, {"g1_a1": 0.01, "g1_a2": 0.025, "g1_b0": 1.0}]
 )
 def test_known_parameters_of_submodels(fixed):
-    """A name belongs to the submodel that its value fits; a submodel may be known altogether."""
+    """A name refers to the submodel that matches its value; all parameters of a submodel may be known."""
     rng = np.random.default_rng(2)
     t = 0.05 * np.arange(600)
     u = HeldSignal(t, rng.standard_normal(600))

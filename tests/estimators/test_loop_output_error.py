@@ -1,4 +1,4 @@
-"""The simulated loop against a plain simulation and against open loop; unstable plants; delay, state and offset."""
+"""Simulated loop against a plain simulation and open loop; unstable plants; delay, state and offset."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def rows_of(options, one, theta, count, state=None):
 
 
 def continuous_loop(plant, law, r, t, fine, foh=False):
-    """Output of a loop in continuous time by short steps of its state equations (fourth order of Runge and Kutta)."""
+    """Return the output of a continuous-time loop by short steps of its state equations (fourth-order Runge-Kutta)."""
     n, m = plant.order, law.denominator.size - 1
     A, B = np.vstack((-plant.denominator[1:], np.eye(n)[:-1])), np.eye(n)[0]
     C = np.concatenate((np.zeros(n - plant.numerator.size), plant.numerator))

@@ -19,7 +19,7 @@ LOSSES = ("huber", "tukey")
 
 
 def record_of(model, seed, *, n=300, interval=0.5, jitter=0.0, offset=0.0, wild=(), size=50.0, one_side=False):
-    """A record with outliers of so many standard deviations of its noise, and that noise."""
+    """Return a record with outliers of a given number of noise standard deviations, and that noise."""
     rng = np.random.default_rng(seed)
     t = interval * np.arange(n)
     t[1:-1] += interval * rng.uniform(-jitter, jitter, n - 2)
@@ -32,7 +32,7 @@ def record_of(model, seed, *, n=300, interval=0.5, jitter=0.0, offset=0.0, wild=
 
 
 def tukey(z):
-    """Twice the loss, and its two derivatives, as functions of the squared error over that of the end."""
+    """Return twice the loss, and its two derivatives, as functions of the squared error over the squared threshold."""
     left = np.maximum(1.0 - z, 0.0)
     return np.array([(1.0 - left**3) / 3.0, left**2, -2.0 * left])
 
@@ -57,7 +57,7 @@ def test_a_general_optimiser_finds_nothing_better(loss, bend):
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_the_size_of_an_outlier_does_not_matter(loss):
-    """Two records, one of them irregular with missing samples, in motion on an offset; outliers in a row and first."""
+    """Two records, one irregular with missing samples, initial state and offset; outliers adjacent and at the start."""
     fits = []
     for size in (50.0, 5e4):
         wild = {"wild": [2, 90, 91, 200], "size": size, "one_side": True}
@@ -85,7 +85,7 @@ def test_the_size_of_an_outlier_does_not_matter(loss):
     ],
 )
 def test_errors_are_as_large_as_the_covariance_says(loss, contamination):
-    """Their squares over the covariance are chi-square, and the covariance is hardly larger than without outliers."""
+    """Squared errors over the covariance are chi-square, and the covariance is hardly larger than without outliers."""
     truth, count = np.array([2.0, 1.0]), 30
     squares, sizes, clean = 0.0, [], []
     for seed in range(count):
@@ -98,7 +98,7 @@ def test_errors_are_as_large_as_the_covariance_says(loss, contamination):
             clean.append(np.diag(DelayProfile(1, 0, (0.0, 0.0)).fit(record).covariance))
     low, high = chi2.ppf([0.0005, 0.9995], 2 * count)
     assert low < squares < high
-    # 10 % of outliers cost Huber's estimate half its precision at worst, least squares nine tenths.
+    # 10 % of outliers reduce the precision of Huber's estimate by half at most, that of least squares by nine tenths.
     assert (np.mean(sizes, axis=0) < 2.2 * np.mean(clean, axis=0)).all()
 
 

@@ -47,7 +47,7 @@ def test_arma_of_no_order_is_white_noise(known_delay):
 
 @pytest.mark.parametrize(("noise", "orders"), [(FAST, (2, 1)), (SLOW, (2, 1))], ids=["fast", "slow"])
 def test_a_general_optimiser_of_the_dense_likelihood_finds_nothing_better(noise, orders):
-    """Two records, samples missing, each with an offset; all parameters of plant and noise at once."""
+    """Two records with missing samples and offsets; all parameters of plant and noise at once."""
     records = [record_of(noise, seed, 120 + 30 * seed, missing=12, offset=seed) for seed in (1, 2)]
     options = DelayProfile(**KNOWN, offset="estimate", noise_model="arma:{},{}".format(*orders))
     fit = options.fit(records)
@@ -74,7 +74,7 @@ def test_a_general_optimiser_of_the_dense_likelihood_finds_nothing_better(noise,
     found = least_squares(lambda z: scaled(theta + scale * z), np.zeros(theta.size), xtol=1e-12, ftol=1e-14)
     assert count * np.log(2.0 * found.cost / count) > fit.noise.deviance - 1e-4
     assert np.abs(found.x).max() < 0.02
-    # Standard errors are from the joint information of plant and noise.
+    # Standard errors come from the joint information of plant and noise.
     slopes = np.column_stack([(scaled(theta + h) - scaled(theta - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     information = np.linalg.inv(slopes.T @ slopes)[:5, :5] * np.outer(scale[:5], scale[:5])
     expected = np.sqrt(np.diag(information) * (own @ own) / (count - 5))
@@ -92,11 +92,11 @@ def test_predictions_on_the_own_record_are_those_of_the_fit(missing):
         spread = np.linalg.norm(record.y[used] - record.y[used].mean())
         expected = 100.0 * (1.0 - np.linalg.norm(left) / spread)
         assert found.fit.prediction_fit(ahead) == pytest.approx(expected, rel=1e-5)
-    # The innovations are the errors one sample ahead over their standard deviations, which settle at once.
+    # The innovations are the one-step prediction errors over their standard deviations, which settle immediately.
     (innovations,) = found.fit.linear.residuals
     if not missing:
         np.testing.assert_allclose((record.y - found.predict(record))[50:], innovations[50:], atol=1e-4)
-    # What is far enough is the simulated output.
+    # Long-horizon predictions equal the simulated output.
     np.testing.assert_allclose(found.predict(record, 200)[used][-50:], (record.y[used] - errors)[-50:], atol=1e-4)
     with pytest.raises(OptionError, match="ahead"):
         found.predict(record, 0)
@@ -117,7 +117,7 @@ def test_the_noise_model_is_chosen_and_what_it_gives_is_seen():
 
 @pytest.mark.parametrize("seed", [0, 4, 5])
 def test_a_larger_plant_is_no_less_likely(seed):
-    """Records whose least output error with a zero more is in a basin that the noise has made."""
+    """Records for which a further zero moves the minimum output error to a basin caused by the noise."""
     record, options = record_of(seed=seed, n=150, offset=1.0), {"offset": "estimate", "noise_model": "arma:2,1"}
     fits = [DelayProfile(n, m, (0.0, 2.0), nested=True, **options).fit(record) for n, m in ((1, 0), (2, 0), (2, 1))]
     deviances = [fit.noise.deviance for fit in fits]
@@ -137,7 +137,7 @@ monte_carlo: {runs: 1, seed: 1}
 
 
 def test_rivc_in_an_experiment_has_the_bound_of_its_noise(tmp_path):
-    """By the dense covariance matrix, averaged over the data sets that theory takes."""
+    """Bound by the dense covariance matrix, averaged over the data sets used by the theory."""
     (tmp_path / "noise.yaml").write_text(EXPERIMENT, encoding="utf-8")
     plan = build_plan(load_spec(tmp_path / "noise.yaml"))
     (cell,), (part,) = plan.data_cells, plan.estimators

@@ -1,4 +1,4 @@
-"""Bounds of parameters: the estimate within them, at them, and what cannot be bounded."""
+"""Bounds of parameters: estimates inside and at the bounds, and refused bounds."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def fitted(order, *bounds, record=None, **options):
     return DelayProfile(order, 0, (0.0, 0.0), bounds=bounds, **options).fit(record or record_of(order))
 
 
-#: What is bounded, and the coefficients that this leaves free with the value that it has.
+#: Bounded parameters, and the coefficients left free by a bound at its value.
 FORMS = {
     (1, "gain"): lambda value, x: ([value * x[0]], [1.0, x[0]]),
     (1, "time_constant"): lambda value, x: ([x[0]], [1.0, 1.0 / value]),

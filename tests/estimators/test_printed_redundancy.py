@@ -1,4 +1,4 @@
-"""Algorithm IV as printed, against a short transcription of its own, and within its bounds on noise."""
+"""Algorithm IV as printed, against a short independent transcription, and within its bounds on noise."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ class Transcription:
         return simulate(TransferFunction(numerator, a, delay), held, self.record.t)[self.used]
 
     def signals(self, record, a, b, delay):
-        """The p^2/A y of (7), the regressors (8), the instruments (9), the output error, and its slope (26)."""
+        """Return p^2/A y of (7), the regressors (8), the instruments (9), the output error, and its slope (26)."""
         y = HeldSignal(record.t, record.y, "foh")
         slow, fast = (self.filtered(y, a, numerator) for numerator in ([1.0], [1.0, 0.0]))
         u = self.filtered(record.input, a, [1.0], delay)
@@ -47,7 +47,7 @@ class Transcription:
         return highest, np.array([-fast, -slow, u]), np.array([-x_fast, -x_slow, u]), error, slope
 
     def srivc(self, record, delay, theta=None):
-        """Algorithm I: coefficients, squared error and Gauss-Newton step of the delay, (26) and (27)."""
+        """Run algorithm I: coefficients, squared error and Gauss-Newton step of the delay, (26) and (27)."""
         if theta is None:
             highest, phi, *_ = self.signals(record, np.poly([-SVF_CUTOFF] * 2), 1.0, delay)
             theta = with_stable_denominator(np.linalg.solve(phi @ phi.T, phi @ highest), 2)
@@ -63,7 +63,7 @@ class Transcription:
         return theta, error @ error, -(slope @ error) / (slope @ slope - slope @ within)
 
     def descend(self, record, delay):
-        """Algorithm II without step 3."""
+        """Run algorithm II without step 3."""
         theta, cost, step = self.srivc(record, delay)
         for _ in range(10):
             step, trial = np.clip(step, -LARGEST_STEP, LARGEST_STEP), (theta, np.inf, 0.0)
@@ -83,13 +83,13 @@ class Transcription:
         return delay
 
     def reference_cost(self, delay):
-        """(45)."""
+        """Return (45)."""
         outputs = [member.y[self.used] for member in self.members]
         errors = [self.srivc(member, delay)[1] for member in self.members]
         return np.mean([100 * np.sqrt(e) / np.linalg.norm(y - y.mean()) for e, y in zip(errors, outputs, strict=True)])
 
     def rounds(self, delay):
-        """Algorithm IV, step 2: incumbents, their J0, and the ends of all paths of each round."""
+        """Run algorithm IV, step 2: incumbents, their J0, and the ends of all paths of each round."""
         trajectory, ends = [(delay, self.reference_cost(delay))], []
         while True:
             ends.append([self.descend(member, delay) for member in self.members])

@@ -1,4 +1,4 @@
-"""Records with several inputs: equal routes, exact derivatives, and what is refused."""
+"""Records with several inputs: agreement of methods, exact derivatives, and refusals."""
 
 from dataclasses import replace
 

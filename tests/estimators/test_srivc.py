@@ -20,12 +20,12 @@ from tests.estimators.records import CASE_1, CASE_2, SVF_CUTOFF, assert_same_mod
 
 
 def known(model, estimator=Srivc, **more):
-    """An estimator at the true delay."""
+    """Return an estimator at the true delay."""
     return estimator(model.order, model.numerator.size - 1, delay=model.delay, svf_cutoff=SVF_CUTOFF[model], **more)
 
 
 def searched(model, **more):
-    """An estimator of coefficients and delay."""
+    """Return an estimator of coefficients and delay."""
     return TdSrivc(model.order, model.numerator.size - 1, (0, 15), svf_cutoff=SVF_CUTOFF[model], **more)
 
 
@@ -34,9 +34,9 @@ EXACT = [
     for model in (CASE_1, CASE_2)
     for variant in ("plain", "guarded")
 ]
-# The fast mode of case 2, whose period is 0.31 s, puts a local minimum 0.13 s before the true delay where the input is
-# white: from that side no local search on unfiltered data can pass, and the low-pass filter is what it is for.
-# 0.2 s late, case 2 on its irregular clock turns on rounding: one start in four, 1e-9 s apart, ends in a local minimum.
+# The fast mode of case 2, with a period of 0.31 s, causes a local minimum 0.13 s before the true delay if the input is
+# white: no local search on unfiltered data passes it from that side, which is the purpose of the low-pass filter.
+# 0.2 s late, case 2 on its irregular clock depends on rounding: of starts 1e-9 s apart, one in four is trapped.
 EXACT += [
     (model, searched(model, lowpass=lowpass, tolerance=1e-12), Start(start))
     for model, lowpass in ((CASE_1, None), (CASE_1, Lowpass(0.202, 2)), (CASE_2, Lowpass(2.685, 2)))
@@ -56,7 +56,7 @@ def test_noise_free_data_return_the_true_model_and_delay(model, estimator, start
 
 @pytest.mark.parametrize("replicate", range(3))
 def test_starts_from_the_record_reach_the_estimate_that_a_good_cutoff_gives(replicate):
-    # Two modes, a decade apart: a cut-off of 1 rad/s loses two thirds of such records.
+    # Two modes, a decade apart: a cut-off of 1 rad/s fails on two thirds of such records.
     record = make_record(CASE_2, seed=5, replicate=replicate, snr_db=10.0, n=2000)
     found = Srivc(4, 1, delay=8.0).fit(record)
     assert found.status is Status.CONVERGED
@@ -65,7 +65,7 @@ def test_starts_from_the_record_reach_the_estimate_that_a_good_cutoff_gives(repl
 
 @pytest.mark.parametrize("hold_output", ["zoh", "foh"])
 def test_fine_sampling_makes_the_state_variable_filter_exact(hold_output):
-    # Its only error without noise is the interpolation of the output: it falls with the interval.
+    # Without noise, the only error is the interpolation of the output: it decreases with the interval.
     errors = []
     for interval in (0.1, 0.05, 0.025):
         t = np.arange(0, 100, interval)
@@ -100,7 +100,7 @@ def test_too_few_iterations_say_so():
 
 
 def single_tone(noise=0.0):
-    """The steady response to one sinusoid: two numbers, amplitude and phase, are all it can tell."""
+    """Return the steady response to one sinusoid, which has only two numbers: amplitude and phase."""
     t = 0.05 * np.arange(3000)
     held = HeldSignal(t, np.sin(1.3 * t))
     y = simulate(TransferFunction([2.0], [1.0, 2.0], 1.0), held, t)
@@ -112,7 +112,7 @@ def test_one_tone_determines_two_parameters():
     assert fit.status is Status.CONVERGED
     for name in ("a1", "b0"):
         assert abs(fit.parameters[name] - 2.0) < 4 * fit.standard_errors[name]
-    # Two poles and a gain, and no noise: the equations are singular.
+    # Two poles and a gain without noise: the equations are singular.
     fit = Srivc(2, 0, delay=1.0).fit(single_tone())
     assert not fit.status.succeeded
     assert all(np.isnan(error) for error in fit.standard_errors.values())
@@ -120,7 +120,7 @@ def test_one_tone_determines_two_parameters():
 
 @pytest.mark.parametrize("estimator", [Svf(2, 0), Srivc(2, 0)])
 def test_input_that_never_reaches_the_output_is_singular(estimator):
-    # It rests until the last sample: not constant, yet nothing that a filter passes on.
+    # At rest until the last sample: not constant, but without a filtered response.
     t = 0.1 * np.arange(200)
     record = Record.from_arrays(t, np.where(t < t[-1], 0.0, 1.0), np.sin(t))
     with pytest.raises(DataError, match="equations became singular: the data do not determine all parameters"):
@@ -129,7 +129,7 @@ def test_input_that_never_reaches_the_output_is_singular(estimator):
 
 @pytest.mark.parametrize("regular", [True, False])
 def test_published_variant_returns_the_true_model_up_to_its_smallest_step(regular):
-    # It ends at delay steps of 1e-5 of the range, without the joint iterations of the guarded variant.
+    # The plain variant ends at delay steps of 1e-5 of the range, without the joint iterations of the guarded one.
     fit = searched(CASE_1, tolerance=1e-12, variant="plain").fit(make_record(regular=regular), Start(8.2))
     assert fit.status is Status.CONVERGED
     assert abs(fit.model.delay - 8.0) < 1e-5 * 15
@@ -138,7 +138,7 @@ def test_published_variant_returns_the_true_model_up_to_its_smallest_step(regula
 
 @pytest.mark.parametrize("start", [0.5, 4.0, 7.5, 10.0, 14.0])
 def test_a_local_minimum_is_called_one(start):
-    # From the right basin the estimate converges, from the others the cost at 8 s is seen to be lower.
+    # From the right basin the estimate converges; from the others, the cost at 8 s is lower.
     record = make_record(seed=11, snr_db=10.0)
     fit = TdSrivc(2, 0, (0.0, 15.0)).fit(record, Start(start))
     if abs(start - 8.0) < 1.0:
@@ -158,7 +158,7 @@ def test_at_the_estimated_delay_it_is_srivc(model):
     assert fixed.count == fit.count
     assert_same_model(fixed.model, fit.model, 1e-7)
     assert fixed.cost == pytest.approx(fit.cost, rel=1e-10)
-    # A delay that must be estimated makes the coefficients less certain, never more.
+    # Estimating the delay increases the standard errors of the coefficients.
     assert all(fixed.standard_errors[name] < fit.standard_errors[name] for name in fixed.standard_errors)
 
 
@@ -196,7 +196,7 @@ def test_without_a_start_the_middle_of_the_bounds_is_taken():
 @pytest.mark.parametrize(("bounds", "start", "bound"), [((0, 7.5), 7.2, 7.5), ((8.1, 12), 8.4, 8.1)])
 @pytest.mark.parametrize("variant", ["plain", "guarded"])
 def test_true_delay_beyond_a_bound_ends_at_the_bound(variant, bounds, start, bound):
-    # The cost falls all the way to the bound; that is neither convergence nor a stall.
+    # The cost decreases all the way to the bound; that is neither convergence nor a stall.
     fit = TdSrivc(2, 0, bounds, variant=variant).fit(make_record(snr_db=15), Start(start))
     assert fit.model.delay == pytest.approx(bound, abs=2e-3)
     assert fit.status is Status.DELAY_AT_BOUND

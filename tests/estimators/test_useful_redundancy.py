@@ -1,4 +1,4 @@
-"""Useful redundancy on whole records: from anywhere to the truth, and what the search says of itself."""
+"""Useful redundancy on whole records: convergence from any start, and the report of the search."""
 
 from itertools import pairwise
 
@@ -20,18 +20,18 @@ FILTERS = {CASE_1: 10, CASE_2: 15}
 
 
 def member_costs(prepared, delay):
-    """Costs of all filters at a delay, each with its own coefficients."""
+    """Return the costs of all filters at a delay, each with separate coefficients."""
     search = prepared.laid_out.filtered
     return percents(search.at(delay).squared_errors, np.array([cost.spread for cost in search.costs]))
 
 
 def reference_cost(prepared, delay):
-    """J0 where the search evaluates it."""
+    """Return J0 as evaluated by the search."""
     return prepared.laid_out.filtered.reference_cost(delay)
 
 
 def options(model=CASE_1, **more):
-    """The settings of the benchmark."""
+    """Return the settings of the benchmark."""
     return {
         "poles": model.order,
         "zeros": model.numerator.size - 1,
@@ -45,12 +45,12 @@ def options(model=CASE_1, **more):
 
 @pytest.fixture(scope="module")
 def prepared():
-    """One noisy record of the first benchmark, for tests that only read it."""
+    """Return a noisy record of the first benchmark, for tests that only read it."""
     return UsefulRedundancy(**options()).prepare(make_record(snr_db=5, seed=5, replicate=2))
 
 
 def same(one, two):
-    """Whether two fits agree bit for bit, with their searches."""
+    """Return whether two fits and their searches are bit-identical."""
     paths = [[(p.round, p.filter, p.delays.tolist(), p.costs.tolist()) for p in fit.paths] for fit in (one, two)]
     return (one.parameters, one.history, one.search, paths[0]) == (two.parameters, two.history, two.search, paths[1])
 
@@ -71,7 +71,7 @@ def test_noise_free_data_return_the_true_model_and_delay(model, regular, start):
 
 @pytest.mark.parametrize("start", [0.0, 3.0, 15.0, None])
 def test_every_start_leads_to_the_same_estimate(start):
-    # That of the plain search from right beside the true delay.
+    # The result of the plain search started very near the true delay.
     record = make_record(snr_db=5, regular=False)
     fit = UsefulRedundancy(**options()).fit(record, None if start is None else Start(start))
     near = TdSrivc(2, 0, BOUNDS).fit(record, Start(8.1))
@@ -81,7 +81,7 @@ def test_every_start_leads_to_the_same_estimate(start):
     assert fit.count == near.count
 
 
-# Data sets on which the plain search from the same start ends in a local minimum, with every one of these filters.
+# Data sets on which the plain search from the same start ends in a local minimum, for each of these filters.
 TRAPS = [
     (CASE_1, {"seed": 5, "replicate": 2, "snr_db": 15}, 3.0, [None, Lowpass(2.02, 10)]),
     (CASE_2, {"seed": 5, "replicate": 0, "snr_db": 15, "n": 4000}, 0.0, [None, Lowpass(2.685, 10), Lowpass(2.685, 2)]),
@@ -108,7 +108,7 @@ def test_bandwidth_is_estimated_where_it_is_not_given(regular):
     assert_same_model(fit.model, UsefulRedundancy(**options()).fit(record, Start(9.0)).model, 1e-6)
 
 
-# Of the costs -----------------------------------------------------------------------------------------
+# Costs ------------------------------------------------------------------------------------------------
 
 
 def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bounds():
@@ -119,18 +119,18 @@ def test_reference_cost_is_the_mean_of_the_members_on_a_lattice_within_the_bound
         for part in (-0.49, 0.0, 0.3, 0.49):
             assert reference_cost(prepared, (place + part) * step) == pytest.approx(mean, rel=1e-9)
         assert abs(reference_cost(prepared, (place + 0.51) * step) - mean) > 1e-3 * mean
-    # The lattice points next to both bounds lie outside of them, and are moved onto them.
+    # The lattice points next to both bounds are outside, and are moved onto the bounds.
     assert round(1.0 / step) * step < 1.0
     assert round(9.0 / step) * step > 9.0
     for bound in (1.0, 9.0):
         assert reference_cost(prepared, bound) == member_costs(prepared, bound).mean()
 
 
-# Of the search ----------------------------------------------------------------------------------------
+# Search -----------------------------------------------------------------------------------------------
 
 
 def test_starts_do_not_influence_one_another():
-    # Bit for bit, in any order, with one prepared record or one for each.
+    # Bit-identical in any order, with one prepared record or one for each.
     record = make_record(snr_db=5, seed=5, replicate=2, n=1500)
     estimator = UsefulRedundancy(**options())
     starts = [0.0, 9.0, 3.0]
@@ -148,14 +148,14 @@ def test_search_tells_how_it_went():
     fit = prepared.fit(Start(0.0))
     search, trajectory, on_lattice = fit.search, fit.search.trajectory, prepared.laid_out.filtered.on_lattice
     assert search.status.succeeded
-    # The first incumbent is the start, and every next one is better.
+    # The first incumbent is the start, and every later one is better.
     assert (trajectory[0].point, trajectory[0].round, trajectory[0].path) == (0.0, 0, -1)
     costs = [visit.cost for visit in trajectory]
     assert all(after < before for before, after in pairwise(costs))
     assert [visit.cost for visit in search.visits] == [reference_cost(prepared, v.point) for v in search.visits]
     assert (search.point, search.cost) == (trajectory[-1].point, trajectory[-1].cost)
     assert min(visit.cost for visit in search.visits) == search.cost
-    # Each round follows every filter from the incumbent, and candidates are the ends of those paths.
+    # Each round follows every filter from the incumbent; candidates are the ends of these paths.
     incumbents = {visit.round + 1: visit.point for visit in trajectory}
     for number in range(1, search.rounds + 1):
         followed = [path for path in fit.paths if path.round == number]
@@ -164,7 +164,7 @@ def test_search_tells_how_it_went():
         assert [on_lattice(path.delays[-1]) for path in followed] == [visit.point for visit in candidates]
         assert set(range(FILTERS[CASE_2])) == {path.filter for path in followed}
         assert {path.delays[0] for path in followed} == {incumbents[number]}
-    # On a path the cost of its own filter falls, and the delay stays within the bounds.
+    # On a path the cost of its filter decreases, and the delay stays within the bounds.
     for path in fit.paths:
         assert path.delays.shape == path.costs.shape
         assert (np.diff(path.costs) < 0).all()
@@ -175,7 +175,7 @@ def test_search_tells_how_it_went():
 
 
 def test_history_leads_from_incumbent_to_incumbent(prepared):
-    # Along the paths that led there, each step with its coefficients and their mean squared error behind that filter.
+    # The paths that led there: each step with its coefficients and their mean squared error after that filter.
     fit = prepared.fit(Start(3.0))
     trajectory = fit.search.trajectory
     assert len(trajectory) > 1
@@ -190,7 +190,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
         assert block[-1].delay == pytest.approx(after.point, abs=0.5 * LATTICE * prepared.laid_out.filtered.period)
         cost = prepared.laid_out.filtered.costs[after.path]
         for entry in block:
-            # A fit goes on from these coefficients.
+            # A fit can continue from these coefficients.
             theta = np.array([*entry.denominator[1:], *entry.numerator, entry.delay])
             assert cost.minimise(entry.delay, theta[None], False).squared_error <= entry.cost * (1 + 1e-9)
         assert (np.diff([entry.cost for entry in block]) < 0).all()
@@ -201,7 +201,7 @@ def test_history_leads_from_incumbent_to_incumbent(prepared):
 
 
 def test_where_no_path_leads_lower_the_next_valleys_are_looked_at():
-    # Two filters are too few for this start: J0 is above 25 % where they end, and paths start a period away from there.
+    # Two filters are too few for this start: J0 is above 25 % at their ends, and new paths start one period away.
     record = make_record(snr_db=5, seed=5, replicate=2, n=2500)
     fit = UsefulRedundancy(**options(filters=2, beta=2.0)).fit(record, Start(14.0))
     away = []

@@ -1,4 +1,4 @@
-"""Figures as they are drawn."""
+"""Capture of drawn figures."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from ctid_cli.reporting.figures.style import Drawing
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Matplotlib figures in the order in which they are drawn, in place of SVG files."""
+    """Return Matplotlib figures in drawing order, in place of SVG files."""
     from matplotlib.figure import Figure
 
     figures = []

@@ -1,7 +1,7 @@
-"""The four signals of the finite-time paper, by direct simulation.
+"""Four signals of the finite-time paper, by direct simulation.
 
-The signals are A: two tones without noise, B: with a third, unmodelled one, C: with uniform noise, D: with a step of
-both frequencies, read in two ways: the phase jumps with the frequency, or goes on.
+They are A: two tones without noise, B: with a third, unmodelled one, C: with uniform noise, D: with a step of
+both frequencies, in two interpretations: the phase jumps with the frequency, or is continuous.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ def clock(interval: float, duration: float) -> Array:
 
 
 def stepped(interval: float, duration: float = 90.0) -> tuple[Array, Array]:
-    """Frequencies of signal D, shape (N, 2), and the clock."""
+    """Return frequencies of signal D, shape (N, 2), and the clock."""
     t = clock(interval, duration)
     after = (t >= STEP - 1e-9)[:, None]
     return np.where(after, [2.0, 3.0], [1.8, 3.2]), t
 
 
 def from_frequencies(omega: Array, interval: float, *, jump: bool) -> Array:
-    """``sin + cos`` of two changing frequencies: ``w(t) t``, or the integral of w, as phase."""
+    """Return ``sin + cos`` of two changing frequencies: ``w(t) t``, or the integral of w, as phase."""
     t = interval * np.arange(len(omega))
     if jump:
         phase = omega * t[:, None]
@@ -51,7 +51,7 @@ def from_frequencies(omega: Array, interval: float, *, jump: bool) -> Array:
 
 
 def signal(name: str, interval: float, duration: float, seed: int | None = None, *, jump: bool = True) -> Array:
-    """One of the signals A to D; C with the noise of a seed."""
+    """Return one of the signals A to D; C with the noise of a seed."""
     t = clock(interval, duration)
     if name == "A":
         return np.asarray(np.sin(2 * t) + np.cos(3 * t))

@@ -1,4 +1,4 @@
-"""Figures of the study of additive models: what is drawn is what was computed or found."""
+"""Figures of the study of additive models: they show the computed and found values."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def test_figure_2_is_the_sum_of_its_submodels(drawn):
     (_, phase), *others = content(below)
     assert not others
     assert phase == pytest.approx(np.rad2deg(np.unwrap(np.angle(response))), abs=1e-6)
-    # The static gains in dB, and resonances where the printed poles are.
+    # Static gains in dB, and resonances at the printed poles.
     assert [values[0] for _, values in content(above)] == pytest.approx(
         20 * np.log10([3, 0.4, 0.2, 0.05, 3.65]), abs=0.15
     )
@@ -87,8 +87,8 @@ def test_a_response_without_a_model_knows_the_hold():
     assert np.diff(frequencies) == pytest.approx(2 * np.pi / (count * h))
     assert frequencies[0] >= 0.5
     assert frequencies[-1] <= 60.0
-    # Half an interval of delay that the hold brings is 0.3 rad at the upper end. Images beyond half the sampling
-    # frequency are left, and what happened before the window.
+    # The hold's delay of half an interval is 0.3 rad at the upper end. The remaining errors are images beyond half the
+    # sampling frequency, and the response to the input before the window.
     error = np.abs(response - system.frequency_response(frequencies)) / np.abs(system.frequency_response(frequencies))
     assert np.median(error) < 0.01
     assert np.quantile(error, 0.9) < 0.05

@@ -1,4 +1,4 @@
-"""Errors of parameters: every number against another route, and who counts and who does not."""
+"""Errors of parameters: every number by a second method, and the counted estimates."""
 
 import numpy as np
 import pandas as pd
@@ -57,7 +57,7 @@ def test_errors_are_measured_beside_theory(plan, tmp_path):
     biased = (errors["estimator"] == "srivc") & (errors["parameter"] == "g2_a2")
     assert (errors["bias_per_error"][biased].abs() > 10).all()
     assert (errors["bias_per_error"][~biased].abs() < 4).all()
-    # Squares of normal errors scatter by the square root of 2 over the number of data sets.
+    # The relative scatter of mean squares of normal errors is the square root of 2 over the number of data sets.
     np.testing.assert_allclose(errors["ratio"][~biased], 1.0, atol=4 * np.sqrt(2 / 40))
 
 
@@ -82,10 +82,10 @@ def test_who_counts_and_who_does_not(plan, tmp_path):
 def test_a_ratio_is_that_of_pairs(plan, tmp_path):
     results = ideal_results(plan, tmp_path)
     stored = results.stored.results
-    # A data set on which one of the two has no value is left out for both.
+    # A data set without a value for one of the two is left out for both.
     lost = next(key for key in stored if key.replicate == 3 and key.estimator_hash == plan.estimators[1].hash)
     stored[lost] = estimate(None, status="FAILED")
-    # One that lacks a parameter has no value at all: every parameter counts the same data sets.
+    # An estimate that lacks a parameter has no values at all: every parameter counts the same data sets.
     partial = next(key for key in stored if key.replicate == 5 and key.estimator_hash == plan.estimators[0].hash)
     stored[partial] = estimate(stored[partial]["parameters"] | {"g1_a1": None})
     wide = results.errors[results.errors["parameter"] == "g2_b0"].pivot(
@@ -138,7 +138,7 @@ def test_theory_of_the_published_experiments():
     assert [found["clsrivc"][name] for name in NAMES] == pytest.approx(
         [0.22218, 0.090118, 14.683, 1.37704e-3, 2.49911e-5, 8.0467], rel=1e-4
     )
-    # White noise that is fed back is a second reference: 0.01 on top of 1.
+    # Noise in the loop acts as a second reference: 0.01 in addition to 1.
     assert [found["srivc"][name] for name in NAMES] == pytest.approx(
         [found["clsrivc"][name] / 1.01 for name in NAMES], rel=1e-9
     )

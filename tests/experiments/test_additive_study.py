@@ -1,4 +1,4 @@
-"""The study of additive models: its specifications are the published settings, and its checks tell right from wrong."""
+"""The study of additive models: specifications with the published settings, and checks that detect deviations."""
 
 import csv
 
@@ -18,7 +18,7 @@ from tests.storage.made_results import export_image
 STUDY = find_study("additive")
 measures = STUDY.module("measures")
 FILES = sorted(config.rpartition("/")[2] for config in STUDY.configs.values())
-#: What is found under coloured noise in closed loop.
+#: Biases found under coloured noise in closed loop.
 BIASES = {"g1_a1": -0.6, "g1_a2": -1.1, "g1_b0": -0.7, "g2_a1": -5.7, "g2_a2": 1.4, "g2_b0": -6.1}
 
 
@@ -90,7 +90,7 @@ def test_the_beam_is_the_printed_model_and_says_that_it_is_simulated():
 
 @pytest.fixture(scope="session")
 def ideal(tmp_path_factory):
-    """A study that came out as theory expects, with fewer data sets and numbers of samples."""
+    """Return a study with results as in theory, with fewer data sets and numbers of samples."""
     out = tmp_path_factory.mktemp("ideal")
     overrides = {
         "open_loop.yaml": ["sampling.samples=[5000, 20000, 50000]", "monte_carlo.runs=400"],
@@ -126,7 +126,7 @@ def failures(checks):
 
 @pytest.fixture
 def changed(study):
-    """Claims on the study with the errors of one experiment, or how its estimates ended, changed."""
+    """Return claims on the study with the errors or statuses of one experiment changed."""
 
     def claims_of(name, change):
         right = study[name]
@@ -158,7 +158,7 @@ def scaled(estimator, factor, shift=0.0):
 
 
 def stopped(estimator, least, count):
-    """The first estimates of each group did not converge."""
+    """Return a change in which the first estimates of each group did not converge."""
 
     def change(_, __, results):
         groups = measures.groups_of(results)

@@ -1,4 +1,4 @@
-"""The comparators of the frequency study: against SciPy and plain formulas, their convergence, and what they refuse."""
+"""Comparators of the frequency study: against SciPy and plain formulas, convergence, and refusals."""
 
 import sys
 
@@ -14,7 +14,7 @@ from tests.frequency.signals import INTERVAL, NO_TWO_TONES, NOISE, OMEGA, T, ton
 
 STUDY = find_study("finite-time-frequency")
 COMPARATORS = STUDIES / "finite_time_frequency" / "comparators"
-#: Loaded as specifications load them: Numba's caches know the modules by the names that they have then.
+#: Loaded as from specifications, so that the module names match Numba's caches.
 Observer, Filter, Esprit, Nonlinear = (
     find_class(f"./{kind}", COMPARATORS)
     for kind in (
@@ -62,7 +62,7 @@ def test_the_filter_converges_with_the_square_of_the_interval(n):
         track = Filter(tones=n, pole=3.0).track(y, INTERVAL / finer)
         errors.append(np.abs(track.frequencies[-1] - OMEGA[n]).max())
         assert track.valid[-3000 * finer :].all()
-    # Lines between the samples are all that is wrong with it.
+    # The only error is the interpolation by straight lines between the samples.
     assert errors[0] < 1e-3
     assert 3.0 < errors[0] / errors[1] < 9.0
 

@@ -1,4 +1,4 @@
-"""A small version of the coverage study: true standard errors cover, and the wrong formula is caught."""
+"""A small version of the coverage study: correct standard errors cover, and a wrong formula is detected."""
 
 import pandas as pd
 import pytest
@@ -40,7 +40,7 @@ def test_intervals_cover_within_the_binomial_band(summary, row, formula):
     least = stats.binom.ppf(1e-4, RUNS, 0.95)
     assert 48 <= least < RUNS
     assert (lines["covered"] >= least).all()
-    # Intervals that are too wide cover as well: the standard errors must match the scatter, known to about 9 %.
+    # Intervals that are too wide cover too: standard errors must match the scatter, known to about 9 %.
     assert lines["standard_error_ratio"].between(0.7, 1.4).all()
 
 
@@ -79,7 +79,7 @@ def test_published_intervals_of_default_settings_cover():
     bounded = together[(together["input"] == "prbs") | (together["snr_db"] == 30.0)]
     assert len(bounded) == 8
     assert bounded["percent"].between(92.0, 98.0).all()
-    # Where intervals of such records cover less than nine in ten, the fit says so.
+    # If intervals of such records cover less than nine in ten, the fit warns.
     short = lines[(lines["system"] != "all") & (lines["percent"] < 90.0) & (lines["snr_db"] == 30.0)]
     assert len(short) == 2
     assert (short["called_unsafe"] > 0.9 * short["runs"]).all()

@@ -1,4 +1,4 @@
-"""Figures of the studies: what is drawn follows from the theory and from the search, and the same bytes come twice."""
+"""Figures of the studies: they follow from theory and search, and are reproducible to the byte."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -18,7 +18,7 @@ COARSE = np.unique(np.concatenate([np.arange(0.0, 15.1, 0.5), np.linspace(7.4, 8
 
 
 class Recorder:
-    """Axes in place of matplotlib's that keep what is drawn."""
+    """Axes that record what is drawn, in place of matplotlib's."""
 
     def __init__(self):
         self.lines = {}
@@ -42,7 +42,7 @@ def quiet():
 
 @pytest.fixture(scope="session")
 def switching():
-    """One step on each path: the search has to change the filter."""
+    """Return one step on each path, so that the search has to change the filter."""
     return computed(CASE_2, True, np.array([0.0, 4.0, 7.9, 7.98, 8.0, 8.02, 8.1, 12.0, 15.0]), max_iterations=1)
 
 

@@ -1,4 +1,4 @@
-"""The study of finite-time frequency estimation: its specifications, what is measured, claimed and published."""
+"""The study of finite-time frequency estimation: specifications, measures, claims and publication."""
 
 import csv
 
@@ -57,10 +57,10 @@ def test_experiments_with_noise_have_data_sets_of_their_own():
     assert len(set(seeds)) == 3
 
 
-# What the runs say ---------------------------------------------------------------------------------------
+# Results of the runs -------------------------------------------------------------------------------------
 
 COARSE = ("sampling.interval=0.01",)
-#: Longer averages for the estimators of whole records, which are fast then.
+#: Longer averages for the estimators of whole records, which are then fast.
 BLOCKS = ("estimators.esprit.averaging=0.2", "estimators.nonlinear_least_squares.averaging=0.2")
 
 
@@ -73,7 +73,7 @@ def out(tmp_path_factory):
     run_here("random", folder, [*COARSE, *BLOCKS, "monte_carlo.runs=3"])
     finer = "sampling.interval=0.005"
     run_here("recovery", folder, [finer])
-    # As much noise in every second as with the published clock.
+    # The same noise power per second as with the published clock.
     run_here("recovery-in-noise", folder, [finer, "monte_carlo.runs=2", "disturbance.variance=0.0026667"])
     run_here("efficiency", folder, [finer, *BLOCKS, "monte_carlo.runs=8"])
     return folder
@@ -158,7 +158,7 @@ def test_efficiency_is_the_error_of_the_last_estimate_over_the_bound(study):
 def test_the_monte_carlo_error_is_that_of_normal_errors():
     rng = np.random.default_rng(1)
     assert measured.monte_carlo_error(rng.standard_normal(100_000)) == pytest.approx(1 / np.sqrt(2e5), rel=0.05)
-    # A bias that is large and known adds none.
+    # A large known bias adds no error.
     assert measured.monte_carlo_error(100 + rng.standard_normal(10_000)) == pytest.approx(0.01, rel=0.05)
 
 
@@ -168,10 +168,10 @@ def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     assert {name: len(found) for name, found in by_experiment.items()} == {
         "two-tones": 8, "harmonic": 3, "random": 1, "step": 10, "recovery": 6, "recovery-in-noise": 6, "efficiency": 5,
     }  # fmt: skip
-    # On a coarser clock and with few data sets most of them hold as well.
+    # On a coarser clock and with few data sets most of them hold too.
     for name in ("two-tones", "step", "recovery", "recovery-in-noise"):
         missed = [claim.claim for claim in by_experiment[name] if not claim.holds]
-        # The regression behind filters is not that exact with ten times fewer samples.
+        # Regression with filters is less exact with ten times fewer samples.
         assert missed == (["filter within 0.001 [s]"] if name == "two-tones" else [])
     late = measured.recovery(study["recovery"]).assign(longest=np.nan)
     monkeypatch.setattr(claims, "recovery", lambda _: late[late["estimator"] == "window"])
@@ -179,7 +179,7 @@ def test_claims_are_judged_on_stored_runs(study, monkeypatch):
     assert [claim.measured for claim in missed] == ["inf", "inf"]
 
 
-# What is published ---------------------------------------------------------------------------------------
+# Publication ---------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Figures of the study of finite-time frequency estimation: what is drawn is what was found."""
+"""Figures of the study of finite-time frequency estimation: they show the found values."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from tests.reporting.frequency_results import STUDY, run_here
 
 figures = STUDY.module("figures")
 NAMES = ("two-tones", "harmonic", "random", "step")
-#: A slow clock and short records; the step must come before their end.
+#: A slow clock and short records; the step must occur before their end.
 SHORT = ("sampling.interval=0.01", "sampling.duration=33", "success.window=[28, 33]", "monte_carlo.runs=2")
 
 

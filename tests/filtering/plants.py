@@ -1,4 +1,4 @@
-"""Models that several tests take, and what they are made of."""
+"""Models shared by several tests."""
 
 from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.transfer_function import TransferFunction

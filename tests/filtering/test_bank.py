@@ -1,4 +1,4 @@
-"""The standard rows and their second moments: two routes to each of them."""
+"""Standard rows and their second moments, each by two methods."""
 
 import numpy as np
 import pytest
@@ -21,13 +21,13 @@ SYSTEMS = [CASE_1, CASE_2, RELATIVE_DEGREE_ONE, FIRST_ORDER, REPEATED]
 #: Partial fractions exist for simple poles only; numerically a triple pole is three close ones.
 FORMS = [(system, "chain") for system in SYSTEMS] + [(system, "modal") for system in SYSTEMS[:-1]]
 HOLDS = st.sampled_from(["zoh", "foh"])
-#: Beside zero none so short that the codes for the two clocks may see it on different sides of a jump of the input.
+#: Zero, or delays so long that both clocks' codes place them on the same side of a jump of the input.
 DELAYS = st.just(0.0) | st.floats(1e-6, 20)
 
 
 @st.composite
 def systems(draw):
-    """Stable systems of order 1 to 5 whose poles lie at least 10 % apart."""
+    """Draw stable systems of order 1 to 5 whose poles lie at least 10 % apart."""
     poles, magnitude = [], draw(st.floats(0.1, 0.5))
     order = draw(st.integers(1, 5))
     while len(poles) < order:
@@ -42,7 +42,7 @@ def systems(draw):
 
 
 def record(seed, n=400, interval=0.1, hold="zoh", regular=True, own_breaks=False):
-    """Noise in, noise out: the equalities below hold for any data."""
+    """Return a record of noise: the equalities below hold for any data."""
     rng = np.random.default_rng(seed)
     t = 3.0 + (interval * np.arange(n) if regular else np.cumsum(rng.uniform(0.2, 1.8, n)) * interval)
     tu = 3.0 + np.concatenate(([0.0], np.cumsum(rng.uniform(0.5, 9, n // 3)) * interval)) if own_breaks else t
@@ -50,7 +50,7 @@ def record(seed, n=400, interval=0.1, hold="zoh", regular=True, own_breaks=False
 
 
 def assert_close(rows, expected, tolerance, where=""):
-    """Each column to a fraction of its own size."""
+    """Compare columns relative to their sizes."""
     size = np.abs(expected).max(axis=0)
     error = np.abs(rows - expected).max(axis=0) / np.where(size > 0, size, 1.0)
     assert error.max() <= tolerance, f"{where} column {error.argmax()}: {error.max():.1e}"
@@ -61,7 +61,7 @@ def test_irregular_code_on_a_regular_clock_is_the_regular_code(system, delay, ho
     regular = filter_data(record(seed, hold=hold), 2.0, hold_output)
     irregular = regular._replace(interval=0.0)
     assert regular.interval > 0.0
-    # Partial fractions of three poles that are 10 % apart lose some digits.
+    # Partial fractions of three poles 10 % apart lose some digits.
     assert_close(standard_rows(irregular, *system, delay, form), standard_rows(regular, *system, delay, form), 1e-9)
 
 
@@ -70,14 +70,14 @@ def test_partial_fractions_and_the_chain_are_one_filter(system, delay, hold, hol
     data = filter_data(record(seed, hold=hold, regular=regular, own_breaks=not regular), 0.0, hold_output)
     expected = standard_rows(data, *system, delay, "chain")
     assert_close(standard_rows(data, *system, delay, "modal"), expected, 1e-8)
-    # What is taken by default is never the worse one of the two by much.
+    # The default form is never much worse than the better one.
     assert_close(standard_rows(data, *system, delay), expected, 1e-9)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize("delay", [0.0, 0.37, 60.0])
 def test_very_different_steps_are_taken_together(hold, delay):
-    # Hundreds of breaks between two samples, hundreds of samples between two breaks, and a gap that forgets all.
+    # Hundreds of breaks between two samples, hundreds of samples between two breaks, and a gap longer than the memory.
     rng = np.random.default_rng(3)
     t = np.sort(np.concatenate((rng.uniform(0, 1, 300), rng.uniform(1, 50, 40), rng.uniform(1e4, 1e4 + 50, 300))))
     tu = np.sort(np.concatenate(([-1.0], rng.uniform(0, 1, 3), rng.uniform(1, 50, 9000), rng.uniform(9900, 10060, 60))))
@@ -144,7 +144,7 @@ def test_paths_for_simple_and_for_repeated_poles_agree_near_coalescence(partner,
 
 @pytest.mark.parametrize("cluster", [1e-1, 1e-3, 1e-5, 1e-7])
 def test_close_fast_poles_beside_a_slow_one_lose_no_accuracy(cluster):
-    # At low frequencies the fast poles hardly show, so that their cancellation must be judged at high ones.
+    # At low frequencies the fast poles have no effect, so their cancellation must be tested at high ones.
     a = np.poly([-0.05, -100.0, -100.0 * (1 + cluster)])
     data = filter_data(record(4, n=4000, interval=0.01, hold="foh"))
     expected = standard_rows(data, a, a[-1:], 0.123, "chain")
@@ -155,7 +155,7 @@ def test_close_fast_poles_beside_a_slow_one_lose_no_accuracy(cluster):
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 def test_poles_far_slower_than_the_sampling_lose_no_accuracy(hold, regular, slowness):
-    # Against the simulator, which the tests beside this one hold against high-precision arithmetic.
+    # Against the simulator, which other tests compare with high-precision arithmetic.
     a = np.poly([-slowness, -3.0])
     r = record(5, n=2000, hold=hold, regular=regular)
     rows = standard_rows(filter_data(r), a, a[-1:], 0.123)

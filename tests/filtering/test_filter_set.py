@@ -36,7 +36,7 @@ def test_extrema_solve_their_equation_and_alternate():
     curvature = ideal_cost(exact + step, cutoff) - 2 * ideal_cost(exact, cutoff) + ideal_cost(exact - step, cutoff)
     assert (curvature[::2] < 0).all()
     assert (curvature[1::2] > 0).all()
-    # none is left out: neighbours are half a period apart, and the first valley begins at zero
+    # no extremum is missing: neighbours are half a period apart, and the first valley begins at zero
     assert (np.diff(x) > np.pi).all()
     assert (np.diff(x) < 1.03 * np.pi).all()
     assert x[0] == pytest.approx(4.493409457909064, rel=1e-15)
@@ -90,7 +90,7 @@ def test_impossible_sets_are_refused(options, message):
 
 
 def descents(cutoff, errors):
-    """Where descents of the sampled ideal cost end, from every point of a grid that begins at zero."""
+    """Return the ends of descents of the sampled ideal cost, from every point of a grid that begins at zero."""
     cost = ideal_cost(errors, cutoff)
     follow = np.arange(errors.size)
     lower, upper = cost[:-2] < cost[1:-1], cost[2:] < cost[1:-1]
@@ -129,7 +129,7 @@ def test_check_against_descents_on_a_grid(filters, largest):
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_second_case(exact):
-    # Adequacy does not grow with the number of filters: nine fail where seven pass.
+    # Adequacy is not monotonic in the number of filters: nine fail and seven pass.
     passing = [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 15.0, exact).passes]
     assert passing == [7, 8, 10, 11, 12, 13, 14, 15]
     assert [n for n in range(2, 16) if check_filters(FilterSet(26.85, n).cutoffs, 8.0, exact).passes] == [*range(7, 16)]
@@ -169,7 +169,7 @@ def test_paths_descend(cutoffs, largest, fraction):
     for k, end in check.path(error):
         assert abs(end) < abs(error)
         assert end * error >= 0
-        # a descent: the filter's cost falls all the way
+        # a descent: the filter's cost decreases all the way
         way = ideal_cost(np.linspace(error, end, 200), cutoffs[k])
         assert (np.diff(way) <= 1e-12 * cutoffs[k]).all()
         error = end

@@ -29,7 +29,7 @@ def initial(terms):
 
 
 def by_exponentials(theta, free, terms):
-    """Impulse response of C/(p^l A) of each submodel, from its companion matrix."""
+    """Return the impulse response of C/(p^l A) of each submodel, from its companion matrix."""
     total = np.zeros(ELAPSED.size)
     for part in AdditiveModel.from_theta(theta, terms).submodels:
         n = part.order
@@ -48,7 +48,7 @@ def test_response_is_that_of_the_matrix_exponential(terms, theta):
     x, _, by_free = free_response(theta, free, terms, ELAPSED)
     expected = by_exponentials(theta, free, terms)
     np.testing.assert_allclose(x, expected, atol=1e-11 * np.abs(expected).max())
-    # It is linear in its parameters.
+    # The response is linear in its free parameters.
     np.testing.assert_allclose(by_free @ free, x, atol=1e-12 * np.abs(expected).max())
 
 

@@ -1,4 +1,4 @@
-"""The closed loop against python-control, against step-by-step simulation and against known numbers."""
+"""The closed loop against python-control, step-by-step simulation and known numbers."""
 
 import control
 import numpy as np
@@ -17,7 +17,7 @@ from tests.filtering.plants import parts, with_delay
 INTERVAL = 0.05
 TWO_MODES = AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])])
 PID = DiscreteController([0.02329, -0.02058, 0.00454], [1.0, -1.0, 0.0])
-# A rigid body with a flexible mode, a derivative with a lag, and a plant that passes its input on at once.
+# A rigid body with a flexible mode, a filtered derivative, and a plant with a direct feedthrough.
 RIGID = AdditiveModel([Submodel([0.5], [1.0], 2), Submodel([0.1], [0.01, 0.002, 1.0])])
 LEAD = DiscreteController([2.0, -1.9], [1.0, -0.4])
 BIPROPER = AdditiveModel([Submodel([0.4, 1.0], [0.5, 1.0]), Submodel([1.0], [0.025, 0.05, 1.0])])
@@ -120,7 +120,7 @@ def test_what_cannot_be_simulated_is_refused():
 
 @pytest.mark.parametrize("gain", [-1.25, -1.25 * (1 + 1e-14)])
 def test_an_algebraic_loop_without_solution_is_refused(gain):
-    # Direct gains of 0.8 and -1.25 round the loop, which a delay breaks open.
+    # Direct loop gains of 0.8 and -1.25; a delay removes the algebraic loop.
     opposite = DiscreteController([gain], [1.0])
     late = AdditiveModel(BIPROPER.submodels, INTERVAL)
     for function in (

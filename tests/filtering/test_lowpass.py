@@ -25,7 +25,7 @@ def record(hold="zoh", regular=True, n=1000):
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize("order", [1, 2, 10])
 def test_filter_commutes_with_the_system_on_a_regular_clock(order, hold):
-    # G L u = L G u: both are linear and time-invariant on the samples (a linear hold must rise from zero).
+    # G L u = L G u: both are linear and time-invariant on the samples (a linear hold must start at zero).
     filtered = Lowpass(0.5, order).apply(record(hold))
     assert filtered.input.hold == hold
     expected = simulate(CASE_1, filtered.input, filtered.t)
@@ -51,7 +51,7 @@ def test_irregular_records_pass_through_the_analogue_filter():
     assert filtered.input.hold == "foh"
     np.testing.assert_array_equal(filtered.input.values, simulate(model, r.input, r.t))
     np.testing.assert_array_equal(filtered.y, simulate(model, HeldSignal(r.t, r.y, "foh"), r.t))
-    # The system hardly sees the rest of the error: smooth signals lie close to the lines between their samples.
+    # The system suppresses the rest of the error: smooth signals are close to the lines between their samples.
     error = simulate(CASE_1, filtered.input, r.t) - filtered.y
     assert np.abs(error).max() < 2e-3 * np.abs(filtered.y).max()
 

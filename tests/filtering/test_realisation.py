@@ -1,4 +1,4 @@
-"""The pieces below the filters: roots, chains of sections and matrix exponentials."""
+"""Building blocks of the filters: roots, chains of sections and matrix exponentials."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_roots_of_a_product_are_its_factors(poles):
     roots = polynomial_roots(np.poly(poles).real)
     roots = roots[np.lexsort((-roots.imag, -np.abs(roots).round(9)))]
     np.testing.assert_allclose(roots, expected, rtol=1e-10, atol=1e-15)
-    # Conjugates exactly, so that no imaginary part survives in a sum.
+    # Exact conjugates, so that imaginary parts cancel in a sum.
     for k in range(len(roots)):
         if roots[k].imag > 0:
             assert roots[k + 1] == roots[k].conjugate()
@@ -38,7 +38,7 @@ def test_roots_of_a_product_are_its_factors(poles):
 @pytest.mark.parametrize("poles", [*POLES[:-1], [-1.0, -1.0, -1.0], [-1 + 2j, -1 - 2j, -1 + 2j, -1 - 2j]])
 def test_chain_has_the_transfer_functions_of_its_rows(poles):
     # Row k of the map over the states: s^k/A(s) at points off the poles.
-    roots = np.array(sorted(poles, key=lambda p: -abs(p)), complex)  # pairs stay side by side
+    roots = np.array(sorted(poles, key=lambda p: -abs(p)), complex)  # pairs stay adjacent
     dynamics, gain, powers = chain(roots)
     for s in (0.3j, 2.0 + 1j, 7j):
         response = powers @ np.linalg.solve(s * np.eye(roots.size) - dynamics, gain)
@@ -57,7 +57,7 @@ def test_exponential_equals_that_of_scipy(size, exponent, seed):
 
 
 def test_small_exponents_keep_their_digits():
-    # exp(x) - 1 beside a fast mode, where the difference of rounded numbers would hold nothing.
+    # exp(x) - 1 together with a fast mode, where the difference of rounded numbers has no correct digits.
     result = exponential_minus_identity(np.diag([-1e6, -1e-9]))
     assert result[1, 1] == pytest.approx(np.expm1(-1e-9), rel=1e-13)
     assert result[0, 0] == -1.0

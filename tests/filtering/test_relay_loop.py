@@ -1,4 +1,4 @@
-"""Loops with a relay: the equations that their signals satisfy, and the limit cycle that theory gives."""
+"""Relay loops: equations satisfied by their signals, and the theoretical limit cycle."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_every_signal_satisfies_its_equation(delay, enters):
 
 
 def test_the_limit_cycle_is_that_of_a_first_order_system_with_delay():
-    """Exact: after a switch the output runs on for the delay, and then to the other side until it has crossed."""
+    """The limit cycle is exact: after a switch the output continues for the delay, then turns until it has crossed."""
     gain, T, delay, h = 2.0, 1.5, 0.5, 0.001
     zeros = np.zeros(40_000)
     u, x = simulate_loop(TransferFunction([gain], [T, 1.0], delay), Relay(1.0, hysteresis=0.1), zeros, zeros, h)

@@ -23,7 +23,7 @@ SYSTEMS = {
 
 
 def on_fine_grid(seed, hold):
-    """An irregular input, a delay and irregular instants, all multiples of one small step."""
+    """Return an irregular input, a delay and irregular instants, all multiples of one small step."""
     rng = np.random.default_rng(seed)
     breaks = np.cumsum(rng.integers(1, 60, 25))
     delay = int(rng.integers(1, 300))
@@ -35,7 +35,7 @@ def on_fine_grid(seed, hold):
 @pytest.mark.parametrize("hold", ["zoh", "foh"])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_equals_another_simulator_on_a_grid_that_holds_everything(name, hold):
-    # It is exact there: every instant, edge and delay is a multiple of its step.
+    # The discretisation is exact: every instant, edge and delay is a multiple of its step.
     numerator, denominator = SYSTEMS[name]
     breaks, values, delay, instants, held = on_fine_grid(1, hold)
     fine = np.arange(instants[-1] - breaks[0] - delay + 2)
@@ -54,7 +54,7 @@ def test_equals_another_simulator_on_a_grid_that_holds_everything(name, hold):
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_delay_moves_the_input(name, regular):
-    # G exp(-s tau) u(t) = G u(t - tau), for a delay of whole intervals and any other one.
+    # G exp(-s tau) u(t) = G u(t - tau), for delays of whole intervals and others.
     rng = np.random.default_rng(2)
     t = 0.1 * np.arange(200.0) if regular else np.cumsum(rng.uniform(0.02, 0.2, 200))
     held = HeldSignal(t, rng.standard_normal(200))
@@ -65,7 +65,7 @@ def test_a_delay_moves_the_input(name, regular):
 
 
 def elementary_responses(kind, hold):
-    """Coefficients of the steps and ramps whose sum is the held signal, and the instants where they begin."""
+    """Return the coefficients and start times of the steps and ramps whose sum is the held signal."""
     rng = np.random.default_rng(5)
     breaks = (
         np.concatenate(([0.0], np.cumsum(rng.uniform(0.001, 300, 12)))) if kind == "irregular" else 37.5 * np.arange(24)
@@ -81,7 +81,7 @@ def elementary_responses(kind, hold):
 
 
 def superposed(step_response, ramp_response, held, steps, ramps, times, delay):
-    """Sum of delayed step and ramp responses."""
+    """Return the sum of delayed step and ramp responses."""
     out = []
     for time in times:
         total = mp.mpf(0)
@@ -102,7 +102,7 @@ STIFF = {
 
 
 def horner(coefficients, point):
-    """Value and derivative of a polynomial."""
+    """Return value and derivative of a polynomial."""
     value, slope = mp.mpf(0), mp.mpf(0)
     for coefficient in coefficients:
         slope = slope * point + value
@@ -111,7 +111,7 @@ def horner(coefficients, point):
 
 
 def newton(coefficients, root):
-    """The exact root of rounded coefficients next to a root of the exact ones."""
+    """Return the exact root of rounded coefficients next to a root of the exact ones."""
     for _ in range(8):
         value, slope = horner(coefficients, root)
         root -= value / slope
@@ -173,7 +173,7 @@ def test_gain_without_poles_passes_the_input_on():
 
 
 def test_inputs_that_end_early_keep_their_last_value():
-    # First order to a unit step: 1 - exp(-t), however many breaks repeat the value.
+    # First-order response to a unit step: 1 - exp(-t), also if breaks repeat the value.
     times = np.array([0.5, 3.0, 40.0])
     for breaks in ([0.0], [0.0, 0.1, 0.7]):
         x = simulate(TransferFunction([1.0], [1.0, 1.0]), HeldSignal(breaks, np.ones(len(breaks))), times)

@@ -1,4 +1,4 @@
-"""Finite-record spectra against quadrature of the held signals themselves, and what sampling does to the output's."""
+"""Spectra of finite records against quadrature of the held signals, and effects of sampling on the output."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
 def quadrature(function, breaks, window, frequencies):
-    """``1/T int v exp(-jw(t - t0)) dt`` by Gauss's rule between the breaks: exact to rounding for short pieces."""
+    """Return ``1/T int v exp(-jw(t - t0)) dt`` by Gauss's rule between the breaks: exact up to rounding."""
     start, end = window
     edges = np.unique(np.concatenate((breaks[(breaks > start) & (breaks < end)], window)))
     middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
@@ -37,8 +37,8 @@ def noisy_record(hold="zoh", regular=True, n=800, input_times=None):
 @pytest.mark.parametrize("regular", [True, False])
 @pytest.mark.parametrize("start", [9.0, 2.0])
 def test_delayed_input_is_integrated_exactly(regular, hold, start):
-    # With a start of 2 s the longer delays reach back before the first break, where the input is zero. The first and
-    # last delay, multiples of the interval and arbitrary ones; asked for in an order that mixes both ends.
+    # With a start of 2 s the longer delays reach back before the first break, where the input is zero. The delays, in
+    # mixed order, are the first and last possible ones, multiples of the interval and arbitrary ones.
     record = noisy_record(hold, regular)
     spectra = record_spectra(record, start, 6.0, 9.0)
     u = record.input
@@ -50,7 +50,7 @@ def test_delayed_input_is_integrated_exactly(regular, hold, start):
 
 @pytest.mark.parametrize("regular", [True, False])
 def test_output_is_integrated_as_straight_lines_and_undamped(regular):
-    # Ends of the window in value and slope are as they are; the rest is divided by the mean of sinc^2.
+    # Value and slope at the ends of the window are not changed; the rest is divided by the mean of sinc^2.
     record = noisy_record(regular=regular)
     spectra = record_spectra(record, 3.217, 6.0, 3.0)
     (a, b), w = spectra.window, spectra.frequencies[1:]
@@ -58,7 +58,7 @@ def test_output_is_integrated_as_straight_lines_and_undamped(regular):
     inside = record.t[record.t >= a]
     h = np.diff(inside)
     damping = (np.sinc(np.outer(w, h) / (2 * np.pi)) ** 2 @ h) / h.sum()
-    # Up to the rounding of the sums; intervals of many lengths are taken together.
+    # Up to rounding of the sums; irregular intervals are grouped by length.
     tolerance = h.size * np.finfo(float).eps if regular else 1e-5
     np.testing.assert_allclose(spectra.damping, np.append(1.0, damping), rtol=tolerance)
     np.testing.assert_allclose(1 - spectra.damping[1:], 1 - damping, rtol=1e-3)
@@ -71,7 +71,7 @@ def test_output_is_integrated_as_straight_lines_and_undamped(regular):
 
 @pytest.mark.parametrize(("regular", "bound"), [(True, 2e-5), (False, 1e-3)])
 def test_smooth_outputs_keep_their_spectrum(regular, bound):
-    # Waves between the bins, a drift and a curvature: nothing of it is periodic in the window.
+    # Waves between the bins, a drift and a curvature: no part is periodic in the window.
     def smooth(t):
         return np.sin(2.3 * t) + 0.3 * np.cos(5.1 * t + 1) + 0.2 * t - 0.004 * t**2
 
@@ -86,7 +86,7 @@ def test_smooth_outputs_keep_their_spectrum(regular, bound):
 
 
 def test_missing_samples_are_left_out():
-    # As if the record had been sampled without them; masked ends shorten the window.
+    # Equal to a record sampled without the masked samples; masked ends shorten the window.
     record = noisy_record("foh")
     y = record.y.copy()
     missing = np.r_[0:100, 300, 301, 440, 790:800]

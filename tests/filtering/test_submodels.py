@@ -1,4 +1,4 @@
-"""The rows of a sum of submodels: the compiled pass, the general route, and what a simulation says."""
+"""Rows of a sum of submodels: compiled pass, general method, and direct simulation."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record
 
 INTERVAL = 0.1
-#: Sums of every kind of submodel; the numbers are a_1 … a_n, b_0 … b_m of each in turn.
+#: Sums with every kind of submodel; the numbers are a_1 … a_n, b_0 … b_m of each in turn.
 SUMS = {
     "real pole": ([Term(1, 0)], [0.7, 2.0]),
     "mode": ([Term(2, 0)], [0.1, 0.25, 2.0]),
@@ -47,7 +47,7 @@ NO_DIRECT = DiscreteController([0.1, -0.02], [1.0, -0.5, 0.06])
 
 
 def record(seed=1, n=300, hold="zoh", interval=INTERVAL, masked=()):
-    """Noise in, noise out: the equalities below hold for any data."""
+    """Return a record of noise: the equalities below hold for any data."""
     rng = np.random.default_rng(seed)
     t = 3.0 + interval * np.arange(n)
     y = rng.standard_normal(n)
@@ -56,12 +56,12 @@ def record(seed=1, n=300, hold="zoh", interval=INTERVAL, masked=()):
 
 
 def feedback(controller, n, enters="controller", seed=7):
-    """A loop laid out for the pass."""
+    """Return a loop in the layout of the pass."""
     return LoopData(np.random.default_rng(seed).standard_normal(n), controller, enters == "controller")
 
 
 def assert_rows(rows, expected, tolerance):
-    """psi, phi, error and output, or some of them: each column to a fraction of its rms."""
+    """Compare psi, phi, error and output, or some of them: each column relative to its rms."""
     for place, (one, other) in enumerate(zip(rows, expected, strict=True)):
         one, other = one.reshape(len(one), -1), other.reshape(len(other), -1)
         assert one.shape == other.shape
@@ -77,7 +77,7 @@ def output_of(terms, theta, delay, signal, times):
 
 
 def central_differences(response, theta):
-    """Derivatives of a response by extrapolated central differences."""
+    """Return derivatives of a response by extrapolated central differences."""
     columns = []
     for k in range(theta.size):
         step = np.zeros(theta.size)
@@ -115,7 +115,7 @@ def test_compiled_pass_is_the_general_route_for_any_sum(draw, delay, hold_output
 @pytest.mark.parametrize(("hold", "hold_output"), [("zoh", "foh"), ("foh", "zoh")])
 @ALL_SUMS
 def test_rows_are_the_signals_that_a_simulation_gives(terms, theta, hold, hold_output, delay):
-    # Each row by its definition: a transfer function applied to the input, or to what the others leave of the output.
+    # Definition of the rows: transfer functions applied to the input, or to the output minus the other submodels.
     r = record(n=120, hold=hold)
     data = filter_data(r, delay, hold_output)
     model = AdditiveModel.from_theta(theta, terms, delay)
@@ -144,7 +144,7 @@ def test_rows_are_the_signals_that_a_simulation_gives(terms, theta, hold, hold_o
 def test_closed_loop_instruments_are_sensitivities_to_the_input_of_the_loop_of_the_model(
     terms, theta, controller, enters, delay
 ):
-    # Derivatives of G(theta) z where z, the input of the noise-free loop, stays what it is; regressors see the record.
+    # Derivatives of G(theta) z with fixed z, the input of the noise-free loop; the regressors use the record.
     # With a biproper submodel, no delay and a controller that acts at once, the loop is algebraic.
     r = record(n=200)
     data = filter_data(r, delay)
@@ -189,7 +189,7 @@ def test_clock_that_is_not_recognised_as_regular_gives_the_same(terms, theta):
 @pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("gap", [1e-1, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 0.0])
 def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
-    # (p + 2)(p + 2 + gap), with an oscillating submodel beside it: the rows hardly notice.
+    # (p + 2)(p + 2 + gap), with an oscillating submodel: the rows hardly change.
     polynomial = np.poly([-2.0, -2.0 - gap])
     theta = np.array([*(polynomial / polynomial[-1])[-2::-1], 1.0, 0.2, 0.1, 0.05, 0.4])
     terms = [Term(2, 1), Term(2, 0)]
@@ -202,7 +202,7 @@ def test_repeated_poles_are_the_limit_of_separate_ones(gap, closed):
 @pytest.mark.parametrize(("closed", "hold", "delay"), [(False, "zoh", 0.37), (False, "foh", 0.0), (True, "zoh", 0.37)])
 @ALL_SUMS
 def test_free_responses_add_to_the_forced_ones(terms, theta, delay, hold, closed):
-    # The error falls by the free response, and psi has its sensitivities: -d eps in open loop, all parameters included.
+    # The error decreases by the free response, and psi has its sensitivities: -d eps in open loop, for all parameters.
     data = filter_data(record(n=200, hold=hold), delay)
     loop = feedback(WEAK, 200) if closed else OPEN_LOOP
     forced = SubmodelFilter(data, terms, delay, loop)
@@ -249,7 +249,7 @@ def test_parameters_without_a_finite_response_give_nothing(theta, initial_state,
 
 @pytest.mark.parametrize("polynomial", [[1.0, 4.0, 4.0], [1.3, 4.0, 4.0]], ids=["double pole", "two poles"])
 def test_loop_that_grows_beyond_all_numbers_gives_nothing(polynomial):
-    # Whichever of the two routes simulates it: an iteration halves its step then.
+    # In both methods of simulation: an iteration then halves its step.
     theta = np.array([polynomial[1], polynomial[0], 50.0 * polynomial[2]]) / polynomial[2]
     loop = feedback(DiscreteController([3.0], [1.0]), 3000)
     assert SubmodelFilter(filter_data(record(n=3000)), [Term(2, 0)], 0.0, loop).moments(theta) is None

@@ -1,4 +1,4 @@
-"""Signals for the tests beside this file, the estimators that they try, and plain forms of their first steps."""
+"""Signals and estimators for the tests in this folder, and plain versions of the estimators' first steps."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ T = INTERVAL * np.arange(4000)
 CLEAN = np.sin(2 * T) + np.cos(3 * T)
 NOISE = np.random.default_rng(0).standard_normal(T.size)
 
-#: Two tones are asked for, and there is no right answer.
+#: Signals without two tones, for which no estimate is right.
 NO_TWO_TONES = {
     "zero": 0 * T,
     "constant": 0 * T + 2.5,
@@ -38,13 +38,13 @@ NO_TWO_TONES = {
 
 
 def tones(n, count, interval=INTERVAL, omega=None):
-    """The n sinusoids of a signal one by one, shape (count, n)."""
+    """Return the n sinusoids of a signal separately, shape (count, n)."""
     t = interval * np.arange(count)
     return AMPLITUDES[:n] * np.sin(np.outer(t, OMEGA[n] if omega is None else omega) + PHASES[:n])
 
 
 def online_estimators(n=2):
-    """One of each kind, for n tones of the signals above, fit for a coarse clock."""
+    """Return one estimator of each kind, for n tones of the signals above, suitable for a coarse clock."""
     initial = tuple(OMEGA[n] * 1.1)
     common = {"tones": n, "h": 0.4}
     return [
@@ -58,7 +58,7 @@ def online_estimators(n=2):
 
 
 def regression_rows(y, n, lag):
-    """Regressand and regressors of a whole record; NaN where a sample is missing."""
+    """Return regressand and regressors of a whole record; NaN if a sample is missing."""
     rows = np.full((y.size, n + 1), np.nan)
     span = 2 * n * lag
     if y.size > span:
@@ -68,12 +68,12 @@ def regression_rows(y, n, lag):
 
 
 def frequencies_of(theta, delay):
-    """Frequencies that belong to the parameters of the delay regression, and their flags."""
+    """Return the frequencies for the parameters of the delay regression, and their flags."""
     theta = np.ascontiguousarray(theta, dtype=float)
     omega = np.empty(theta.size)
     return omega, Flag(decode(theta, clock_of(delay), np.empty(theta.size), omega))
 
 
 def clock_of(delay):
-    """A regression of which only the delay matters."""
+    """Return a regression for tests in which only the delay matters."""
     return Clock(1.0, 1, float(delay), 1, 1.0, 1)

@@ -1,4 +1,4 @@
-"""From parameters to frequencies and back, and how errors pass through."""
+"""Conversion between parameters and frequencies, and propagation of errors."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_frequencies_survive_the_round_trip(omega, delay):
     omega = np.array(omega)
     assume(omega.size == 1 or np.diff(omega).min() > 0.2)
     found, flags = frequencies_of(theta_of(omega, delay), delay)
-    # A root moves by the rounding of the coefficients over the product of its distances to the others.
+    # The error of a root is the rounding of the coefficients over the product of its distances to the others.
     c = np.cos(omega * delay)
     distances = [np.prod(np.delete(c[i] - c, i)) for i in range(omega.size)]
     slack = 1e-14 * 2.0**omega.size / np.abs(distances) / (delay * np.sin(omega * delay))
@@ -43,7 +43,7 @@ def test_real_roots_are_found_and_complex_ones_are_not(n, seed):
     pair = complex(rng.uniform(-1, 1), rng.uniform(0.05, 1))
     coefficients = np.poly([*wanted[:-2], pair, pair.conjugate()]).real
     assert not roots_of(coefficients)[0]
-    # Their real parts are shown.
+    # Their real parts are returned.
     omega, flags = frequencies_of(coefficients[1:], 1.0)
     assert flags == Flag.COMPLEX_ROOTS
     np.testing.assert_allclose(np.cos(omega), np.sort(np.roots(coefficients).real)[::-1], atol=1e-6)
@@ -72,7 +72,7 @@ LONG = 1e3
 
 
 def verdict(omega, share, *, span=LONG, elapsed=LONG, closeness=1.0):
-    """The verdict on a fit whose misfit can move a frequency by a share of itself, or of the distance to the next."""
+    """Return the verdict on a fit whose misfit can move a frequency by a fraction of itself, or of the distance."""
     omega, delay = np.array(omega), 0.7
     theta, n = theta_of(omega, delay), len(omega)
     phi = np.random.default_rng(n).standard_normal((200, n))
@@ -83,7 +83,7 @@ def verdict(omega, share, *, span=LONG, elapsed=LONG, closeness=1.0):
         derivatives = np.array(
             [(frequencies_of(theta + d, delay)[0] - frequencies_of(theta - d, delay)[0]) / 2e-6 for d in steps]
         )
-        # Residuals e move a frequency by g' G^-1 phi' e, at most by sqrt(g' G^-1 g e'e). These leave theta as it is.
+        # Residuals e move a frequency by g' G^-1 phi' e, at most by sqrt(g' G^-1 g e'e). These do not change theta.
         reach = np.sqrt(np.sum(derivatives * np.linalg.solve(phi.T @ phi, derivatives), axis=0))
         apart = np.diff(omega, append=np.inf)
         room = np.minimum(np.minimum(apart, np.roll(apart, 1)), omega)
@@ -104,7 +104,7 @@ def test_certain_means_a_tenth_of_the_distance_to_the_next_or_to_zero(omega):
 
 def test_short_data_make_a_misfit_weigh_more():
     omega = [2.0]  # a period takes pi seconds
-    # Either the estimate rests on less than a period, or less than two have passed.
+    # Either the estimate uses less than one period, or less than two have passed.
     cases = ((4.0, LONG, 1.0), (np.pi, LONG, 1.0), (np.pi / 2, LONG, 32.0), (np.pi / 4, LONG, 1024.0))
     cases += ((np.pi, 2 * np.pi, 1.0), (np.pi, np.pi, 32.0), (np.pi / 2, 2 * np.pi, 32.0))
     for span, elapsed, factor in cases:

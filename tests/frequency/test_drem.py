@@ -1,4 +1,4 @@
-"""Gradient, finite time and sliding window against plain numpy twins, exactness, and what scaling must not change."""
+"""Gradient, finite time and sliding window against plain numpy versions, exactness, and invariance to scaling."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ COUNT = 2500
 
 
 def mixed_regressions(y, n, first_row, lag=LAG, spacing=SPACING):
-    """Psi (N, n) and Delta (N,) from numpy's determinants; NaN where a row is missing."""
+    """Return Psi (N, n) and Delta (N,) from numpy's determinants; NaN for missing rows."""
     psi, phi = regression_rows(y, n, lag)
     right, delta = np.full((y.size, n), np.nan), np.full(y.size, np.nan)
     for k in range(2 * n * lag + (first_row + n - 1) * spacing, y.size):
@@ -40,7 +40,7 @@ def decoded(theta, h=H):
 @pytest.mark.parametrize("first_row", [0, 1])
 def test_gradient_and_finite_time_are_the_published_recursions(n, first_row):
     # theta' = gamma Delta (Psi - Delta theta) solved over each interval, W' = -gamma Delta^2 W, and the finite-time
-    # estimate (theta - theta(0) W)/(1 - W): literally, from numpy's determinants.
+    # estimate (theta - theta(0) W)/(1 - W), directly from numpy's determinants.
     y = noisy(n)
     epsilon, gamma = 0.3, np.array([3.0, 1.0, 2.0])[:n]
     initial = tuple(1.2 * OMEGA[n])
@@ -95,7 +95,7 @@ def test_sliding_sums_hold_the_window_and_nothing_else():
     slide(values, np.zeros((7, 2)), np.zeros(2), np.zeros(1, np.int64), sums)
     for k in range(100):
         part = values[max(0, k - 6) : k + 1]
-        # No more rounding than that of the sum itself, although much larger numbers have passed.
+        # The rounding is at most that of the sum itself, although much larger numbers have been added and removed.
         np.testing.assert_allclose(sums[k], part.sum(axis=0), rtol=0, atol=1e-15 * np.abs(part).sum(axis=0).max())
 
 
@@ -151,7 +151,7 @@ def test_zero_filled_delays_enter_the_estimate():
     gated = DremFiniteTime(tones=2, h=H, d=D).track(y, INTERVAL)
     filled = DremFiniteTime(tones=2, h=H, d=D, gated=False).track(y, INTERVAL)
     padded = DremFiniteTime(tones=2, h=H, d=D).track(np.concatenate((np.zeros(300), y)), INTERVAL)
-    # Zero-filled delays are the same as a signal that has been zero for ever, from the first complete row on.
+    # Zero-filled delays equal a signal that was always zero before, from the first complete row on.
     np.testing.assert_allclose(filled.frequencies[:], padded.frequencies[300:], atol=1e-9)
     error = np.abs(filled.frequencies - OMEGA[2]).max(axis=1)
     assert error[2 * 2 * LAG + 2 * SPACING] > 1e-3
@@ -159,7 +159,7 @@ def test_zero_filled_delays_enter_the_estimate():
 
 
 def test_rounded_delays_cost_nothing():
-    # h = 0.1 s is no multiple of 3 ms: 0.099 s is used, in the arc cosine too.
+    # h = 0.1 s is not a multiple of 3 ms: 0.099 s is used, in the arc cosine too.
     t = 0.003 * np.arange(1000)
     y = np.sin(2 * t) + np.cos(3 * t)
     options = DremFiniteTime(tones=2, h=0.1, d=0.13, epsilon=100.0, gamma=0.005)

@@ -1,4 +1,4 @@
-"""Signals that do not have the tones asked for: no estimator calls a wrong number valid."""
+"""Signals without the requested tones: no estimator marks a wrong number as valid."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_valid_estimates_are_right(options, noise):
     track = options.track(y, INTERVAL)
     error = np.abs(track.frequencies - TRUTH)
     valid = track.valid
-    assert (error[valid] < 0.1).all()  # what certain means here: a tenth of the distance
+    assert (error[valid] < 0.1).all()  # valid means: within a tenth of the distance
     if noise <= 1e-3:
         assert valid[-500:].all()
         assert error[-500:].max() < 1e-2
@@ -59,11 +59,11 @@ def test_no_estimate_from_before_a_step_stays_valid(options, jump):
     track = options.track(np.sin(phase).sum(axis=1), INTERVAL)
     error = np.abs(track.frequencies - true).max(axis=1)
     assert track.valid[2990:3000].all()
-    assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual shows it
+    assert (track.valid & (error > 0.1)).sum() <= 5  # until the residual reveals it
 
 
 def test_rows_of_two_signals_bear_nothing_out():
-    # So slow an estimate keeps the old frequencies, and judged rows from both sides of the step suit them for a while.
+    # A slow estimate keeps the old frequencies, and checked rows from both sides of the step match them for a while.
     true = np.where(T[:, None] < 30.0, [1.8, 3.2], [2.0, 3.0])
     y = np.sin(true[:, 0] * T) + np.cos(true[:, 1] * T)
     track = DremFiniteTime(tones=2, h=0.7, d=0.4, epsilon=0.1, power="literal").track(y, INTERVAL)
@@ -73,7 +73,7 @@ def test_rows_of_two_signals_bear_nothing_out():
 
 @pytest.mark.parametrize("options", [{}, {"gated": False}, {"power": "literal"}])
 def test_an_estimate_that_converges_stays_valid(options):
-    # Its residuals sink below what second moments can show.
+    # Its residuals fall below the resolution of second moments.
     tuning = {"h": 0.1, "d": 0.13, "epsilon": 100.0, "gamma": 0.005, "initial_frequencies": (2.0, 5.0)}
     track = DremGradient(tones=2, **tuning, **options).track(CLEAN, INTERVAL)
     assert track.valid[-500:].all()
@@ -82,7 +82,7 @@ def test_an_estimate_that_converges_stays_valid(options):
 
 
 def test_tones_that_look_alike_at_the_delay_are_one():
-    # cos(w h) is the same for 2 and 2 pi/0.7 - 2 rad/s; at another delay they are two.
+    # cos(w h) is equal for 2 and 2 pi/0.7 - 2 rad/s; at another delay they differ.
     y = np.sin(2 * T) + np.sin((2 * np.pi / 0.7 - 2) * T)
     assert not RestartingLeastSquares(tones=2, h=0.7).track(y, INTERVAL).valid.any()
     track = RestartingLeastSquares(tones=2, h=0.4).track(y, INTERVAL)
@@ -111,7 +111,7 @@ def test_extreme_amplitudes_give_no_wrong_number(options, scale):
 STREAM = 0.004 * np.arange(4000)
 ENDS = STREAM >= 10.0
 SINE = np.sin(75.0 * STREAM + 0.4)
-#: What may happen to a tone of 75 rad/s at 10 s; the gap ends there.
+#: Events of a tone of 75 rad/s at 10 s; a gap ends there.
 EVENTS = {
     "a small spike": SINE + (np.arange(STREAM.size) == 2500),
     "a spike": SINE + 10.0 * (np.arange(STREAM.size) == 2500),
@@ -136,7 +136,7 @@ DELAYS = {"h": 0.024, "prefilter": 0.048}
     ids=lambda options: options.kind,
 )
 def test_in_a_stream_an_event_makes_valid_estimates_wrong_for_a_stated_time_only(options, event, seed):
-    # All samples that the memory, the delays and the prefilter hold are then from after the event.
+    # All samples in the memory, the delays and the prefilter are then from after the event.
     until = options.memory + options.prefilter + 2 * options.h
     y = EVENTS[event] + 0.007 * np.random.default_rng(seed).standard_normal(STREAM.size)
     track = options.track(y, 0.004)

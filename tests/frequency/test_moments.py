@@ -77,7 +77,7 @@ def test_every_alias_is_told_from_the_frequency_itself(n, noise):
             assert np.cos(alias * h) == pytest.approx(np.cos(omega[-1] * h), abs=1e-9)
             aliased = omega.copy()
             aliased[-1] = alias
-            # In noise, the two must really differ at the second delay.
+            # In noise, the two must clearly differ at the second delay.
             if (
                 abs(np.cos(alias * second * interval) - np.cos(omega[-1] * second * interval))
                 > (0.1 if noise else 0.0) + 10 * noise
@@ -86,7 +86,7 @@ def test_every_alias_is_told_from_the_frequency_itself(n, noise):
 
 
 def test_negligible_residuals_are_none():
-    # Frequencies wrong by 1e-5 leave less than 1e-8 of the regressand's square, and least squares nothing.
+    # With frequency errors of 1e-5 less than 1e-8 of the regressand's square remains, and least squares leaves nothing.
     omega, second = np.array([1.0, 2.0]), second_lag(50)
     gram = second_moments(tones(2, 4000, 0.01, omega).sum(axis=1), 2, second)
     assert flag_inconsistent(gram, omega * (1 + 1e-5), second * 0.01, 1e-8) == 0

@@ -1,4 +1,4 @@
-"""One sample in, one estimate out: the same numbers as of the whole record, however that is cut."""
+"""Estimates sample by sample: equal to those of the whole record, for any division."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ each = pytest.mark.parametrize("options", ESTIMATORS, ids=IDS)
 
 
 def eventful(count=1500):
-    """Two tones with noise, a gap, a step and an infinite sample."""
+    """Return two tones with noise, a gap, a step and an infinite sample."""
     y = tones(2, count).sum(axis=1) + 0.01 * np.random.default_rng(0).standard_normal(count)
     y[800:] = 1.3 * tones(2, count, omega=OMEGA[2] * 1.2).sum(axis=1)[800:]
     y[500:503] = np.nan
@@ -28,7 +28,7 @@ def same(one, other):
     np.testing.assert_allclose(one.t, other.t, rtol=1e-15)
     assert np.array_equal(one.flags, other.flags)
     np.testing.assert_allclose(one.frequencies[one.valid], other.frequencies[one.valid], rtol=1e-9)
-    # Complex roots and roots on the bounds pass rounding on enlarged.
+    # Complex roots and roots at the bounds amplify rounding.
     np.testing.assert_allclose(one.frequencies, other.frequencies, rtol=1e-5)
 
 
@@ -39,7 +39,7 @@ def test_samples_one_by_one_give_the_numbers_of_the_record(options):
     single = [online.update(sample) for sample in y]
     joined = (np.concatenate([getattr(row, name) for row in single]) for name in ("t", "frequencies", "flags"))
     same(type(track)(*joined), track)
-    # The signal was made so that something happens to every estimator.
+    # The signal contains an event for every estimator.
     assert len(set(track.flags.tolist())) > 2
     assert (np.nanstd(track.frequencies[1000:], axis=0) > 0).all()
 

@@ -1,4 +1,4 @@
-"""The delay regression and its mixing: closed forms against products of operators, determinants against numpy."""
+"""Delay regression and mixing: closed forms against operator products, determinants against numpy."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ LAG, SPACING = 200, 150
 
 
 def mixed(matrix):
-    """Psi and Delta of one stacked regression."""
+    """Return Psi and Delta of one stacked regression."""
     [row] = mix([line[None, :] for line in matrix])
     return row[:-1], row[-1]
 
@@ -63,7 +63,7 @@ def test_mixing_is_cramers_rule(n, seed):
 
 
 def test_mixing_of_a_singular_matrix_is_finite():
-    # Two equal rows of the regressors, different right-hand sides: no theta at all, but finite numbers.
+    # Two equal rows of regressors with different right-hand sides: theta does not exist, but the numbers are finite.
     right, delta = mixed(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 5.0]]))
     assert delta == 0.0
     np.testing.assert_array_equal(right, [-4.0, 2.0])

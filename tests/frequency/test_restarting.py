@@ -1,4 +1,4 @@
-"""The recommended tracker: least squares against numpy and scipy, alarms, restarts, mixed data, memory."""
+"""Recommended tracker: least squares against numpy and scipy, alarms, restarts, mixed data, memory."""
 
 import numpy as np
 import pytest
@@ -85,7 +85,7 @@ def test_a_step_raises_one_alarm_and_is_exact_again_after_the_flush():
         assert 1500 <= alarm <= 1510
         assert np.flatnonzero(track.flags & Flag.CHANGED)[-1] == alarm + flush
         assert (track.frequencies[alarm : alarm + flush] == track.frequencies[alarm]).all()  # held
-        # The ring holds nothing from before the change when the first row is used.
+        # The ring buffer has no samples from before the change when the first row is used.
         assert np.abs(track.frequencies[alarm + flush + 20 :] - [1.3, 2.5]).max() < 1e-8
         assert track.valid[-500:].all()
         assert not track.valid[alarm : alarm + flush + 2 * LAG // 4].any()
@@ -104,7 +104,7 @@ def test_noise_raises_no_alarm_but_a_step_does():
 
 
 def test_a_second_change_during_the_flush_is_found_by_comparing_halves():
-    # 1.0 -> 1.6 -> 1.3 rad/s, half a second apart: the restart takes rows that mix the last two.
+    # 1.0 -> 1.6 -> 1.3 rad/s, half a second apart: the restart uses rows that mix the last two.
     t = INTERVAL * np.arange(4000)
     rate = np.select([t < 15.0, t < 15.5], [1.0, 1.6], 1.3)
     y = np.sin(np.concatenate(([0.0], np.cumsum(rate[:-1]) * INTERVAL))) + np.sin(2.2 * t)
@@ -128,7 +128,7 @@ def test_older_rows_are_forgotten_exponentially(memory):
     assert not alarms(track).size
     rows = rows_of(y, 2)
     most = round(memory / INTERVAL)
-    # All rows weigh the same until there are as many as remembered; every further one makes the others weigh less.
+    # All rows have equal weights until the memory is full; every further row reduces the weights of the others.
     weights = (1.0 - 1.0 / most) ** np.clip(np.arange(len(rows))[::-1], 0, len(rows) - most)
     root = np.sqrt(weights)[:, None]
     theta = np.linalg.lstsq(root * rows[:, :2], root[:, 0] * rows[:, 2], rcond=None)[0]
@@ -139,7 +139,7 @@ def test_older_rows_are_forgotten_exponentially(memory):
 
 @pytest.mark.parametrize("n", [3, 4, 5])
 def test_noise_that_a_short_record_hides_raises_no_alarm(n):
-    # Rows of the first periods are so much alike that the fit leaves a hundred times less than the noise.
+    # Rows of the first periods are so similar that the residual of the fit is a hundred times below the noise.
     assert not alarms(tracker(n).track(noisy(n, 6000), INTERVAL)).size
 
 
@@ -192,7 +192,7 @@ def test_gaps_are_waited_for_and_passed():
     assert np.flatnonzero(gaps)[-1] == 1100 + 20 + 4 * LAG
     assert track.valid[1100 + 20 + 4 * LAG + 1 :].all()
     assert np.abs(track.frequencies[300:] - OMEGA[2]).max() < 1e-7
-    # Nothing is estimated where nothing arrives.
+    # Without samples there are no estimates.
     silent = tracker().track(np.full(500, np.nan), INTERVAL)
     assert (silent.flags == Flag.STARTING).all()
     assert np.isnan(silent.frequencies).all()

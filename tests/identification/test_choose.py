@@ -1,4 +1,4 @@
-"""What is chosen where nothing is given, on records whose answer is known."""
+"""Automatic choices without options, on records with a known result."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ def binary(rng, count, width=8):
 
 
 def record_of(model, *, seed=0, u=None, past=0, offset=0.0, colour=0.0, deviation=0.05, count=600, hold="zoh"):
-    """Samples of a model; those before the record leave a state behind."""
+    """Return samples of a model; those before the record cause an initial state."""
     rng = np.random.default_rng(seed)
     t = 0.1 * np.arange(count + past)
     u = binary(rng, t.size) if u is None else u
@@ -88,7 +88,7 @@ def test_a_record_that_begins_with_its_step_needs_the_level_before():
 
 
 def test_a_step_at_the_beginning_does_not_tell_an_integrator_from_a_drift():
-    # The record rises to the end; a ramp of the output is what an integrator and a drift have in common.
+    # The output rises to the end; a ramp may be due to an integrator or a drift.
     t = 0.1 * np.arange(600)
     record = record_of(SECOND, u=np.ones(600))
     drifting = Record(record.t, record.y + 0.02 * t, record.input)
@@ -122,7 +122,7 @@ def test_the_grid_goes_on_while_more_poles_pay_against_white_noise():
 
 @pytest.mark.parametrize(("unseen", "chosen"), [(1.5, 4), (2.5, 2)])
 def test_a_structure_that_predicts_far_worse_than_a_smaller_one_is_no_candidate(monkeypatch, unseen, chosen):
-    # Blocks are predicted with this ratio of the squared error to that of the fit.
+    # Blocks are predicted with this ratio of their squared error to that of the fit.
     record = record_of(SECOND)
     best = choose(record).ranking.best
     sizes = {4: unseen, 3: 1.2, 2: 1.0}

@@ -1,4 +1,4 @@
-"""What ``identify`` says of faults that are planted in a record, and that it says nothing where there are none."""
+"""Warnings of ``identify`` about planted faults, and none without faults."""
 
 from dataclasses import replace
 
@@ -26,7 +26,7 @@ NOISE = 0.1
 
 
 def record_of(model=SYSTEM, *, seed=0, hold="zoh", read_as=None, interval=0.2, n=1000):
-    """A record of steps of random length, or of a random walk that is followed along straight lines."""
+    """Return a record with steps of random length, or with a random walk joined by straight lines."""
     rng = np.random.default_rng(seed)
     t = interval * np.arange(n)
     u = np.repeat(rng.choice([-1.0, 1.0], n), rng.integers(3, 12, n))[:n] if hold == "zoh" else rng.standard_normal(n)
@@ -51,7 +51,7 @@ def step_of(lead, model=SYSTEM):
 
 
 def looped(gain=0.8, n=1000):
-    """A record in the loop of a proportional controller."""
+    """Return a record in the loop of a proportional controller."""
     rng = np.random.default_rng(5)
     r = np.repeat(rng.choice([-1.0, 1.0], n // 5), 5)
     u, y, e, pole = np.zeros(n), np.zeros(n), 0.05 * rng.standard_normal(n), np.exp(-0.2)

@@ -1,4 +1,4 @@
-"""Bounds of the accuracy, against known numbers, integrals over the unit circle, and finite differences."""
+"""Accuracy bounds against known numbers, integrals over the unit circle, and finite differences."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ CLOSED = {"standard_deviation": 1.0, "innovation_variance": 0.01, "samples": 1}
 
 
 def variances(accuracy, letter):
-    """N times the variances of the parameters whose name ends so, by submodel."""
+    """Return N times the variances of the parameters with a name ending, by submodel."""
     return [v for name, v in zip(accuracy.names, np.diag(accuracy.covariance), strict=True) if name.endswith(letter)]
 
 
@@ -64,7 +64,7 @@ def test_known_variances_of_four_modes_in_open_loop():
     np.testing.assert_allclose(variances(unconstrained, "b0"), [36.75, 3.645, 0.5341, 0.2322], rtol=2e-4)
     np.testing.assert_allclose(variances(unconstrained, "a1"), [0.49374, 0.033565, 0.0023801, 0.014823], rtol=5e-5)
     np.testing.assert_allclose(variances(unconstrained, "a2"), [0.23860, 2.9082e-3, 6.4791e-5, 1.7786e-4], rtol=5e-5)
-    # The white formula at the same total variance is no substitute.
+    # The formula for white noise of the same total variance gives other values.
     white = limiting_accuracy(FOUR_MODES, INTERVAL, standard_deviation=1.0, innovation_variance=0.151351, samples=1)
     assert variances(additive, "b0")[0] / variances(white, "b0")[0] == pytest.approx(11, rel=0.05)
 
@@ -88,20 +88,20 @@ def test_known_variances_of_two_modes_in_closed_loop():
     np.testing.assert_allclose(variances(factors, "a1"), [0.22218, 1.37704e-3], rtol=3e-5)
     np.testing.assert_allclose(variances(factors, "a2"), [0.090118, 2.49911e-5], rtol=3e-5)
     np.testing.assert_allclose(variances(factors, "b0"), [14.683, 8.0467], rtol=4e-5)
-    # The input is S (r - v), and v has the variance 0.01: with the input itself the noise excites too.
+    # The input is S (r - v), and v has the variance 0.01: for the input itself, the noise is excitation too.
     direct = limiting_accuracy(unfactored(TWO_MODES), INTERVAL, PID, instruments="open_loop", **CLOSED)
     np.testing.assert_allclose(1.01 * direct.covariance, unconstrained.covariance, rtol=1e-6)
 
 
 def sampled_response(numerator, denominator, z):
-    """Zero-order-hold equivalent of a filter on the unit circle, from SciPy."""
+    """Return the zero-order-hold equivalent of a filter on the unit circle, from SciPy."""
     A, B, C, D, _ = cont2discrete(tf2ss(numerator, denominator), INTERVAL)
     states = np.linalg.solve(z[:, None, None] * np.eye(A.shape[0]) - A, np.broadcast_to(B, (z.size, *B.shape)))
     return (C @ states + D)[:, 0, 0]
 
 
 def spectra(model, z):
-    """Responses of the sensitivities of an additive model to its input, and of the model, on the unit circle."""
+    """Return the responses of the input sensitivities of an additive model, and of the model, on the unit circle."""
     rows, total = [], 0.0
     for submodel in model.submodels:
         b, a, integrators = submodel.numerator, submodel.denominator, np.zeros(submodel.integrators)
@@ -113,7 +113,7 @@ def spectra(model, z):
 
 
 def integral(rows, power):
-    """Covariance from a spectrum, by the trapezoidal rule over the unit circle."""
+    """Return the covariance from a spectrum, by the trapezoidal rule over the unit circle."""
     return np.real((rows * power) @ rows.conj().T) / rows.shape[1]
 
 
@@ -122,7 +122,7 @@ def sandwich(rows, power, noise_power):
     return inverse @ integral(rows, power * noise_power) @ inverse
 
 
-# Half a step beside zero frequency, where integrators are infinite.
+# Shifted by half a step from zero frequency, where integrators are infinite.
 Z = np.exp(2j * np.pi * (np.arange(8192) + 0.5) / 8192)
 H_POWER = np.abs((1 + 0.5 / Z) / (1 - 0.85 / Z)) ** 2
 
@@ -130,7 +130,7 @@ H_POWER = np.abs((1 + 0.5 / Z) / (1 - 0.85 / Z)) ** 2
 FAST = AdditiveModel([Submodel([0.5, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])], 0.13)
 RIGID = AdditiveModel([Submodel([0.4], [0.3, 1.0], integrators=1), Submodel([0.1], [0.01, 0.1, 1.0])])
 DOUBLE = AdditiveModel([Submodel([0.2, 0.4], [1.0], integrators=2), Submodel([0.1], [0.02, 0.1, 1.0])])
-# As many zeros as poles: the output answers to the input at once, also round the loop.
+# As many zeros as poles: direct feedthrough, also in the loop.
 DIRECT = AdditiveModel([Submodel([0.02, 0.3, 1.0], [0.04, 0.1, 1.0]), Submodel([0.7], [0.5, 1.0])])
 DIRECT_RIGID = AdditiveModel([Submodel([0.1, 0.2, 0.4], [0.3, 1.0], integrators=1)])
 PD = DiscreteController.from_pid(0.5, 0.0, 0.5)
@@ -154,7 +154,7 @@ def test_closed_loop_is_an_integral_over_the_unit_circle(model, controller, ente
     assert largest_relative_error(accuracy.covariance, sandwich(rows, power, 0.01)) < 1e-7
     coloured = limiting_accuracy(model, INTERVAL, controller, noise_filter=COLOURED, **options)
     assert largest_relative_error(coloured.covariance, sandwich(rows, power, 0.01 * H_POWER)) < 1e-7
-    # Where the reference enters at the input, the noise still comes through the controller.
+    # If the reference enters at the input, the noise still passes the controller.
     noise = 0.01 * np.abs(numerator / (denominator + G * numerator)) ** 2
     direct = limiting_accuracy(model, INTERVAL, controller, instruments="open_loop", **options)
     assert largest_relative_error(direct.covariance, sandwich(rows, power + noise, 0.01)) < 1e-7
@@ -183,7 +183,7 @@ def test_a_reaction_at_once_of_the_model_is_solved_for():
 
 def test_standard_errors_follow_the_unit_of_time():
     base = limiting_accuracy(FOUR_MODES, INTERVAL, **OPEN)
-    # In another unit of time, c of the old one: a_k scales with c^-k.
+    # In another unit of time, c times the old one, a_k scales with c^-k.
     unit = 1e-3
     scaled = AdditiveModel(
         [Submodel(s.numerator, s.denominator * unit ** np.arange(2, -1, -1)) for s in FOUR_MODES.submodels]
@@ -232,7 +232,7 @@ def test_names_and_values():
 
 @pytest.mark.parametrize("delay", [0, 1])
 def test_factoring_undoes_the_sum(delay):
-    # The covariance of the sum's coefficients, from that of the submodels, leads back to it.
+    # The covariance of the sum's coefficients, computed from that of the submodels, is converted back.
     jacobian = unfactored_jacobian(MODEL)
     jacobian = np.block([[jacobian, np.zeros((6, delay))], [np.zeros((delay, 6)), np.eye(delay)]])
     expected = spread(6 + delay)
@@ -283,8 +283,8 @@ def test_the_bound_counts_the_samples_that_are_used(estimate_delay):
     [(1, [0.0267, 0.0308, 0.0693, 0.00192]), (4, [0.0295, 0.0353, 0.0781, 0.00238])],
 )
 def test_known_bounds_of_the_second_order_benchmark(clock, expected):
-    # Standard deviations of a1, a2, b0 and the delay at 15 dB, from an independent implementation; they move by a
-    # few per cent with the phase of the input, which is drawn here and was drawn there.
+    # Standard deviations of a1, a2, b0 and the delay at 15 dB, from an independent implementation; they vary by a few
+    # per cent with the phase of the input, which is random here and there.
     r = record(CASE_1, clock * 0.05)
     noise = np.sqrt(np.mean(r.y**2) / 10**1.5)
     np.testing.assert_allclose(np.sqrt(np.diag(cramer_rao_bound(CASE_1, r, noise, 15.0))), expected, rtol=0.1)

@@ -1,4 +1,4 @@
-"""Covariances of white and coloured noise, against exact ones and by coverage; sentences on ill-conditioned ones."""
+"""Covariances for white and coloured noise, against exact ones and by coverage; messages on ill-conditioned ones."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_no_degrees_of_freedom_no_covariance():
 
 
 def regressors(count, seed=0, pole=0.95):
-    """Sensitivities of a first-order system with a delay to its pole, gain and delay."""
+    """Return the sensitivities of a first-order system with a delay to its pole, gain and delay."""
     u = np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], count // 10 + 1), 10)[:count]
     x = lfilter([1 - pole], [1, -pole], u)
     return np.column_stack([lfilter([1 - pole], [1, -pole], x), x, np.append(0, np.diff(x)) / (1 - pole)])
@@ -178,7 +178,7 @@ def covariance(errors, pairs=()):
 
 
 FIVE = ("a1", "a2", "b0", "b1", "delay")
-# Each pair of parameters 0.6 to 0.8, but the third is nearly the sum of the others.
+# Correlations between pairs are 0.6 to 0.8, but the third parameter is nearly the sum of the others.
 TOGETHER = np.random.default_rng(1).standard_normal((1000, 3))
 TOGETHER[:, 2] = TOGETHER[:, 0] + TOGETHER[:, 1] + 0.01 * TOGETHER[:, 2]
 UNDEFINED = np.full((3, 3), np.nan)
@@ -206,7 +206,7 @@ DIRECTION = np.array([[4.0, 0.0, 0.0], [0.0, 1.0, 2.0], [0.0, 2.0, 4.0]])
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),
             ("can hardly distinguish", "hardly shows when the response begins"),
         ),
-        # Pairs that share a parameter are one sentence.
+        # Pairs that share a parameter are in one sentence.
         (
             covariance([0.1] * 5, [(0, 1, 0.9997), (1, 2, 0.9997), (0, 2, 0.9996)]),
             *([1, 2, 3, 4, 5], FIVE, 4000.0, None),

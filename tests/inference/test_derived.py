@@ -73,7 +73,7 @@ def test_names_and_units_say_what_is_what():
     rows = by_name(SUM, random_covariance(SUM))
     pair = ["pole_real", "pole_imag", "natural_frequency", "natural_frequency_hz", "damping"]
     real = [f"{kind}_{k}" for k in (1, 2) for kind in ("pole", "time_constant")]
-    # Of two real poles and of a pair alike there is a natural frequency; the second submodel has five poles.
+    # A natural frequency exists for two real poles and for a pair; the second submodel has five poles.
     assert [name for name in rows if name[1] != "2"] == [
         *("g1_pole", "g1_time_constant", "g1_static_gain"),
         *(f"g3_{name}" for name in (*pair, "static_gain")),
@@ -143,7 +143,7 @@ def test_frequency_and_damping_do_not_change_where_two_poles_meet_on_the_real_ax
 
 
 def test_accuracy_is_that_of_the_unfactored_model():
-    # The same estimate in other coordinates: poles of a fraction, poles of its factors.
+    # One estimate in other coordinates: poles of a fraction, poles of its factors.
     covariance = random_covariance(TWO_MODES, 1e-4)
     forth = unfactored_jacobian(TWO_MODES)
     whole, rows = by_name(unfactored(TWO_MODES), forth @ covariance @ forth.T), by_name(TWO_MODES, covariance)

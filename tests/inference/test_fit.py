@@ -1,4 +1,4 @@
-"""What a fit reports, and the measures of its quality."""
+"""Report of a fit, and its quality measures."""
 
 import numpy as np
 import pytest

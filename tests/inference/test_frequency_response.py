@@ -1,4 +1,4 @@
-"""Frequency responses without a model, against the exact response of known systems."""
+"""Nonparametric frequency responses against the exact response of known systems."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def periodic_record(once, periods, settling=40, noise=0.0, square=0.0, cube=0.0,
 
 
 def sampled_response(model, w, hold="zoh"):
-    """What samples show: the spectrum of the answer to one held sample, over that of the hold."""
+    """Return the response of the samples: spectrum of the response to one held sample, over that of the hold."""
     t = INTERVAL * np.arange(3000)
     pulse = np.zeros(t.size)
     pulse[1] = 1.0
@@ -61,7 +61,7 @@ def test_periods_without_noise_are_exact():
     assert found.frequencies == pytest.approx(2 * np.pi / (PERIOD * INTERVAL) * ODD, rel=1e-12)
     true = sampled_response(MODEL, found.frequencies)
     assert np.abs(found.response - true).max() < 1e-10 * np.abs(true).max()
-    # The images that a hold leaves are within their bound.
+    # The image errors of a hold are within their bound.
     assert (np.abs(true - exact(MODEL, found.frequencies)) <= 1.1 * found.bias).all()
 
 
@@ -70,7 +70,7 @@ def test_variance_of_periods_covers():
     for seed in range(30):
         found = estimate_frequency_response(periodic_record(multisine(seed), 4, settling=3, noise=0.5, seed=seed))
         shares.append(covered(found, sampled_response(MODEL, found.frequencies)))
-    # 1,500 lines; variances are shared by neighbours.
+    # 1,500 lines; neighbours share variances.
     assert 0.93 < np.mean(shares) < 0.97
 
 
@@ -99,7 +99,7 @@ def test_realisations_tell_distortions_from_noise():
     cubic = [periodic_record(multisine(k), 3, noise=0.1, cube=1e-3, seed=k) for k in range(8)]
     distorted = estimate_frequency_response(cubic)
     assert np.median(distorted.distortion) > 10 * np.median(found.distortion)
-    # One realisation does not show odd distortions of an odd input; its lines differ from the mean by them.
+    # One realisation does not reveal odd distortions of an odd input, by which its lines differ from the mean.
     once = estimate_frequency_response(cubic[0])
     off = np.abs(once.response - distorted.response) ** 2
     assert 0.3 < np.median(off / distorted.distortion.mean()) < 3
@@ -107,9 +107,9 @@ def test_realisations_tell_distortions_from_noise():
 
 @pytest.mark.parametrize("periods", [1, 3])
 def test_intervals_of_short_records_cover(periods):
-    # A resonance with damping .1 of which the record has 8 to 16 periods, 15 dB. Lines share windows: some 7 of 9 in
-    # the band of the gain are independent at most, and of 30 records at least 400 are. 90 % is then 3.3 deviations
-    # below 95 %.
+    # A resonance with damping .1, 8 to 16 periods of it in the record, 15 dB. Lines share windows: at most 7 of 9 in
+    # the band of the gain are independent, and at least 400 of 30 records. 90 % is then 3.3 standard deviations below
+    # 95 %.
     hits = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
@@ -138,7 +138,7 @@ def test_no_interval_on_a_peak_between_the_lines():
 
 
 def test_the_phase_is_followed_where_it_is_known():
-    # After 2 rad/s the response is below the noise.
+    # Above 2 rad/s the response is below the noise.
     model = TransferFunction([1.0], np.polymul([1.0, 1.0], [0.7, 1.0]), delay=3.0)
     found = estimate_frequency_response(random_record(0, n=800, noise=0.5, model=model))
     phase, half = found.phase(), found.phase_band()

@@ -30,7 +30,7 @@ def drawn(noise, count, seed=0):
 
 
 def deviance(noise, v, use):
-    """``-2 ln L`` with the variance eliminated, by the dense covariance matrix."""
+    """Return ``-2 ln L`` with the variance eliminated, by the dense covariance matrix."""
     covariance = toeplitz(noise.autocovariance(np.arange(use.size)))[np.ix_(use, use)]
     return v.size * np.log(v @ np.linalg.solve(covariance, v) / v.size) + np.linalg.slogdet(covariance)[1]
 
@@ -69,7 +69,7 @@ def test_the_likelihood_is_greatest(noise, orders):
         estimate = np.array([*fit.noise.denominator[1:], *fit.noise.numerator[1:]])
         gram = coefficient_gram(fit, v, use)
         errors, alone = np.sqrt(np.diag(np.linalg.inv(gram))), 1.0 / np.sqrt(np.diag(gram))
-        # The deviance is one above its least where a coefficient alone is one such error off.
+        # The deviance rises by one from its minimum if one coefficient alone changes by this error.
         assert np.abs(approx_fprime(estimate, at, 1e-4 * alone) * alone).max() < 0.02
         true = np.array([*noise.denominator[1:], *noise.numerator[1:]])
         assert np.abs((estimate - true) / errors).max() < 4
@@ -104,7 +104,7 @@ def test_two_records_share_one_noise():
 
 
 def test_orders_of_least_bic():
-    """A model is not worse than those that it contains, and the true orders are usually chosen."""
+    """A model fits at least as well as those that it contains, and the true orders are usually chosen."""
     found = []
     for seed in range(8):
         v = drawn(FAST, 1000, seed)
@@ -117,7 +117,7 @@ def test_orders_of_least_bic():
 
 @pytest.mark.parametrize("ahead", [1, 4])
 def test_predictions_go_on_without_innovations(ahead):
-    """Direct simulation: what the filter makes of the innovations up to then, and of zeros after."""
+    """Direct simulation: the filter's response to the innovations up to then, and to zeros after."""
     v = drawn(FAST, 300)
     (noise,) = sampled(FAST, [np.ones(300, dtype=bool)])
     e = lfilter(FAST.denominator, FAST.numerator, v)
@@ -125,7 +125,7 @@ def test_predictions_go_on_without_innovations(ahead):
     for t in (200, 250, 299):
         known = e.copy()
         known[t - ahead + 1 :] = 0.0
-        # Of the zeros before the first sample nothing is left after 200 samples: .9^200 < 1e-9.
+        # The effect of the zeros before the first sample has vanished after 200 samples: .9^200 < 1e-9.
         assert predicted[t] == pytest.approx(lfilter(FAST.numerator, FAST.denominator, known)[t], abs=1e-7)
     np.testing.assert_array_equal(predicted[:ahead], 0.0)
 

@@ -1,4 +1,4 @@
-"""A small version of the coverage of bands, and what is published of the large one."""
+"""A small version of the study of band coverage, and the published values of the large one."""
 
 import pandas as pd
 import pytest

@@ -34,7 +34,7 @@ MODELS = {
 
 
 def central(parametric, answer, step=1e-6):
-    """Derivatives by central differences, zero for parameters that are not of the model."""
+    """Return derivatives by central differences, zero for parameters outside the model."""
     mine, places = parametric.free
     found = np.zeros((answer(parametric).size, len(parametric.names)), dtype=answer(parametric).dtype)
     for k, place in zip(mine, places, strict=True):
@@ -101,7 +101,7 @@ def test_linear_and_sampled_bands_agree_where_the_model_is_nearly_linear():
 
 
 def test_pointwise_bands_cover_at_their_level():
-    """Estimates drawn with the covariance that they report: 600 of them, at every instant and frequency."""
+    """Estimates drawn with their reported covariance: 600 of them, at every instant and frequency."""
     rng, names = np.random.default_rng(11), ("a1", "a2", "b0", "b1", "delay")
     covariance = fitted(deviation=3e-3).covariance
     truth = Parametric(SECOND, names)

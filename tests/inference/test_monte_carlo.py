@@ -1,4 +1,4 @@
-"""Monte Carlo errors and intervals: by hand, against the bootstrap, and how often they hold the truth."""
+"""Monte Carlo errors and intervals: by hand, against the bootstrap, and by their coverage."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_bias_deviation_and_mean_square_are_those_of_the_table_of_morris():
     assert monte_carlo.bias(Sample(ERRORS, ERRORS))[:2] == pytest.approx((mean, scatter / np.sqrt(n)))
     assert monte_carlo.mean_square(Sample(ERRORS, ERRORS)).error == pytest.approx(np.std(squares, ddof=1) / np.sqrt(n))
     assert monte_carlo.deviation(Sample(ERRORS, ERRORS)).value == pytest.approx(scatter)
-    # Their error of a standard deviation is that of normal errors, and the jackknife finds it there.
+    # For normal errors, the error of a standard deviation has a formula, with which the jackknife agrees.
     normal = np.random.default_rng(1).standard_normal(20_000)
     found = monte_carlo.deviation(Sample(normal, normal))
     assert found.error == pytest.approx(found.value / np.sqrt(2 * 19_999), rel=0.03)
@@ -49,7 +49,7 @@ def test_nothing_is_said_of_nothing():
     assert monte_carlo.bias(one) == (2.0, None, None, None)
     assert monte_carlo.coverage(Sample(ERRORS, np.full(5, np.nan))) == Measured()
     assert monte_carlo.deviation(one) == monte_carlo.error_ratio(one) == Measured()
-    # Without one of them, nothing scatters.
+    # If one of two values is left out, no scatter remains.
     assert monte_carlo.deviation(Sample(np.array([1.0, 3.0]), np.ones(2))) == (pytest.approx(2**0.5), None, None, None)
     exact = Sample(np.zeros(9), np.zeros(9), 1.0)
     assert monte_carlo.root_mean_square(exact) == (0.0, 0.0, 0.0, 0.0)
@@ -85,7 +85,7 @@ def test_an_interval_that_says_nothing_has_no_ends():
         found = MEASURES[name].compute(Sample(far * errors, widths * (far if name == "standard_error" else 1.0), 1.0))
         assert found.value > 0.0
         assert found[2:] == (None, None)
-    # Two data sets tell of a mean square by chance only.
+    # Two data sets do not determine a mean square.
     assert monte_carlo.mean_square(Sample(np.array([0.1, 2.0]), np.ones(2)))[2:] == (None, None)
 
 

@@ -1,4 +1,4 @@
-"""Tests of Monte Carlo measures against theory: what they find, and that they find nothing where nothing is."""
+"""Tests of Monte Carlo measures against theory: power, and false alarms."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from ctid_cli.inference.monte_carlo_tests import MEASURED, departures
 
 
 def departed(n=400, shift=0.0, width=1.0, scale=1.0):
-    """Departures by kind, of normal errors whose standard deviation by theory is 1."""
+    """Return departures by kind, for normal errors with a theoretical standard deviation of 1."""
     errors = shift + scale * np.random.default_rng(3).standard_normal(n)
     sample = Sample(errors, np.full(n, width), bound=1.0)
     measured = {name: MEASURES[name].compute(sample) for name in MEASURED}

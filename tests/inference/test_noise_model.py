@@ -68,7 +68,7 @@ def test_no_product_reaches_from_one_experiment_into_the_next():
 
 
 def slow_rows(count, rng, columns=3):
-    """Sensitivities to slow inputs, and an offset."""
+    """Return sensitivities to slow inputs, and to an offset."""
     return np.column_stack([lfilter([0.1], [1, -0.9], rng.standard_normal((columns, count))).T, np.ones(count)])
 
 
@@ -127,7 +127,7 @@ def test_the_order_may_be_long_as_a_season():
 
 
 def test_intervals_of_short_records_of_slow_noise_cover():
-    """AR(1) of .95 and 600 samples, worth 15 independent ones: of 200 runs 95 % -+ 3.5 are within the interval."""
+    """AR(1) of .95 and 600 samples (effective count 15): of 200 runs 95 % -+ 3.5 are within the interval."""
     rng = np.random.default_rng(2)
     psi = slow_rows(600, rng)
     covered = np.zeros(4)

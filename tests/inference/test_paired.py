@@ -1,4 +1,4 @@
-"""Differences on the same data sets: published examples, defining equations, and how often they hold the truth."""
+"""Paired differences on the same data sets: published examples, defining equations, and coverage."""
 
 import itertools
 from math import comb
@@ -24,7 +24,7 @@ def test_mid_p_halves_what_was_observed(b, c):
 
 
 def score(d, b, c, n):
-    """Tango's statistic, the likelihood of the discordant pairs maximised by brute force."""
+    """Return Tango's statistic, with the likelihood of the discordant pairs maximised by brute force."""
     low, high = max(0.0, -d), (1 - d) / 2
 
     def cost(q):
@@ -57,7 +57,7 @@ def test_the_bootstrap_is_that_of_scipy():
     width = interval.high - interval.low
     assert found.value == pytest.approx(statistic(one, other))
     assert (found.low, found.high) == pytest.approx((interval.low, interval.high), abs=0.04 * width)
-    # The p-value is that of the interval that ends at zero.
+    # The p-value is that of the interval with one end at zero.
     assert (found.p_value < 0.05) == (found.low > 0 or found.high < 0)
     assert bootstrap_difference(root_of_mean, one**2, other**2) == found
     assert bootstrap_difference(root_of_mean, one**2, one**2)[:3] == (0.0, 0.0, 0.0)
@@ -65,18 +65,18 @@ def test_the_bootstrap_is_that_of_scipy():
 
 
 def test_the_p_value_of_no_difference_keeps_its_level(monkeypatch):
-    # Fewer resamples do where many p-values are wanted.
+    # Fewer resamples suffice for many p-values.
     monkeypatch.setattr(paired, "DRAWS", 1000)
     rng = np.random.default_rng(3)
     pairs = rng.standard_normal((400, 2, 80)) ** 2
     found = np.array([bootstrap_difference(root_of_mean, one, other).p_value for one, other in pairs])
     assert stats.kstest(found, "uniform").pvalue > 0.01
-    # The interval of so few data sets is a little short: 6 %, and what 400 of them can be off.
+    # For this number of data sets the interval is slightly short: 6 %, with the scatter of 400 trials.
     assert stats.binom.cdf(np.sum(found < 0.05) - 1, 400, 0.06) < 0.999
 
 
 def hypergeometric_p(k1, n1, k2, n2):
-    """Two-sided p-value as the definition has it: all tables that are no more likely than the one found."""
+    """Return the two-sided p-value by definition: the sum over all tables no more likely than the observed one."""
     likely = [comb(n1, k) * comb(n2, k1 + k2 - k) for k in range(max(0, k1 + k2 - n2), min(n1, k1 + k2) + 1)]
     found = comb(n1, k1) * comb(n2, k2)
     return sum(value for value in likely if value <= found) / sum(likely)

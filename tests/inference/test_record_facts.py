@@ -1,4 +1,4 @@
-"""Facts on a record: each fault on a record made to have it, none on a clean one, and estimates beside the truth."""
+"""Facts about a record: each planted fault is found, none on a clean record, and estimates are near the true values."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ FIRST_ORDER = TransferFunction([1], [1, 1], delay=1.3)
 
 
 def clean(seed=0, n=1000, hold=20, colour=0.9, noise=0.1, irregular=False):
-    """A first-order system after a random binary input, from rest, in AR(1) noise."""
+    """Return a record of a first-order system with a random binary input, from rest, in AR(1) noise."""
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.uniform(0.02, 0.18, n)) if irregular else 0.1 * np.arange(n)
     u = np.repeat(rng.choice([-1.0, 1.0], n // hold + 1), hold)[:n]
@@ -49,7 +49,7 @@ def faulty(fault):
 
 
 def stated(facts):
-    """Faults that are stated."""
+    """Return the stated faults."""
     parts = facts.parts
     found = {name for name in ("offset", "drift", "start") if getattr(parts, name).detected}
     others = {"outliers": parts.outliers, "feedback": parts.feedback_p_value <= LEVEL, "saturation": facts.saturated}
@@ -75,7 +75,7 @@ def test_a_clean_record_has_no_faults_and_its_numbers_hold_the_truth(colour, irr
 
 def test_false_alarms_are_as_rare_as_the_level_says():
     alarms = sum(bool(stated(record_facts(clean(seed, n=300, hold=10)))) for seed in range(15))
-    # With five tests at .001 one of 200 is expected.
+    # With five tests at .001, one alarm in 200 is expected.
     assert alarms <= 1
 
 

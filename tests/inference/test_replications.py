@@ -1,4 +1,4 @@
-"""Data sets until the measures are precise: the rule itself."""
+"""Stopping rule of data sets until the measures are precise enough."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_blocks_grow_to_the_most_that_is_allowed() -> None:
     ends = list(block_ends(1000))
     assert ends == [200, 250, 313, 392, 490, 613, 767, 959, 1000]
     assert list(block_ends(AT_LEAST)) == [AT_LEAST]
-    # Another limit changes the last block only.
+    # Another limit changes only the last block.
     assert list(block_ends(2000))[: len(ends) - 1] == ends[:-1]
 
 
@@ -56,9 +56,9 @@ def test_the_first_block_with_narrow_intervals_of_all_estimators_ends_it() -> No
     assert (decision.state, decision.finished, decision.needed) == ("enough", expected, expected)
     assert decision.widest is not None
     assert decision.widest.excess == pytest.approx(max(widths(expected)), rel=1e-4)
-    # Neither of them alone needs more.
+    # Together they need the larger of the numbers needed alone.
     assert max(decide(until, [one], 2000).needed for one in found) == expected
-    # What comes later does not matter, and without the last data set of the block nothing is decided.
+    # Later data sets have no effect, and without the last data set of the block there is no decision.
     assert decide(until, [found[0].first(expected), found[1]], 2000) == decision
     before = decide(until, [found[0].first(expected - 1), found[1]], 2000)
     assert (before.state, before.needed) == ("open", expected)
@@ -69,9 +69,9 @@ def test_what_cannot_be_measured_decides_nothing() -> None:
     rng = np.random.default_rng(4)
     errors = np.column_stack([rng.standard_normal(900), np.zeros(900), np.full(900, np.nan)])
     asked = Until(rmse_relative=0.08)
-    # A parameter that is given has no error, and one that the model lacks has no value.
+    # A given parameter has no error, and one that the model lacks has no value.
     assert decide(asked, [of_errors(errors)], 900) == decide(asked, [of_errors(errors[:, :1])], 900)
-    # Of a single value nothing is known but the value.
+    # A single value has no standard error.
     once = np.where(np.arange(900) == 3, 1.0, np.nan)
     lonely = decide(asked, [of_errors(once)], 900)
     assert (lonely.state, lonely.needed) == ("at_most", 900)
@@ -84,7 +84,7 @@ REPETITIONS = 600
 
 
 def stopped(until: Until, draw: Any, at_most: int) -> list[Replications]:
-    """What a study that follows the rule ends with, over and over."""
+    """Return the final results of many studies that follow the rule."""
     found = []
     for _ in range(REPETITIONS):
         whole = draw(at_most)
@@ -98,7 +98,7 @@ def test_intervals_of_percentages_keep_their_promise_under_the_rule(probability:
     found = stopped(Until(percent_half_width=1.5), lambda n: of_hits(rng.random(n) < probability), 5000)
     intervals = [wilson_interval(int(one.hits.sum()), one.hits.size) for one in found if one.hits is not None]
     inside = sum(low <= probability <= high for low, high in intervals)
-    # As many as 93 % would give with 99 %: 558 - 2.33 sqrt(600 0.93 0.07).
+    # The number that 93 % coverage exceeds with a probability of 99 %: 558 - 2.33 sqrt(600 0.93 0.07).
     assert inside >= 543
     assert max(high - low for low, high in intervals) <= 0.03
     assert len({one.hits.size for one in found if one.hits is not None}) > (1 if probability > 0.5 else 0)

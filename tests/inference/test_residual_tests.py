@@ -1,4 +1,4 @@
-"""Residual tests against sums by hand, their nominal level, and models that are wrong in known ways."""
+"""Residual tests against sums by hand, their nominal level, and models with known errors."""
 
 import numpy as np
 import pytest
@@ -34,11 +34,11 @@ def test_whiteness_by_hand():
 
 
 def test_band_of_the_cross_correlation_is_ljungs():
-    # An AR(1) residual and an AR(1) input: sum of the products of autocorrelations is (1 + ab) / (1 - ab).
+    # An AR(1) residual and an AR(1) input: the sum of the products of autocorrelations is (1 + ab) / (1 - ab).
     rng = np.random.default_rng(1)
     e = lfilter([1], [1, -0.9], rng.standard_normal(200_000))
     u = lfilter([1], [1, -0.5], rng.standard_normal(200_000))
-    # It sums over all lags, however few are tested.
+    # It includes all lags, not only the tested ones.
     band = residual_tests(e, u, lags=1).cross_correlation_band
     assert band == pytest.approx(1.959964 * np.sqrt(1.45 / 0.55 / 200_000), rel=0.02)
     white = rng.standard_normal(200_000)
@@ -61,7 +61,7 @@ def test_a_sound_model_fails_at_the_stated_rate(numerator):
         residuals = v - psi @ np.linalg.lstsq(psi, v, rcond=None)[0]
         tests = residual_tests(residuals, u, sensitivities=psi)
         rejected += not tests.white, not tests.uncorrelated
-    # binomial: 0.05 +- 3 * 0.0126; a little fewer, as the colour is estimated from the same residuals
+    # binomial: 0.05 +- 3 * 0.0126; slightly fewer, because the colour is estimated from the same residuals
     assert 0.01 < rejected[1] / 300 < 0.088
     if coloured:
         assert rejected[0] == 300
@@ -77,7 +77,7 @@ def test_the_statistic_does_not_see_what_estimation_removes():
     psi = lfilter([1.0, 0.5], [1.0, -0.6], u)[:, None]
     e -= psi[:, 0] * (psi[:, 0] @ e) / (psi[:, 0] @ psi[:, 0])
     here = residual_tests(e, u, sensitivities=psi)
-    # the colour of the residuals is estimated anew, hence not to the last digit
+    # the colour of the residuals is estimated again, so the last digits differ
     moved = residual_tests(e - 0.01 * psi[:, 0], u, sensitivities=psi)
     assert moved.cross_statistic == pytest.approx(here.cross_statistic, rel=1e-3)
     assert residual_tests(e - 0.2 * psi[:, 0], u).cross_statistic > here.cross_statistic + 5
@@ -123,13 +123,13 @@ def least_squares_rest(columns, beside):
 
 @pytest.mark.parametrize("count", [40, ROWS, 2 * ROWS + 17])
 def test_the_rest_is_that_of_least_squares(count):
-    # Nearly collinear columns of very different sizes, one twice.
+    # Nearly collinear columns of very different sizes, one of them repeated.
     slow = np.cumsum(RNG.standard_normal(count))
     beside = np.column_stack((slow, 1e6 * slow + RNG.standard_normal(count), slow))
     columns = RNG.standard_normal((count, 3))
     parts = Concatenated((constant(count), beside))
     expected = least_squares_rest(columns, parts[:])
-    # Rounding turns a span by eps times the condition number, here of the three columns that differ.
+    # Rounding rotates a subspace by eps times the condition number, here of the three different columns.
     sizes = np.linalg.svd(parts[:] / np.linalg.norm(parts[:], axis=0), compute_uv=False)
     slack = np.finfo(float).eps * sizes[0] / sizes[2] * np.linalg.norm(columns, axis=0).max()
     assert slack < 1e-5
@@ -160,7 +160,7 @@ N = 600
 
 
 def looked_at(rng, *, colour=0.0, pole=0.0, feedback=0.0):
-    """The tests of the errors of a first-order model, as if it were known."""
+    """Return the tests of the errors of a first-order model with known parameters."""
     e = lfilter([1.0], [1.0, -colour], rng.standard_normal(N))
     r = np.repeat(rng.choice([-3.0, 3.0], N // 4), 4)
     u = r - feedback * e
@@ -174,7 +174,7 @@ def looked_at(rng, *, colour=0.0, pole=0.0, feedback=0.0):
 def test_false_alarms_are_as_rare_as_said(colour):
     rng = np.random.default_rng(7)
     found = [looked_at(rng, colour=colour) for _ in range(150)]
-    # Both levels are approximate: no more than twice the nominal one, with a confidence of 99.9 %.
+    # Both levels are approximate: at most twice the nominal one, with a confidence of 99.9 %.
     most = binom.ppf(0.999, len(found), 0.1)
     assert sum(one.pole_p_value < 0.05 for one in found) <= most
     assert sum(one.feedback_p_value < 0.05 for one in found) <= most

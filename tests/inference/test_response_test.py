@@ -1,4 +1,4 @@
-"""Whether outputs answer to their inputs: how often noise passes for an answer, and how often an answer is missed."""
+"""Test for a response of outputs to inputs: rates of false and of missed detections."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def noise(rng, n, colour=(1.0,)):
 
 
 def inputs(rng, n):
-    """A fast and a slow random binary input, steps, a sine and filtered noise."""
+    """Yield a fast and a slow random binary input, steps, a sine and filtered noise."""
     k = np.arange(n)
     yield np.repeat(rng.choice([-1.0, 1.0], n // 2 + 1), 2)[:n]
     yield np.repeat(rng.choice([-1.0, 1.0], n // 10 + 1), 10)[:n]
@@ -40,7 +40,7 @@ def outcome(*records, delays=(0.0, 10.0), **options):
 
 
 def answering(rng, n=400, share=0.36, colour=(1.0,), model=FIRST_ORDER):
-    """A record of which the model explains a share of the output's variance."""
+    """Return a record in which the model explains a fraction of the output variance."""
     u = next(inputs(rng, n))
     x = simulate(model, HeldSignal(np.arange(float(n)), u), np.arange(float(n)))
     return record_of(u, np.sqrt(share) * x / x.std() + np.sqrt(1 - share) * noise(rng, n, colour))
@@ -54,9 +54,9 @@ def test_noise_seldom_passes_for_an_answer():
         for colour in COLOURS
         for u in inputs(rng, 120)
     ]
-    # A test of level 5 % stays below in 999 of 1,000 such samples.
+    # A test of level 5 % stays below this number in 999 of 1,000 such samples.
     assert sum(found) <= binom.ppf(0.999, len(found), 0.05)
-    # One that never gives a false alarm would not know its level.
+    # A test without any false alarm would have another level.
     assert sum(found) >= 1
 
 
@@ -64,12 +64,12 @@ def test_noise_seldom_passes_for_an_answer():
 def test_an_answer_that_fits_20_percent_is_seen(colour):
     rng = np.random.default_rng(42)
     found = [outcome(answering(rng, 500, colour=colour)).seen for _ in range(12)]
-    # With a power of 95 % two are missed, or fewer, in 98 of 100 such samples.
+    # With a power of 95 %, at most two are missed in 98 of 100 such samples.
     assert sum(found) >= 10
 
 
 def test_one_step_in_noise_is_seen():
-    """The output of a step looks like slow noise; what the answer leaves of it does not."""
+    """The output of a step resembles slow noise; the residual of the response does not."""
     rng = np.random.default_rng(52)
     t = np.arange(300.0)
     u = 1.0 * (t >= 100)
@@ -114,7 +114,7 @@ def test_a_long_record_is_averaged_and_a_fast_answer_is_still_seen():
 
 @pytest.mark.parametrize("model", [([1.0], [1.0, 0.0]), ([1.0], [1.0, 0.005, 0.25]), ([-0.1, 0.01], [1.0, 0.2, 0.01])])
 def test_without_noise_an_answer_is_always_seen(model):
-    """Integrating, hardly damped, and with a zero in the right half plane."""
+    """Integrating and lightly damped systems, and one with a zero in the right half plane."""
     rng = np.random.default_rng(48)
     t = np.arange(300.0)
     for u in inputs(rng, 300):
@@ -124,13 +124,13 @@ def test_without_noise_an_answer_is_always_seen(model):
 def test_free_responses_and_steady_states():
     rng = np.random.default_rng(49)
     t = np.arange(100.0)
-    # Most of the answer to a pulse at the end comes at the beginning of the next period.
+    # Most of the response to a pulse at the end occurs at the beginning of the next period.
     u = 1.0 * (t >= 92)
     twice = simulate(FIRST_ORDER, HeldSignal(np.arange(200.0), np.append(u, u)), np.arange(200.0))
     steady = record_of(u, twice[100:] + 0.01 * noise(rng, 100))
     assert outcome(steady).explained < 0.5
     assert outcome(steady, initial_state="periodic").explained > 0.95
-    # A free response is none to the input, however large.
+    # A free response is not a response to the input, however large.
     falling = record_of(next(inputs(rng, 100)), 50.0 * np.exp(-t / 12.0) + noise(rng, 100))
     assert not outcome(falling, initial_state="estimate").seen
 
@@ -146,7 +146,7 @@ def test_outliers_hide_no_answer():
 def test_what_cannot_be_tested_is_not_denied():
     rng = np.random.default_rng(51)
     held = record_of(np.ones(100), noise(rng, 100))
-    # From rest a constant input is a step.
+    # From rest, a constant input is a step.
     assert np.isfinite(outcome(held).p_value)
     still = Record(held.t, held.y, HeldSignal(held.t - 1e6, np.zeros(100)))
     for found in (outcome(still), outcome(answering(rng, 7))):

@@ -45,7 +45,7 @@ def test_covariance_is_the_double_sum_over_all_pairs_of_samples():
     deviations = np.sqrt(np.diag(expected))
     covariance = finite_record_covariance(psi, autocovariances)
     assert np.abs((covariance - expected) / np.outer(deviations, deviations)).max() < 1e-9
-    # Lags beyond the record do not count, and those not given are zero.
+    # Lags beyond the record have no effect, and missing ones are zero.
     np.testing.assert_allclose(finite_record_covariance(psi, noise.autocovariance(np.arange(900))), covariance)
     padded = np.append([0.3, 0.1], np.zeros(398))
     np.testing.assert_allclose(
@@ -69,7 +69,7 @@ def test_long_records_approach_the_limit():
     psi = sensitivities(MODES, signal, times)
     covariance = finite_record_covariance(psi, noise.autocovariance(np.arange(2000)))
     ratios = np.sqrt(np.diag(covariance)) / limit.standard_errors
-    # The least damped mode has the time constant 5 s: some hundred independent stretches.
+    # The least damped mode has a time constant of 5 s: about a hundred independent sections.
     assert np.abs(ratios - 1).max() < 0.1
     white = np.sqrt(np.diag(finite_record_covariance(psi, 0.02)))
     assert np.abs(white / limit.standard_errors - 1).min() > 0.3

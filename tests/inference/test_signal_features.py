@@ -1,4 +1,4 @@
-"""Faults of sensors and recorders that are planted in a sequence."""
+"""Faults of sensors and recorders planted in a sequence."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_few_samples_at_one_limit_are_cut_off():
     limit = np.sort(y)[-6]
     assert saturated(y) == 0
     assert saturated(np.minimum(y, limit)) == 6 / 400
-    # An output at rest before it moves may lie below all that follows.
+    # An output at rest before it moves may be below all later values.
     assert saturated(np.concatenate((np.full(40, y.min() - 1), y))) == 0
 
 
@@ -40,7 +40,7 @@ def test_only_exponential_growth_diverges(grown, diverges):
     # An input that pauses does not grow when it goes on.
     pausing = np.where((t > 7.5) & (t < 9.0), 0.0, u)
     assert np.isfinite(growth_time(t, y, pausing)) == diverges
-    # An input that grows itself explains it.
+    # Growth of the input explains growth of the output.
     assert np.isnan(growth_time(t, y, grown(t)))
 
 

@@ -1,4 +1,4 @@
-"""What standard errors take the noise for, in every estimator that asks."""
+"""Noise model of the standard errors, in every estimator with the option."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Sums of submodels: their parameters, their properties, and the sums that are refused."""
+"""Sums of submodels: parameters, properties, and refused sums."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_order_frequency_and_stability_by_hand():
     assert REAL.natural_frequency == pytest.approx(10.0)
     assert (SLOW.order, SLOW.relative_degree, SLOW.dc_gain, SLOW.is_stable) == (2, 2, 3.0, True)
     assert (RIGID.order, RIGID.natural_frequency, RIGID.dc_gain, RIGID.poles.tolist()) == (2, 0.0, np.inf, [0, 0])
-    # Integrators are not looked at; an undamped pair is not stable.
+    # Integrators are ignored; an undamped pair is not stable.
     assert RIGID.is_stable
     assert not Submodel([1.0], [1.0, 0.0, 1.0]).is_stable
     assert not Submodel([1.0], [-0.1, 1.0], integrators=1).is_stable
@@ -102,7 +102,7 @@ def test_sum_is_the_sum():
     expected_poles = [-10.0, -0.5 - 1.9364916731j, -0.5 + 1.9364916731j, 0.0, 0.0]
     np.testing.assert_allclose(model.poles, expected_poles, rtol=1e-10)
     assert (model.dc_gain, AdditiveModel([SLOW, REAL]).dc_gain) == (np.inf, 5.0)
-    # Integrators are the margin of stability.
+    # Integrators are marginally stable.
     assert (model.is_stable, model.is_marginally_stable) == (False, True)
     assert not AdditiveModel([SLOW, Submodel([1.0], [-1.0, 1.0])]).is_marginally_stable
 
@@ -173,7 +173,7 @@ def test_sums_that_do_not_determine_their_terms_are_refused(submodels, delay, me
 def test_poles_close_to_each_other_may_belong_to_two_submodels():
     near = Submodel([1.0], [0.25 * (1 + 1e-5), 0.25, 1.0])
     assert AdditiveModel([SLOW, near]).order == 4
-    # A double root of rounded coefficients comes out as two roots 1e-8 apart.
+    # A double root of rounded coefficients becomes two roots 1e-8 apart.
     with pytest.raises(DataError, match="in common"):
         AdditiveModel([Submodel([1.0], np.poly([-0.3, -0.3])), Submodel([1.0], [1.0, 0.3])])
 

@@ -1,4 +1,4 @@
-"""Discrete-time controllers: normal form, realisation, and the controllers that are refused."""
+"""Discrete-time controllers: normal form, realisation, and refusals."""
 
 import control
 import numpy as np

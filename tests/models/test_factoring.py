@@ -1,4 +1,4 @@
-"""One fraction and a sum of submodels: there and back again, and the derivatives both ways."""
+"""Conversion between one fraction and a sum of submodels, with derivatives in both directions."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ MODELS = {
 
 
 def completed(model):
-    """The same model with numerators of the length that a partial fraction has."""
+    """Return the model with numerators of the length of a partial fraction."""
     submodels = []
     for part in model.sorted().submodels:
         b = np.concatenate((np.zeros(max(part.order - part.numerator.size, 0)), part.numerator))
@@ -37,14 +37,14 @@ def completed(model):
 
 
 def coefficients(fraction, length=None):
-    """``a_1 … a_n`` and the numerator, padded to a length."""
+    """Return ``a_1 … a_n`` and the numerator, padded to a length."""
     length = length or fraction.numerator.size
     padding = np.zeros(length - fraction.numerator.size)
     return np.concatenate((fraction.denominator[1:], padding, fraction.numerator))
 
 
 def central_differences(function, x, steps):
-    """Derivatives by five points, so that the steps may be large; zero where the step is zero."""
+    """Return derivatives by five points, which allow large steps; zero where the step is zero."""
     columns = []
     for step in np.diag(steps):
         one, two = function(x + step) - function(x - step), function(x + 2 * step) - function(x - 2 * step)
@@ -121,7 +121,7 @@ def test_terms_pair_neighbouring_real_poles_and_leave_pairs_together():
     fraction = TransferFunction([1.0, 7.0], a)
     result = factored(fraction, [Term(2, 0), Term(1, 0), Term(2, 0), Term(1, 0)])
     groups = [sorted(np.round(part.poles, 9), key=abs) for part in result.submodels]
-    # The pair takes the first term of two poles; real poles fill the others, slowest first.
+    # The pair is assigned to the first term with two poles; real poles fill the others, slowest first.
     assert groups == [[-0.1], [-1.0, -5.0], [-2 - 3j, -2 + 3j], [-40.0]]
     w = np.array([0.05, 1.0, 20.0])
     np.testing.assert_allclose(result.frequency_response(w), fraction.frequency_response(w), rtol=1e-10)
@@ -134,7 +134,7 @@ def test_feedthrough_goes_to_the_term_that_can_hold_it():
     fraction = unfactored(MODELS["biproper mode"])
     assert factored(fraction, [Term(2, 0), Term(2, 2)]).terms == (Term(2, 1), Term(2, 2))
     assert factored(fraction, [Term(2, 1), Term(2, 1), Term(0, 0)]).terms == (Term(2, 1), Term(2, 1), Term(0, 0))
-    # Without a feedthrough there is nothing to take.
+    # Without a feedthrough nothing is removed.
     assert factored(unfactored(TWO_MODES), [Term(2, 2), Term(2, 0)]).terms == (Term(2, 1), Term(2, 1))
     assert factored(fraction).submodels[-1].numerator == pytest.approx(fraction.numerator[0])
 
@@ -166,7 +166,7 @@ def test_factored_jacobian_is_that_of_central_differences(name):
     def function(x):
         return factored(TransferFunction(x[n:], np.append(1.0, x[:n])), model.terms).theta
 
-    # Poles at the origin stay there: their coefficients are not moved.
+    # Poles at the origin stay there: their coefficients are not varied.
     expected = central_differences(function, x, 1e-4 * np.abs(x))
     assert jacobian.shape == expected.shape
     # Rows in units of their largest derivative, columns in units of their coefficient.

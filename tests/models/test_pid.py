@@ -1,4 +1,4 @@
-"""Continuous PID gains: limits, the rules of discretisation, and the gains per sample that they amount to."""
+"""Continuous PID gains: limits, discretisation rules, and equivalent gains per sample."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Transfer functions: one normal form, and the properties read off it."""
+"""Transfer functions: normal form and derived properties."""
 
 import control
 import numpy as np

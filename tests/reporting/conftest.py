@@ -1,4 +1,4 @@
-"""Results made by hand: a plan of one experiment and estimates for some of it."""
+"""Hand-made results: a plan of one experiment and estimates for part of it."""
 
 import pytest
 
@@ -29,13 +29,13 @@ def make_estimate(delay, status="CONVERGED", numerator=(8.0,), denominator=(1.0,
 
 @pytest.fixture
 def estimate():
-    """What a worker returns, for a delay that it found."""
+    """Return a worker's result for an estimated delay."""
     return make_estimate
 
 
 @pytest.fixture
 def add_estimator():
-    """Give results one more estimator, from the delays that it found by SNR and start; a start None takes none."""
+    """Add an estimator to results, from its delays by SNR and start; None for an estimator without starts."""
 
     def add(results, name, found):
         manifest, stored = results.manifest, results.stored
@@ -56,7 +56,7 @@ def add_estimator():
 
 @pytest.fixture
 def make_results(tmp_path):
-    """Results of a case with SNR 5 and 15 dB and one estimator, from the delay that each estimate found."""
+    """Return results of a case with SNR 5 and 15 dB and one estimator, from the estimated delays."""
 
     def make(found, *, experiment="useful-redundancy/case1-regular", snrs=(5.0, 15.0), swept=True, origins=1, **spec):
         starts = {"0.0": 0.0, "uniform(0, 9)": "random"}

@@ -1,4 +1,4 @@
-"""Results of experiments as theory expects them: estimates drawn around the truth, without a single record."""
+"""Results of experiments drawn from the theoretical distribution of the estimates, without records."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def plan_of(text, tmp_path):
 
 
 def estimate(parameters, standard_errors=None, status="CONVERGED", **more):
-    """What a worker returns."""
+    """Return the result of a worker."""
     failed = status == "FAILED"
     return {
         "status": status,
@@ -55,7 +55,7 @@ def estimate(parameters, standard_errors=None, status="CONVERGED", **more):
 
 
 def results_of(plan, found, folder):
-    """Results from what workers returned: ``found[estimator name, samples]`` is a list by replicate."""
+    """Return results from those of workers: ``found[estimator name, samples]`` is a list by replicate."""
     manifest = plan.manifest()
     start = next(point.label for point in plan.starts)
     results = {}
@@ -68,10 +68,10 @@ def results_of(plan, found, folder):
 
 
 def ideal_results(plan, folder, *, bias=None, width=None, seed=1):
-    """Estimates with the variances of theory, the errors of all estimators of a data set alike.
+    """Return estimates with the theoretical variances; all estimators of a data set have the same errors.
 
-    ``bias`` and ``width`` map names of estimators to their bias in standard deviations by parameter, and to a factor of
-    their standard errors.
+    ``bias`` maps names of estimators to their bias in standard deviations by parameter, ``width`` to a factor of their
+    standard errors.
     """
     variances = long_record_variances(plan)
     truth = true_values(plan.manifest()["data_cells"][0])
@@ -82,7 +82,7 @@ def ideal_results(plan, folder, *, bias=None, width=None, seed=1):
         samples = cell.source.sampling.samples
         common = rng.standard_normal((plan.runs, len(truth)))
         for j, part in enumerate(plan.estimators):
-            # Where there is no theory: one per cent at so many samples.
+            # Without a theory: one per cent at this number of samples.
             theory = variances.get((k, j)) or {n: 1e-4 * v**2 * samples for n, v in truth.items()}
             deviation = np.array([np.sqrt(theory[name] / samples) for name in truth])
             own = 0.95 * common + np.sqrt(1 - 0.95**2) * rng.standard_normal(common.shape)

@@ -1,4 +1,4 @@
-"""Results of an experiment on a signal, from estimates made by hand."""
+"""Hand-made results of an experiment on a signal."""
 
 from ctid_cli.custom_code import STUDIES
 from ctid_cli.reporting.results import Results
@@ -22,7 +22,7 @@ monte_carlo: {{runs: 4, seed: 1}}
 
 
 def of_track(first, second, after, rms, alarms):
-    """What a tracker gave, by the settling times of both tones and the second one's after its step."""
+    """Return a tracker's result, from the settling times of both tones and of the second one after its step."""
     return {
         "status": "VALID",
         "message": "good",
@@ -39,12 +39,12 @@ def of_track(first, second, after, rms, alarms):
 
 
 def of_record(rms):
-    """What an estimator of whole records gave."""
+    """Return the result of an estimator of whole records."""
     return {"status": "VALID", "message": "good", "measures": {"omega_1": 2.0, "rms_1": rms, "rms_2": 0.05}}
 
 
 def frequency_results(folder, tracks, records):
-    """Results from the estimates of the tracker and of ESPRIT; None stands for one that failed."""
+    """Return results from estimates of the tracker and of ESPRIT; None stands for a failure."""
     file = folder / "made.yaml"
     file.write_text(SPEC, encoding="utf-8")
     manifest = build_plan(load_spec(file)).manifest()

@@ -1,4 +1,4 @@
-"""A page as its tests see it."""
+"""Parser of pages for tests."""
 
 from collections import Counter
 from html.parser import HTMLParser
@@ -7,7 +7,7 @@ VOID = {"meta", "link", "br", "img", "input", "hr"}
 
 
 class Page(HTMLParser):
-    """What a page holds; refuses tags that are not closed in order."""
+    """Content of a page; refuses tags that are not closed in order."""
 
     def __init__(self, text):
         super().__init__()
@@ -34,7 +34,7 @@ class Page(HTMLParser):
 
 
 def alone(text):
-    """A page that runs nothing, loads nothing, and is not too large to be sent."""
+    """Assert that a page runs nothing, loads nothing, and is small enough to be sent; return it parsed."""
     page = Page(text)
     assert not {"script", "link", "img", "iframe"} & {tag for tag, n in page.tags.items() if n}
     assert not [name for name, _ in page.attributes if name.startswith("on")]

@@ -1,4 +1,4 @@
-"""Tables beside the committed ones and those of the article: what differs by more than chance."""
+"""Comparison of tables with committed and published ones: significant differences."""
 
 import pandas as pd
 import pytest
@@ -42,7 +42,7 @@ def test_the_same_tables_agree_cell_by_cell():
         row(None, n=0, method="redundancy"),
     )
     comparison = compare(rows, rows, STUDY, "tables.csv")
-    # An estimate without a start stands in two tables and is compared once.
+    # An estimate without a start is in two tables and is compared once.
     cells = comparison.content()["cells"]
     assert [(cell["against"], cell["method"], cell["initial_delay"]) for cell in cells] == [
         ("committed", "existing", 0.0),

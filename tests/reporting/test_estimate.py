@@ -41,7 +41,7 @@ SUBMODELS = {
 
 def test_what_was_estimated_as_a_sum_is_shown_as_a_sum_only():
     found = {item.name: item for item in parameters(SUBMODELS)}
-    # Two integrators, which belong to the first submodel.
+    # Two integrators, in the first submodel.
     units = {"g1_b0": "out/in/s^2", "g1_b3": "out/in*s", "g2_a1": "s", "delay": "s"}
     assert {name: item.unit for name, item in found.items()} == units
     both = parameters(SUBMODELS | {"standard_errors": {"b0": 0.1, "g2_a1": 0.3}})

@@ -1,4 +1,4 @@
-"""Figures of any experiment: their points are the measures and the estimates, and their intervals are drawn."""
+"""Figures of experiments: points are the measures and estimates, bars their intervals."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.reporting.ideal_results import TWO_MODES, ideal_results, plan_of
 
 @pytest.fixture
 def results(make_results, estimate):
-    """Two noise levels and two starts; from 0 s, half of the estimates end in another minimum."""
+    """Return results at two noise levels from two starts; from 0 s, half of the estimates end in another minimum."""
     right = [estimate(delay) for delay in (8.1, 7.9, 8.05, 8.02)]
     wrong = [estimate(delay) for delay in (8.0, 2.1, 2.0, 7.95)]
     failed = [*right[:3], estimate(None, status="FAILED")]
@@ -28,13 +28,13 @@ def ideal(tmp_path_factory):
 
 
 def points(axes):
-    """Values of every line with markers, in the order of drawing; the ends of bars are markers too."""
+    """Return the values of every line with markers in drawing order; the ends of bars are markers too."""
     lines = [line for line in axes.lines if line.get_marker() not in ("None", "none", "_")]
     return [np.asarray(line.get_ydata(), float) for line in lines]
 
 
 def bars(axes):
-    """Ends of the vertical bars."""
+    """Return the ends of the vertical bars."""
     ends = [tuple(part[:, 1]) for lines in axes.collections for part in lines.get_segments() if np.ptp(part[:, 0]) == 0]
     return sorted(ends)
 

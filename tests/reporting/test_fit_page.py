@@ -1,4 +1,4 @@
-"""The page of a fit: complete in itself, and safe whatever names files and columns have."""
+"""Page of a fit: self-contained, and safe for any names of files and columns."""
 
 import re
 import shlex
@@ -30,7 +30,7 @@ def measurement(seed, name, n=400, noise=0.1):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A fit with everything, its records and its page."""
+    """Return a fit with all optional parts, its records and its page."""
     measured, other = [measurement(0, HOSTILE)], measurement(1, "other.csv")
     options = DelayProfile(2, 0, (0, 2), initial_state="estimate", offset="estimate")
     result = identify([item.record for item in measured], options, other.record)
@@ -49,7 +49,7 @@ def page_of(result, measured, other, folder):
 
 def test_a_page_says_all_and_needs_nothing_but_itself(fitted, tmp_path):
     text, again = page_of(*fitted, tmp_path)
-    assert text == again  # what is read from the file draws the same page, to the byte
+    assert text == again  # the page of the stored fit is identical
     page = alone(text)
     titles = ["Before using it", "Data", "Model", "Output", "Residuals", "Responses", "Poles", "Delay", "Provenance"]
     fine = "The search ended well, the residuals pass their tests, and no change that was tried gives a better fit."

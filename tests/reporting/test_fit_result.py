@@ -41,13 +41,13 @@ def measurement(seed=0, *, n=800, units=("ms", "V", "mA"), notes=()):
 
 
 def with_output(change):
-    """A measurement with another output."""
+    """Return a measurement with another output."""
     one = measurement()
     return replace(one, record=Record(one.record.t, change(one.record.y.copy()), one.record.input, name="file.csv"))
 
 
 def coloured(seed=0):
-    """A measurement with one missing output and noise with a pole."""
+    """Return a measurement with one missing output and noise with a pole."""
     one, e = measurement(seed), 0.1 * np.random.default_rng(10 + seed).standard_normal(800)
     y = one.record.y + lfilter([1.0], [1.0, -0.8], e)
     y[40] = np.nan
@@ -68,7 +68,7 @@ def result_of(*measurements, other=None, poles=2, delay=(0.0, 3.0), **options):
 
 @pytest.fixture(scope="module")
 def results():
-    """Fits in the states that are shown in different ways."""
+    """Return fits in all states with different output."""
     noise = with_output(lambda y: np.random.default_rng(4).standard_normal(y.size))
     validated = result_of(measurement(notes=("A note.",)), other=measurement(1))
     noisy = result_of(coloured(), other=coloured(1), noise_model="arma:1,0")
@@ -88,7 +88,7 @@ def results():
 def test_text(results, state, snapshot):
     text = results[state].summary()
     assert max(map(len, text.splitlines())) <= 100
-    # Three digits do not depend on the processor; how near a matrix is to singular and which starts arrive may.
+    # Three digits are the same on all processors; condition numbers and the starts that converge may not be.
     text = re.sub(r"\d+\.\d+", lambda found: f"{float(found[0]):.3g}", text)
     text = re.sub(r"(condition number|best of|reached) \S+", r"\1 #", text)
     text = re.sub(r"p = \S+?e-\d+", "p = tiny", text)
@@ -211,7 +211,7 @@ def test_the_figure_is_the_same_every_time_and_names_its_axes(results):
     figure = results["validated"].drawing().saved()
     assert figure == results["validated"].drawing().saved()
     assert ElementTree.fromstring(figure).tag.endswith("svg")
-    # Text is drawn as outlines; what it says stands in comments beside them.
+    # Text is drawn as outlines; the characters are in comments of the file.
     for label in ("y [mA]", "t [ms]", "residual [mA]", "delay [ms]", "lag [samples]"):
         assert f"<!-- {label} -->".encode() in figure
     assert b"counts for little" in results["outliers"].drawing().saved()

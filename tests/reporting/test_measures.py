@@ -1,4 +1,4 @@
-"""Measures of experiments: who counts, under which names, and what is refused."""
+"""Measures of experiments: counted estimates, parameter names, and refusals."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_measures_come_for_every_planned_cell_in_the_order_asked_for(results):
 
 
 def test_coefficients_go_together_by_their_power(make_results, estimate):
-    # b0 p + b1 against b0 in truth; names of standard errors count the zeros where the leading one was dropped.
+    # Model b0 p + b1, true system b0; names of standard errors include the dropped leading zero.
     errors = {"a1": 0.1, "a2": 0.2, "b0": 9.0, "b1": 0.4, "delay": 0.01}
     two = [estimate(8.1, numerator=b, standard_errors=errors) for b in ((0.5, 8.3), (7.9,), (8.1,))]
     found = {row["parameter"]: row for row in rows_of(make_results({(5.0, "0.0"): two}), "bias", "coverage")}
@@ -65,7 +65,7 @@ def test_coefficients_go_together_by_their_power(make_results, estimate):
     assert found["b0"]["without_value"] == 0
     bias = {row["parameter"]: row["value"] for row in rows_of(make_results({(5.0, "0.0"): two}), "bias")}
     assert bias == pytest.approx({"a1": 0.0, "a2": 0.0, "b0": 0.1, "delay": 0.1})
-    # Of a model with another number of poles only the delay has a true value.
+    # In a model with another number of poles, only the delay has a true value.
     three = [estimate(8.1, denominator=(1.0, 2.0, 3.0, 4.0))] * 2
     found = rows_of(make_results({(5.0, "0.0"): three}), "bias")
     assert {row["parameter"]: row["without_value"] for row in found} == {"a1": 2, "a2": 2, "b0": 2, "delay": 0}
@@ -77,7 +77,7 @@ def test_a_delay_that_was_given_is_no_estimate(make_results, estimate):
 
 
 def test_one_parameter_or_the_poles_are_asked_for_by_name(make_results, estimate):
-    # In truth they are -1.4 -+ 1.428j.
+    # The true poles are -1.4 -+ 1.428j.
     found = [estimate(8.1, denominator=(1.0, 2.0 * x, x**2 + y**2)) for x, y in ((1.5, 1.4), (1.3, 1.5))]
     results = make_results({(5.0, "0.0"): [*found, estimate(8.0, denominator=(1.0, 2.0))]})
     assert [row["parameter"] for row in rows_of(results, "rmse:delay")] == ["delay"]

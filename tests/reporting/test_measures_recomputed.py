@@ -1,4 +1,4 @@
-"""Every measure of docs/measures.md, computed a second time with NumPy from what an experiment stored."""
+"""Every measure of docs/measures.md, recomputed with NumPy from the stored results of an experiment."""
 
 import re
 from pathlib import Path
@@ -39,7 +39,7 @@ STATUS[list(FAILED)] = "FAILED"
 MODELS = np.setdiff1d(np.arange(RUNS), FAILED)
 #: Frequencies of distances [rad/s].
 GRID = np.r_[np.linspace(0.0, 64.0, 2**15 + 1), np.geomspace(64.0, 4000.0, 20_000)[1:]]
-#: Of a model with one pole no parameter counts.
+#: Estimates whose parameters count: a model with one pole has no true values.
 COUNTED = np.setdiff1d(MODELS, [ONE_POLE])
 
 
@@ -56,14 +56,14 @@ def results(tmp_path_factory):
 
 
 def binomial(hits):
-    """Percentage with Wilson's interval, the two solutions p of (k/n - p)^2 = z^2 p (1 - p) / n."""
+    """Return the percentage with Wilson's interval, the two solutions p of (k/n - p)^2 = z^2 p (1 - p) / n."""
     n, share, z2 = len(hits), np.mean(hits), stats.norm.ppf(0.975) ** 2
     ends = np.sort(np.roots([1 + z2 / n, -2 * share - z2 / n, share**2]))
     return 100 * np.array([share, np.sqrt(share * (1 - share) / n), *ends])
 
 
 def jackknife(statistic, *columns):
-    """Leave out one data set after the other; the interval is that of the logarithm."""
+    """Return the jackknife over data sets; the interval is that of the logarithm."""
     n = len(columns[0])
     without = np.array([statistic(*(np.delete(column, k) for column in columns)) for k in range(n)])
     error, of_logarithm = (np.sqrt((n - 1) * np.var(part)) for part in (without, np.log(without)))
@@ -74,7 +74,7 @@ def jackknife(statistic, *columns):
 
 
 def order_statistics(values, level=0.5):
-    """Quantile between the values of which at most 2.5 % chance is that it lies beyond."""
+    """Return the quantile with an interval of order statistics, which ends at probabilities of at most 2.5 %."""
     n, ordered = len(values), np.sort(values)
     first = max(k for k in range(n) if stats.binom.cdf(k, n, level) <= 0.025)
     last = min(k for k in range(n) if stats.binom.cdf(k, n, level) >= 0.975)
@@ -83,7 +83,7 @@ def order_statistics(values, level=0.5):
 
 
 def student(errors):
-    """Mean with Student's interval."""
+    """Return the mean with its t interval."""
     mean, error = np.mean(errors), np.std(errors, ddof=1) / np.sqrt(len(errors))
     return np.array([mean, error, *stats.t.interval(0.95, len(errors) - 1, mean, error)])
 
@@ -97,13 +97,13 @@ def deviation(errors):
 
 
 def response(frequency, model, poles=2):
-    """Response of b0 / (p^2 + a1 p + a2), or of b0 / (p + a1), after a delay."""
+    """Return the response of b0 / (p^2 + a1 p + a2), or of b0 / (p + a1), after a delay."""
     p, (a1, a2, b0, delay) = 1j * frequency, model
     return b0 / (p**2 + a1 * p + a2 if poles == 2 else p + a1) * np.exp(-p * delay)
 
 
 def distances(norm):
-    """Relative distances of the models [%], of what failed infinite ones."""
+    """Return the relative distances of the models [%], infinite for failures."""
     true, found = response(GRID, TRUTH), np.full(RUNS, np.inf)
     for k in MODELS:
         model = response(GRID, VALUES[k], 1 if k == ONE_POLE else 2)
@@ -111,7 +111,7 @@ def distances(norm):
     return found
 
 
-#: Of errors e with standard errors w, one of which may be missing, and the least variance.
+#: Measures of errors e with standard errors w, which may be missing, and the minimum variance.
 OF_ERRORS = {
     "bias": lambda e, w, bound: student(e),
     "deviation": lambda e, w, bound: jackknife(deviation, e),

@@ -1,4 +1,4 @@
-"""Pages: well-formed, complete in themselves, and safe whatever messages and files hold."""
+"""Pages: well-formed, self-contained, and safe for any content of messages and files."""
 
 from pathlib import Path
 

@@ -44,12 +44,12 @@ def test_the_text_lists_what_only_the_second_solves(results, tmp_path):
 
 
 def test_each_pair_and_each_estimate_counts_once(results, add_estimator, estimate, tmp_path):
-    # The second has two sets of options: what the first missed is listed once.
+    # The second one has two sets of options: failures of the first are listed once.
     add_estimator(results, "third", {(5.0, None): [estimate(delay) for delay in SECOND]})
     _, other, third = results.manifest["estimators"]
     other["swept"], third["swept"], third["name"] = {"zeros": 0}, {"zeros": 1}, "other"
     assert "3 estimates of existing missed" in compare_estimators(results, "existing,other", tmp_path).summary()
-    # Options of one estimator: one difference each, not two of opposite sign.
+    # One difference for two options of an estimator, not two of opposite sign.
     rows = paired_rows(results, "other", "other")
     assert [(row["first"], row["second"]) for row in rows] == [("other, zeros 0", "other, zeros 1")] * 5
     with pytest.raises(UsageError, match="existing has no swept option; compare it with another estimator"):

@@ -1,4 +1,4 @@
-"""What is printed of stored results: how much is done, how precise it is, what failed."""
+"""Printed status of stored results: progress, precision, failures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tables of the published study: its numbers, our cells beside them, and what stands in for those not run."""
+"""Tables of the published study: its numbers next to ours, and placeholders for cells that were not run."""
 
 import pytest
 
@@ -67,7 +67,7 @@ def test_fixed_and_random_starts_go_to_their_tables(make_results, estimate):
     (fixed,), (random,) = ([row for row in rows_of(number, results) if row["n"]] for number in (1, 2))
     assert [fixed[key] for key in ("initial_delay", "n", "percent", "published_percent")] == [0.0, 2, 50.0, 65.0]
     assert [random[key] for key in ("initial_delay", "n", "percent", "published_percent")] == ["random", 4, 100.0, 90.0]
-    # What was not run stays in the table.
+    # Cells that were not run stay in the table.
     assert (len(rows_of(1, results)), len(rows_of(2, results))) == (72, 12)
 
 
@@ -81,7 +81,7 @@ def test_a_setting_finds_its_cell_or_gets_one_of_its_own(make_results, estimate,
 
 @pytest.fixture
 def mixed(make_results, add_estimator, estimate):
-    """Of one experiment: the existing method in part, ours, and two that take no start."""
+    """Return one experiment: part of the existing method, ours, and two without a start."""
     good, bad = estimate(8.0), estimate(5.0, "STALLED")
     results = make_results({(5.0, "0.0"): [good, bad, bad, bad], (5.0, RANDOM): [good, bad], (15.0, "0.0"): [good]})
     add_estimator(results, "other_profile", {(5.0, None): [good, good, good, bad], (15.0, None): [good] * 4})
@@ -106,7 +106,7 @@ def test_the_pooled_percentage_is_that_of_all_estimates_in_the_cells_of_the_tabl
     # 1 of 4 at 5 dB, 1 of 1 at 15 dB; published from 0 s 65 and 69.
     assert pooled.loc["existing"].tolist() == ["2 of 24", 5, 2, "40.0", "67.0", "20 ms"]
     assert pooled.loc["delay_profile"].tolist()[:5] == ["2 of 4", 8, 7, "87.5", ""]
-    # Without results it is the mean of the table.
+    # Without results, it is the mean of the table.
     values = [value for case, _, _, fixed, _ in EXISTING if case == 1 for value in fixed]
     (existing, *_) = records_of(pooled_frame(STUDY, STUDY.tables[1], frame_of(1)))
     assert (existing["cells"], existing["percent"]) == ("0 of 24", "not run")
@@ -128,7 +128,7 @@ def test_the_whole_study_is_the_default_and_committed_tables_stand_in(tmp_path):
     assert "case2_regular.yaml" in nothing.summary()
     committed = build_tables(["3"], tmp_path, committed=True)
     assert {row["table"] for row in committed.rows} == {3}
-    # The printed method was run from two of the delays only, as it takes so long.
+    # The method as printed was run from two of the delays only, because it is slow.
     ours = [row for row in committed.rows if row["method"] != "as_printed"]
     assert all(row["n"] == 100 and row["percent"] is not None for row in ours)
     assert "committed results of " in committed.remarks[0]

@@ -1,4 +1,4 @@
-"""What results show that theory does not expect: how often that is said of nothing, and with which reason."""
+"""Deviations of results from theory: false alarm rate, and stated reasons."""
 
 import re
 
@@ -26,7 +26,7 @@ monte_carlo: {runs: 60, seed: 3}
 
 @pytest.fixture
 def results(tmp_path):
-    """Results with the variances of theory, of errors ``change(errors)`` and standard errors wider by a factor."""
+    """Return results with the theoretical variances, errors ``change(errors)``, and standard errors times a factor."""
 
     def make(text=SPEC, seed=1, change=None, width=1.0):
         plan = plan_of(text, tmp_path)
@@ -85,7 +85,7 @@ WRONG = SPEC.replace("delay_bounds: [0, 4]", "delay_bounds: [2, 4]").replace("de
     ],
 )
 def test_sentences(results, given, snapshot):
-    # Numbers and the worst cases are those of random draws.
+    # The numbers and the worst cases depend on random draws.
     found = (re.sub(r"\(\w+, samples [^)]*\)", "(case)", text) for text in surprises(results(**given)))
     assert [re.sub(r"[\d.]*\d", "#", text) for text in found] == snapshot
 

@@ -1,4 +1,4 @@
-"""Tables of experiments, from estimates made by hand: who counts, what programs read, and how it is printed."""
+"""Tables of experiments from hand-made estimates: counted estimates, machine-readable output, and text."""
 
 import json
 
@@ -115,7 +115,7 @@ def test_differing_settings_are_named(results):
 
 
 def measured(results):
-    """Medians of the tracker and of the estimator of whole records."""
+    """Return the medians of the tracker and of the estimator of whole records."""
     names = ("median_settling_time", "median_settling_after_step", "median_rms_1", "median_rms_2", "false_alarms")
     return [[row.get(name) for name in names] for row in records_of(percentage_frame(results))]
 
@@ -124,7 +124,7 @@ def test_medians_are_of_the_slowest_tone(tmp_path):
     tracks = [of_track(1.0, 3.0, 2.0, 0.1, 0), of_track(2.0, 1.5, 3.0, 0.3, 2), of_track(5.0, 0.0, 9.0, 0.2, 1)]
     results = frequency_results(tmp_path, tracks, [of_record(0.01)])
     assert measured(results) == [[3.0, 3.0, 0.2, 0.2, 3], [None, None, 0.01, 0.05, None]]
-    # Settled in time: not the one with 5 and 9 s, and of whole records those whose errors lie in the band.
+    # Settled in time: not the one with 5 and 9 s; of the whole records, those with errors inside the band.
     assert percentage_frame(results)["converged"].tolist() == [2, 1]
 
 

@@ -1,4 +1,4 @@
-"""The page of a track: complete in itself, and safe whatever names files and columns have."""
+"""Page of a track: self-contained, and safe for any names of files and columns."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What is said and written about a track."""
+"""Text and files of a track."""
 
 import io
 import json
@@ -82,6 +82,6 @@ def test_figure(tones):
     one, two = (track_drawing(track, 0.0, "Pa", "title").saved() for _ in range(2))
     assert one == two
     assert one.startswith(b"<?xml")
-    assert b"#e4e4e4" in one  # the shade of what is not valid
+    assert b"#e4e4e4" in one  # the shade of invalid rows
     plain = Track.of(track.t, omega, np.zeros(ROWS, np.uint16), 0.1, amplitudes=1.0 / omega)
     assert b"#e4e4e4" not in track_drawing(plain, 0.0, None, "title").saved()

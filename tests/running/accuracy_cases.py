@@ -1,4 +1,4 @@
-"""Experiments whose accuracy theory gives, and some that have no theory."""
+"""Experiments with a theory of their accuracy, and some without."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ CASES = yaml.safe_load((HERE / "accuracy.yaml").read_text(encoding="utf-8"))
 
 
 def specification(case, folder):
-    """The file of a case: the simulation examples of Gonzalez et al., or a single mode, with changes."""
+    """Write the file of a case: the simulation examples of Gonzalez et al., or a single mode, with changes."""
     content = (HERE / "specifications" / f"{CASES[case]['of']}.yaml").read_text(encoding="utf-8")
     for old, new in CASES[case].get("change", ()):
         assert content.count(old) == 1

@@ -1,4 +1,4 @@
-"""Plans of toy estimators that behave, raise, die or dawdle: what the engine must cope with."""
+"""Plans of toy estimators that work, raise, end their process or hang, for tests of the engine."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FakeRecord:
 
 @dataclass(frozen=True)
 class ToySource:
-    """Data sets of noise at some level; that of replicate `hangs_at` is never made."""
+    """Source of noise data sets at some level; that of replicate `hangs_at` is never finished."""
 
     level: float
     seed: int
@@ -63,7 +63,7 @@ class ToySource:
 
 @dataclass(frozen=True)
 class Toy:
-    """Estimates from random numbers; its mischief happens in replicate `at`, until the file `marker` is there."""
+    """Estimator by random numbers; it misbehaves in replicate `at`, until the file `marker` exists."""
 
     mischief: str = "none"
     at: int = -1
@@ -114,7 +114,7 @@ STARTS = (
 
 @dataclass(frozen=True)
 class ToySpec:
-    """What a plan asks of its specification."""
+    """The attributes of a specification used by a plan."""
 
     experiment: str
     content: dict[str, Any]
@@ -138,7 +138,7 @@ def toy_plan(
     precision: dict[str, Any] | None = None,
     limits: dict[str, float] | None = None,
 ) -> Plan:
-    """Plan toys on noise of several levels; every second of them takes no start, the others take two."""
+    """Plan toys on noise of several levels; every second toy takes no start, the others take two."""
     seed = 7
     system = {"numerator": [2.0], "denominator": [1.0, 1.0], "delay": 8.0}
     contents = [{"system": system, "level": level, "seed": seed} for level in levels]
@@ -166,7 +166,7 @@ def toy_plan(
 
 
 def run(plan: Plan, place: Path, jobs: int | None = 2, **options: Any) -> RunSummary:
-    """Run toys, for which no kernel is to be compiled."""
+    """Run toys, which need no compiled kernels."""
     return run_experiment(plan, place, jobs=jobs, **{"warm": lambda plan: None, **options})
 
 
@@ -175,12 +175,12 @@ def exported(place: Path) -> bytes:
 
 
 def outcomes_of(job: Job) -> list[Outcome]:
-    """What comes of a job in this process."""
+    """Return the outcomes of a job computed in this process."""
     return [entry for entry in run_job(job) if isinstance(entry, Outcome)]
 
 
 def blas_threads() -> int:
-    """Most threads that any OpenBLAS in this process would use."""
+    """Return the maximum number of threads of any OpenBLAS in this process."""
     import scipy.linalg  # noqa: F401  (loads a BLAS of its own)
 
     counts = []

@@ -1,4 +1,4 @@
-"""What estimators do that take more than they may, fail, or are not let finish by the machine."""
+"""Misbehaving estimators: they exceed limits, fail, or lack machine resources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run in a process of its own, to be interrupted; it prints the ids of estimates as they are reported done."""
+"""A run in a separate process, to be interrupted; it prints the ids of estimates reported as done."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Custom components and measures: computed by workers as here, and a failure costs its own estimates only."""
+"""Custom components and measures: same results in workers, and a failure affects only its own estimates."""
 
 import json
 import os
@@ -90,7 +90,7 @@ estimators:
   bad:       {kind: "./parts.py:Mean", mischief: [raise, die, nan]}
 monte_carlo: {runs: 2, seed: 2}
 """
-#: Estimators of ctid, of which measures are taken.
+#: Built-in estimators for custom measures.
 OWN = (
     "noise={kind: white, standard_deviation: 0.1}",
     "estimators={one: {kind: srivc, poles: 1, zeros: 0}, two: {kind: delay_profile, poles: 1, zeros: 0, "
@@ -149,7 +149,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fil
     assert "mean is nan; give a status" in results["bad", "nan", bad[0]]["message"]
     assert summary.failed == 3 * len(bad)
 
-    # Nothing is left to do, whatever is said in comments; other numbers are other results.
+    # Comments do not change results; other numbers do.
     level = file.with_name("level.py")
     level.write_text("LEVEL = 0.5  # of the noise\n", encoding="utf-8")
     assert run(planned(file), out).computed == 0
@@ -158,7 +158,7 @@ def test_workers_run_it_failures_stay_alone_and_changed_code_is_not_mixed_in(fil
     with pytest.raises(RefusedError, match="results of other code"):
         run(planned(file), out)
     assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
-    # Results are read without the code.
+    # Results can be read without the code.
     os.unlink(file.with_name("parts.py"))
     assert json.dumps(list(read_stored(out)))
 
@@ -210,7 +210,7 @@ def test_the_value_of_a_measure_is_stored_with_every_estimate_and_in_every_table
     rows = json.loads(ctid("table", *out, "--measure", "Slowest", "--format", "json"))
     assert [(row["value"], row["unit"], row["n"]) for row in rows] == [(pytest.approx(19.9), "s", 2)] * 2
     assert "did you mean 'Slowest'" in ctid("table", *out, "--measure", "Slowet", code=2)
-    # Nothing that a measure changes reaches what comes after it.
+    # Changes made by a measure do not affect later computations.
     run(planned(file, *OWN), tmp_path / "plain")
     plain = read_estimates(tmp_path / "plain")
     assert plain["numerator"].tolist() == estimates["numerator"].tolist()

@@ -1,4 +1,4 @@
-"""Workers of dask: the bytes of one machine, whatever happens to them, and no worker that computes otherwise."""
+"""Dask workers: same bytes as on one machine, failures of workers, and refusal of workers with another origin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctid_cli.signals.files import COPIES
 from ctid_cli.simulation.dataset import require_content
 from tests.running.fakes import Toy, exported, run, toy_plan
 
-# As errors, warnings would end the threads of dask that they come from.
+# As errors, warnings would end the dask threads in which they occur.
 pytestmark = pytest.mark.filterwarnings("default")
 
 
@@ -86,7 +86,7 @@ def test_data_files_come_by_content(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(DataError, match="differs from that of the planned"):
         require_content(str(file), digest)
     monkeypatch.setitem(COPIES, digest, "the copy")
-    # Also in the process that computes a suspect alone.
+    # Also in the separate process of a suspect.
     sent = packed()
     monkeypatch.delitem(COPIES, digest)
     unpacked(sent)

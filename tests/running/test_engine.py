@@ -36,7 +36,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def snapshot(place: Path) -> dict[str, tuple[str, int]]:
-    """Content and modification time of every file."""
+    """Return content and modification time of every file."""
     return {
         str(path.relative_to(place)): (hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_mtime_ns)
         for path in place.rglob("*")
@@ -46,7 +46,7 @@ def snapshot(place: Path) -> dict[str, tuple[str, int]]:
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Start a run of toys in a process group of its own, which ends with the test."""
+    """Start a run of toys in a separate process group, which ends with the test."""
     with ExitStack() as stack:
 
         def started(place: Path, jobs: int, *more: str) -> subprocess.Popen[str]:
@@ -60,7 +60,7 @@ def start() -> Iterator[Start]:
 
 
 def read_ids(process: subprocess.Popen[str], lines: int) -> list[str]:
-    """Ids of the estimates in the next lines of a run's output."""
+    """Return the ids of the estimates in the next lines of a run's output."""
     assert process.stdout is not None
     ids: list[str] = []
     for _ in range(lines):
@@ -69,12 +69,12 @@ def read_ids(process: subprocess.Popen[str], lines: int) -> list[str]:
 
 
 def finish(process: subprocess.Popen[str], within: float = 300) -> tuple[list[str], str]:
-    """The remaining ids and the error output of a run, once it and its workers have ended."""
+    """Return the remaining ids and the error output of a run after it and its workers have ended."""
     assert process.stdout is not None
     assert process.stderr is not None
     watchdog = threading.Timer(within, os.killpg, (process.pid, signal.SIGKILL))
     watchdog.start()
-    # Not communicate(), which forgets what readline() has read ahead.
+    # Not communicate(), which ignores text already buffered by readline().
     output, errors = process.stdout.read(), process.stderr.read()
     process.wait()
     watchdog.cancel()
@@ -350,10 +350,10 @@ def test_a_second_run_is_refused_and_told_who_runs(tmp_path: Path, start: Start)
     status = experiment_status(place)
     assert status.running is not None
     assert status.running["pid"] == process.pid
-    # Others see what is stored, and more of it a little later.
+    # Other processes see the stored estimates, and more of them later.
     first = now = len(read_estimates(place))
     while now == first:
-        # A line for each data set; a data set may have been stored before its line was read here.
+        # One line per data set; a data set may be stored before its line is read here.
         read_ids(process, 3)
         now = len(read_estimates(place))
     assert now < 3000

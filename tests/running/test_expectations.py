@@ -1,4 +1,4 @@
-"""What theory expects of the estimators of a plan: printed numbers of the paper, and two routes to one number."""
+"""Theoretical accuracy of the estimators of a plan: published numbers, and equal results of two methods."""
 
 import numpy as np
 import pytest
@@ -22,13 +22,13 @@ def accuracy(tmp_path):
 
 
 def errors(estimates, estimator, k=-1):
-    """Standard errors of an estimator at one of the lengths, with the number of samples."""
+    """Return standard errors of an estimator at one of the lengths, with the number of samples."""
     entry = [entry for entry in estimates if entry["estimator"] == estimator][k]
     return np.array([p["standard_error"] for p in entry["parameters"]]), entry["samples"]
 
 
 def variances(estimates, estimator, letter, k=-1):
-    """N times the variances of the parameters whose name ends so."""
+    """Return N times the variances of the parameters with a name ending."""
     found, samples = errors(estimates, estimator, k)
     names = next(entry for entry in estimates if entry["estimator"] == estimator)["parameters"]
     return [samples * e**2 for e, p in zip(found, names, strict=True) if p["name"].endswith(letter)]
@@ -39,7 +39,7 @@ def test_the_printed_variances_of_the_paper(accuracy):
     for k in (1, 2):
         np.testing.assert_allclose(variances(found, "sum", "b0", k), [35.60, 2.700, 0.4405, 0.2240], rtol=3e-4)
     np.testing.assert_allclose(variances(found, "srivc", "b0"), [36.75, 3.645, 0.5341, 0.2322], rtol=3e-4)
-    # Of short records from data sets, which is another way.
+    # Short records use data sets, which is another method.
     ratios = np.array(variances(found, "sum", "b0", 0)) / variances(found, "sum", "b0")
     assert 1e-3 < np.abs(ratios - 1).max() < 0.4
     found = accuracy("closed loop")
@@ -58,7 +58,7 @@ def test_where_the_reference_enters(accuracy):
 
 
 def test_different_ways_to_the_same_numbers(accuracy, tmp_path):
-    """A bound averaged over data sets; white noise of another kind; as many parameters in both forms."""
+    """Bound averaged over data sets; white noise of another kind; equal numbers of parameters in both forms."""
     found, _ = errors(accuracy("an estimated delay"), "known")
     bounds = []
     plan = build_plan(load_spec(tmp_path / "spec.yaml"))

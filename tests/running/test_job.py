@@ -19,7 +19,7 @@ from tests.running.fakes import STARTS, FakeFit, FakeRecord, Prepared, Toy, ToyS
 
 @dataclass(frozen=True)
 class Counting(Toy):
-    """Counts how often records are prepared."""
+    """Toy that counts how often records are prepared."""
 
     def prepare(self, record: FakeRecord) -> Prepared:
         PREPARED.append(record.replicate)
@@ -111,7 +111,7 @@ def test_what_the_machine_is_short_of_is_no_result(error: Exception, reason: str
 
 @dataclass(frozen=True)
 class FractionFit(FakeFit):
-    """A fit with what the conversion to submodels needs."""
+    """A fit with the attributes needed for the conversion to submodels."""
 
     parameter_names: tuple[str, ...] = ("a1", "a2", "b0")
     covariance: np.ndarray[Any, Any] = field(default_factory=lambda: np.diag([0.01, 0.04, 0.09]))
@@ -119,7 +119,7 @@ class FractionFit(FakeFit):
 
 @dataclass(frozen=True)
 class Fraction(Toy):
-    """Estimates a second-order fraction, and keeps what it was told to start from."""
+    """Toy that estimates a second-order fraction, and keeps its start."""
 
     def prepare(self, record: FakeRecord) -> Any:
         return self
@@ -151,14 +151,14 @@ def test_starts_are_told_the_true_system_and_fractions_the_submodels_to_find() -
     assert untouched.result["standard_errors"].keys() == {"b0", "a1", "a2"}
     (factored,) = outcomes_of(Job(data_cell(Source()), 3, 7, wanted, (Term(2, 0),)))
     assert factored.result["parameters"] == pytest.approx({"g1_a1": 0.75, "g1_a2": 0.25, "g1_b0": 0.5, "g1_b1": 0.0})
-    # a_1 = a1/a2: the relative variances of both add up.
+    # a_1 = a1/a2: the relative variances of both are added.
     assert factored.result["standard_errors"]["g1_a1"] == pytest.approx(0.75 * np.hypot(0.1 / 3, 0.2 / 4))
     assert factored.result["standard_errors"].keys() == {"b0", "a1", "a2", *factored.result["parameters"]}
     assert json.loads(json.dumps(factored.result, allow_nan=False)) == factored.result
 
 
 def test_processor_time_does_not_pass_while_an_estimator_waits() -> None:
-    # Of a busy one it does, however many others share the processor.
+    # It does for a busy toy, whatever the load of the machine.
     (waits, *_), (works, *_) = outcomes_of(job(Toy(seconds=0.2))), outcomes_of(job(Toy(seconds=0.2, busy=True)))
     assert waits.seconds is not None
     assert waits.cpu_seconds is not None

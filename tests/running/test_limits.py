@@ -20,12 +20,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def toys(*hostile: Toy, runs: int = 3, **options: Any) -> Any:
-    """A well-behaved estimator, hostile ones and another good one, which all share data sets."""
+    """Plan a well-behaved estimator, hostile ones and another good one, which all share data sets."""
     return toy_plan(Toy(), *hostile, Toy(order=4), levels=(5,), runs=runs, **options)
 
 
 def failures(place: Path) -> dict[tuple[str, int, str], str]:
-    """Status of what did not converge, by estimator, replicate and start."""
+    """Return the status of estimates that did not converge, by estimator, replicate and start."""
     frame = read_estimates(place)
     bad = frame[frame["status"] != "CONVERGED"]
     return dict(zip(zip(bad["estimator"], bad["replicate"], bad["start"], strict=True), bad["status"], strict=True))

@@ -1,4 +1,4 @@
-"""From a specification to a plan: what is expanded, and what the identity of an estimate is made of."""
+"""From a specification to a plan: expansion, and content of the identity of an estimate."""
 
 import hashlib
 
@@ -166,7 +166,7 @@ def test_too_many_cells(plan_of):
 
 
 def test_what_a_data_cell_is_made_of(plan_of):
-    """Another value here would leave the results of every user aside."""
+    """A changed hash would make the stored results of every user unused."""
     plan = plan_of()
     assert plan.data_cells[0].content == {
         "system": {"numerator": [2.0], "denominator": [0.25, 0.7, 1.0], "delay": 1.0},

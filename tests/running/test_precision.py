@@ -1,4 +1,4 @@
-"""Data sets until the measures are precise: runs that follow the rule."""
+"""Runs with data sets until the measures are precise enough."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ctid_cli.storage.estimates import read_stored
 from tests.running.fakes import exported, run, toy_plan
 
 UNTIL = {"until": {"percent_half_width": 13.0}, "at_most": 60}
-#: First block of the runs below, which need not be long to be interrupted.
+#: First block of the runs below; short runs suffice for interruptions.
 FEW = 20
 
 
@@ -53,7 +53,7 @@ def test_every_cell_gets_the_data_sets_it_needs(undisturbed: Path) -> None:
     assert sizes(undisturbed) == [first.needed, second.needed]
     assert first.needed > second.needed
     assert len(stored.results) == 3 * (first.needed + second.needed)
-    # The interval that decided is that of the tables.
+    # The interval used for the decision is that of the tables.
     rows = [row for row in stored.rows() if row["cell"] == first.cell]
     assert first.widest is not None
     hits = [row["converged"] for row in rows if (row["estimator"], row["start"]) == ("toy0", first.widest.start)]
@@ -79,13 +79,13 @@ def test_neither_workers_nor_interruptions_change_a_byte(
         return run(plan(), place, jobs=jobs, stop=request, progress=listen)
 
     assert interrupted(jobs=1, commits=1).computed > 0
-    # Wherever the first run stopped, the next ones go on from it.
+    # The next runs continue wherever the first run stopped.
     assert interrupted(jobs=2, commits=1).reused > 0
     interrupted(jobs=1, commits=20)
     summary = run(plan(), place)
     assert (summary.exit_code, summary.missing) == (0, 0)
     assert exported(place) == exported(undisturbed)
-    # Once more there is nothing to do.
+    # A further run has nothing to do.
     assert preview(plan(), place).estimates == 0
     assert run(plan(), place).computed == 0
     assert exported(place) == exported(undisturbed)

@@ -1,4 +1,4 @@
-"""Experiments with several inputs: the sum of those with one, and estimates under the names of all inputs."""
+"""Experiments with several inputs: sum of single-input data sets, and estimates under the names of all inputs."""
 
 from copy import deepcopy
 

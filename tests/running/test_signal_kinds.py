@@ -1,4 +1,4 @@
-"""Every kind of input, clock, noise and controller from its specification to its estimates."""
+"""Every kind of input, clock, noise and controller, from specification to estimates."""
 
 import json
 
@@ -12,7 +12,7 @@ from ctid_cli.simulation.dataset import LoopOptions, MeasuredSource
 from ctid_cli.specification.load import load_spec
 from tests.running.fakes import outcomes_of
 
-#: A value for every section, and options for every kind that has some without a default.
+#: A value for every section, and options of every kind with required ones.
 USUAL = {
     "excitation": {"kind": "prbs", "stages": 7, "clock_period": 0.4},
     "sampling": {"kind": "regular", "interval": 0.1, "samples": 400},
@@ -48,7 +48,7 @@ def specification(**sections):
 
 
 def specifications():
-    """Every kind in one experiment at least, with others beside it."""
+    """Yield specifications that use every kind in at least one experiment."""
     kinds = [list(KINDS[section]) for section in USUAL]
     for k in range(max(map(len, kinds))):
         chosen = {section: names[k % len(names)] for section, names in zip(USUAL, kinds, strict=True)}
@@ -63,7 +63,7 @@ def specifications():
 
 @pytest.fixture
 def plan_of(tmp_path):
-    """The plan of a specification with some sections."""
+    """Return the plan of a specification with some sections."""
     write_columns(tmp_path / "input.csv", "t,u", [0, 3, 4, 11, 13], [1, -1, 1, -1, 1])
     write_columns(tmp_path / "instants.csv", "t", 7.0 + 0.1 * np.arange(400) ** 1.02)
 
@@ -83,7 +83,7 @@ def test_every_kind_runs_from_its_specification_to_its_estimates(plan_of, sectio
     (outcome,) = outcomes_of(plan_of(**sections).job(0, 0))
     estimate = outcome.result
     assert estimate["status"] == "CONVERGED"
-    # 30 dB and a few hundred samples: a fifth is far more than the noise can do.
+    # 30 dB and a few hundred samples: the noise causes much smaller errors than a fifth.
     np.testing.assert_allclose([*estimate["numerator"], estimate["denominator"][1]], [2.0, 2.0], rtol=0.2)
 
 
@@ -93,7 +93,7 @@ def test_gains_in_continuous_time_follow_the_interval(plan_of, tmp_path):
     for cell in plan_of(**LOOP, loop=loop, sampling=sampling).data_cells:
         kp = 0.5 + 0.5 * cell.swept["interval"] / cell.swept["ti"]
         np.testing.assert_allclose(cell.dataset(0).record.loop.controller.numerator, [kp, -0.5])
-    # A measured loop takes gains in seconds too.
+    # A measured loop accepts gains in seconds too.
     file = tmp_path / "record.csv"
     file.write_text("t,r,u,y\n" + "".join(f"{0.1 * k},{k % 3},{k % 5},{k % 7}\n" for k in range(30)))
     source = MeasuredSource(str(file), reference="r", loop=LoopOptions(ContinuousPid(kp=1.0, ti=2.0)))

@@ -1,4 +1,4 @@
-"""What several tests of signals use."""
+"""Fixtures of several tests of signals."""
 
 import pytest
 

@@ -22,7 +22,7 @@ def rig(tmp_path):
 
 
 def opaque(variable, kind):
-    """A version 5 file with one object, laid out as MATLAB does it."""
+    """Return a version 5 file with one object, in MATLAB's layout."""
 
     def element(code, data):
         return struct.pack("<II", code, len(data)) + data + b"\0" * (-len(data) % 8)
@@ -36,7 +36,7 @@ def opaque(variable, kind):
 
 
 def save_v73(path, groups):
-    """A version 7.3 file: HDF5 behind a MATLAB header; arrays lie transposed."""
+    """Write a version 7.3 file: HDF5 after a MATLAB header; arrays are transposed."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, (kind, value) in groups.items():
             item = file.create_group(name) if value is None else file.create_dataset(name, data=value)
@@ -45,7 +45,7 @@ def save_v73(path, groups):
         file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + struct.pack("<HH", 0x0200, 0x4D49))
 
 
-# --- what is read ---------------------------------------------------------------------------------
+# --- accepted files -------------------------------------------------------------------------------
 
 COLUMNS = {"t": T, "u": U, "y": Y}
 V73 = {name: (b"double", value[None, :]) for name, value in COLUMNS.items()}
@@ -96,7 +96,7 @@ def test_numbers_of_other_types_are_converted_and_names_may_be_given(rig):
     assert measurement.record.input.values.tolist() == [-1.0, 1.0, 1.0]
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- refused files --------------------------------------------------------------------------------
 
 LINE = (
     "s = struct('t', z.SamplingInstants, 'u', z.InputData, 'y', z.OutputData); "

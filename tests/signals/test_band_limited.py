@@ -1,4 +1,4 @@
-"""A band-limited signal as straight lines on a finer clock, against exact answers to periodic inputs."""
+"""Band-limited signals as straight lines on a finer clock, against exact responses to periodic inputs."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ MODELS = {
 
 
 def period(top, seed=0):
-    """Harmonics up to a fraction of half the sampling frequency: frequencies, phases."""
+    """Return harmonics up to a fraction of half the sampling frequency: frequencies, phases."""
     harmonics = np.arange(1, int(top * PERIOD / 2))
     phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, harmonics.size)
     return 2 * np.pi * harmonics / (PERIOD * INTERVAL), phases
@@ -46,7 +46,7 @@ def test_answers_are_those_of_the_harmonics(model, top):
         off[hold] = np.std((simulate(model, HeldSignal(t, u, hold), t) - true)[middle]) / np.std(true)
     assert off["band-limited"] < 2e-4
     assert off["foh"] > 50 * off["band-limited"]
-    # Any other instants take another way, and see the same.
+    # Other instants use another method, with the same result.
     some = t[3 * PERIOD : 4 * PERIOD] + 0.07
     between = simulate(model, HeldSignal(t, u, "band-limited"), some)
     assert np.std(between - waves(some, w, phases, exact(model, w))) < 4e-4 * np.std(true)
@@ -79,7 +79,7 @@ def test_what_is_not_known_at_the_ends():
     wide, narrow = (band_limited_doubt(t, waves(t, *period(top))) for top in (0.97, 0.2))
     assert wide.beyond > 0.01 > narrow.beyond
     assert narrow.ends < 0.2 * wide.ends
-    # The doubt is of the size of the error.
+    # The estimated uncertainty is of the size of the error.
     values = waves(t, w, phases)
     lines = HeldSignal(t, values, "band-limited").lines
     damped = np.sinc(w * INTERVAL / FINER / (2 * np.pi)) ** 2

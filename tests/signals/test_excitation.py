@@ -1,4 +1,4 @@
-"""Inputs: what theory says of each signal, and where it takes its values."""
+"""Inputs: theoretical properties of each signal, and times of its changes."""
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ BASE = 2 * np.pi / PERIOD
             {"lowest_frequency": BASE, "highest_frequency": 64 * BASE, "tones": 7, "spacing": "logarithmic"},
             [1, 2, 4, 8, 16, 32, 64],
         ),
-        # Crowded tones become one.
+        # Coinciding tones become one.
         ({"lowest_frequency": BASE, "highest_frequency": 3 * BASE, "tones": 9}, [1, 2, 3]),
     ],
 )
@@ -151,7 +151,7 @@ def test_without_a_clock_every_instant_has_a_value(excitation):
         (Step(amplitude=-2.0, time=1.05), 0.0, [0.0, 0.0, -2.0, -2.0, -2.0]),
         (Step(), 0.0, [1.0, 1.0, 1.0, 1.0, 1.0]),
         (Steps((1.0, 1.1, 40.0), (2.0, -1.0, 5.0)), 0.0, [0.0, 2.0, 2.0, -1.0, -1.0]),
-        # Of steps before the record the last one is what it begins with.
+        # The last of the steps before the record gives its initial value.
         (Steps((0.2, 0.4, 1.1), (7.0, 3.0, -1.0)), 0.5, [0.0, 3.0, 3.0, -1.0, -1.0]),
     ],
 )
@@ -174,9 +174,9 @@ def test_steps_behind_the_record_are_refused(excitation):
     ("text", "hold", "record", "instants", "values"),
     [
         ("t,u\n0,1\n0.25,-1\n1,3\n9,4\n10,5\n", "zoh", [0.0, 0.7, 2.0], [0.2, 0.25, 0.99, 2.0], [1, -1, -1, 3]),
-        # Straight lines reach the end of the record.
+        # Straight lines extend to the end of the record.
         ("t,u\n0,0\n10,20\n11,0\n", "foh", [0.0, 4.0], [0.0, 1.0, 4.0], [0, 2, 8]),
-        # What lies before the record is not applied.
+        # Values before the record are not used.
         ("t,u\n-1,1\n1,3\n2,4\n", "zoh", [0.0, 5.0], [-0.5, 0.0, 1.0, 5.0], [0, 1, 3, 4]),
         ("t,u\n-1,1\n1,3\n2,4\n", "foh", [0.0, 5.0], [-0.5, 0.0, 1.0, 5.0], [0, 2, 3, 4]),
         # Before the first break the input is zero.

@@ -1,4 +1,4 @@
-"""Tables of frequency responses: every form of one table is the same data, and what is refused."""
+"""Tables of frequency responses: all forms of a table give the same data; refusals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Held signals: their value at any instant, and what they refuse; regular clocks."""
+"""Held signals: values at any instant, and refusals; regular clocks."""
 
 import numpy as np
 import pytest
@@ -32,13 +32,13 @@ def test_values_between_the_breaks_before_and_after(hold, values):
 @given(signals(), st.floats(-50, 50), st.floats(0, 50))
 def test_delay_shifts_the_signal(signal, time, delay):
     later = signal.delayed(delay)
-    # Away from jumps, since the rounding of time + delay may put an instant on either side of one.
+    # Not near jumps, where rounding of time + delay may place an instant on either side.
     if np.abs(signal.t - time).min() > 1e-6:
         np.testing.assert_allclose(later.at(time + delay), signal.at(time), atol=1e-9)
 
 
 def test_an_edge_and_a_sample_of_one_name_are_one_instant():
-    # The same instants, rounded differently: some of the coarse ones lie before the fine ones.
+    # Equal instants with different rounding: some of the coarse ones precede the fine ones.
     coarse, fine = 0.3 * np.arange(400), 0.1 * np.arange(1200)
     assert (coarse < fine[::3]).any()
     signal = HeldSignal(fine, np.arange(1200.0))
@@ -83,6 +83,6 @@ def test_one_late_sample_makes_a_clock_irregular(samples, shift, data):
 
 
 def test_times_written_with_few_digits_are_still_regular():
-    # A file with ten digits after the point, as loggers write them.
+    # A file with ten digits after the point, as written by loggers.
     t = np.round(np.arange(1000) / 300, 10)
     assert regular_interval(t) == pytest.approx(1 / 300, rel=1e-9)

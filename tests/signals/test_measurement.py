@@ -1,11 +1,11 @@
-"""Measured files: columns by name, units as labels, windows, and one clear sentence for what cannot be used."""
+"""Measured files: columns by name, units as labels, windows, and clear messages about unusable ones."""
 
 import pytest
 
 from ctid_cli.errors import DataError
 from ctid_cli.signals.measurement import read_measurement
 
-# --- what is read ---------------------------------------------------------------------------------
+# --- accepted files -------------------------------------------------------------------------------
 
 
 def test_units_in_the_header_are_labels_and_convert_nothing(write):
@@ -32,7 +32,7 @@ def test_three_columns_are_taken_by_position_and_a_note_says_so(write):
     assert measurement.notes == (
         "Columns were taken by their position: 'when' as the time, 'valve' as the input and 'level' as the output.",
     )
-    # what is known is not taken twice
+    # known columns are not assigned twice
     partly = read_measurement(write("level,valve,t\n1,5,0\n2,6,1\n"), output="level")
     assert (partly.time, partly.input, partly.output) == ("t", "valve", "level")
     assert partly.notes == ("Columns were taken by their position: 'valve' as the input.",)
@@ -61,7 +61,7 @@ def test_other_text_files_are_read_alike(write):
         assert read_measurement(write("t,u,y\n0,1,2\n1,3,4\n", name)).record.n_samples == 2
 
 
-# --- what is refused ------------------------------------------------------------------------------
+# --- refused files --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

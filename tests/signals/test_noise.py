@@ -1,4 +1,4 @@
-"""Noise: its covariance by two routes, its first samples, its levels; and the random streams."""
+"""Noise: covariance by two methods, first samples, levels; and random streams."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ PUBLISHED = {"numerator": (1.0, 0.5), "denominator": (1.0, -0.85)}
 
 
 class Given:
-    """Stands for a generator: hands out the numbers that it was given, in order."""
+    """Generator that returns given numbers in order."""
 
     def __init__(self, numbers):
         self.numbers = list(numbers)
@@ -38,7 +38,7 @@ def rng(replicate=0):
 
 
 def by_impulse_response(numerator, denominator, lags, length=4000):
-    """Covariance as the sum of products of the impulse response, by plain recursion."""
+    """Return the covariance as the sum of products of the impulse response, by plain recursion."""
     response = np.zeros(length)
     for k in range(length):
         value = numerator[k] if k < len(numerator) else 0.0
@@ -81,7 +81,7 @@ def test_levels_scale_one_shape(snr_db, replicate):
         (WhiteNoise(standard_deviation=np.sqrt(variance)), white),
         (ArmaNoise((1.0,), (1.0,), variance=variance), white),
         (ArmaNoise(**PUBLISHED, snr_db=snr_db), coloured.generate(OUTPUT, rng(replicate))),
-        # The gain of a filter is one more way to say the level.
+        # The gain of a filter is another way to set the level.
         (ArmaNoise((2.0, 1.0), (2.0, -1.7), variance=variance), coloured.generate(OUTPUT, rng(replicate))),
     ]:
         drawn = noise.generate(OUTPUT, rng(replicate))
@@ -108,7 +108,7 @@ def test_a_ratio_needs_an_output(noise):
 
 
 def test_streams_are_those_of_the_spawn_keys_and_differ():
-    # Stored results are repeatable only as long as these numbers stay what they are.
+    # Stored results are repeatable only if these numbers never change.
     assert ROLES == {"input": 0, "sampling": 1, "noise": 2, "start": 3, "parameters": 4}
     expected = np.random.default_rng(np.random.SeedSequence(20170331, spawn_key=(2, 5))).standard_normal(3)
     assert np.array_equal(stream(20170331, "noise", 5).standard_normal(3), expected)

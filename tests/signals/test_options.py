@@ -1,4 +1,4 @@
-"""Options of signals, noises and samplings: what is refused, in one sentence that names the option."""
+"""Options of signals, noises and samplings: refusals in one sentence that names the option."""
 
 from dataclasses import fields
 from typing import Annotated, Literal, get_args, get_origin, get_type_hints
@@ -22,7 +22,7 @@ NAN = float("nan")
 
 
 def has_check(hint):
-    """Whether an annotation says what is allowed, or nothing has to be said: of names of files and columns."""
+    """Return whether an annotation defines the allowed values, or need not: for names of files and columns."""
     parts = [part for part in get_args(hint) if part not in (type(None), Ellipsis)]
     return get_origin(hint) in (Annotated, Literal) or hint in (str, bool) or bool(parts and all(map(has_check, parts)))
 

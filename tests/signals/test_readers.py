@@ -1,4 +1,4 @@
-"""Text files as programs and people write them: what is read, and the exact message where a file is refused."""
+"""Text files of programs and people: content read, and exact messages about refused files."""
 
 import h5py
 import numpy as np
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from ctid_cli.errors import DataError
 from ctid_cli.signals.measurement import read_held_signal, read_measurement, read_record
 
-#: What most files below hold.
+#: Content of most files below.
 T, U, Y = (0.0, 0.5, 1.0), (1.0, -1.5, 2.0), (0.25, np.nan, 3.0)
 COMMA = "Numbers were read with decimal commas."
 ANSI = "The file is not UTF-8; it was read as Windows-1252."
@@ -75,7 +75,7 @@ DATE = "which is a date or a time of day; write times as numbers, such as second
 NUMBER = "which is not a number; leave the field empty if the sample is missing"
 NO_NAMES = ":1: the first line holds numbers; it must name the columns, for example t,u,y"
 HUGE = "give it in a unit in which it is between"
-#: Kind: content, the message behind the name of the file.
+#: Kind: content, the message after the file name.
 REFUSED = {
     "empty": ("", ":1: the file is empty; its first line must name the columns"),
     "comments only": ("# t,u,y\n", ":1: the file is empty; its first line must name the columns"),

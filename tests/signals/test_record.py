@@ -11,7 +11,7 @@ ONE = HeldSignal([0.0], [1.0])
 
 
 class Proportional:
-    """The least that a record needs to know of a controller."""
+    """The minimum interface of a controller for a record."""
 
     numerator = (2.0,)
     denominator = (1.0,)

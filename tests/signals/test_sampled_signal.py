@@ -1,4 +1,4 @@
-"""One signal with its clock, from files of all kinds."""
+"""A signal with its clock, from all kinds of files."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Sampling schemes: the distributions of their intervals, given instants, and sizes of records."""
+"""Sampling schemes: distributions of intervals, given instants, and record lengths."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from ctid_cli.signals.sampling import (
     geometric_sizes,
 )
 
-#: Below this p-value a distribution is another one; the seeds are fixed.
+#: Significance level of the tests of distributions; the seeds are fixed.
 LEVEL = 1e-3
 
 
@@ -94,7 +94,7 @@ def test_geometric_sizes(first, ratio, count):
     [(2000, 100_000, 30, 778_580, 778_581), (500, 123_036, 50, 1_153_484, 1_153_482)],
 )
 def test_sizes_of_the_published_studies_of_additive_models(first, last, count, unrounded, rounded):
-    # The totals that González, Classens, Rojas, Welsh and Oomen print are those of the sizes before rounding.
+    # The totals printed by González, Classens, Rojas, Welsh and Oomen are those of the sizes before rounding.
     exact = [first * (last / first) ** (k / (count - 1)) for k in range(count)]
     assert round(sum(exact)) == unrounded
     assert sum(geometric_sizes(first, last, count)) == rounded

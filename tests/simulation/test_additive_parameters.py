@@ -1,4 +1,4 @@
-"""Estimates of one fraction in the parameters of submodels: values, errors, and where there are none."""
+"""Estimates of one fraction converted to submodel parameters: values, errors, and missing results."""
 
 from dataclasses import dataclass
 
@@ -83,7 +83,7 @@ def test_undefined_errors_are_not_finite():
     fit = fraction_fit()
     fit.covariance[:] = np.nan
     assert np.isnan(list(additive_parameters(fit, TERMS)[1].values())).all()
-    # A numerator that lost its leading coefficient: the parameters do not match those of the model.
+    # A numerator without its leading coefficient: the parameters do not match those of the model.
     fit = fraction_fit(AdditiveModel([Submodel([3.0], [0.25, 0.25, 1.0]), Submodel([1.0], [0.025, 0.01, 1.0])]))
     fit.parameter_names = (*fit.parameter_names, "b3")
     assert np.isnan(list(additive_parameters(fit, TERMS)[1].values())).all()
@@ -101,10 +101,10 @@ def test_a_sum_of_submodels_is_what_it_is():
     ("denominator", "terms"),
     [
         ([1.0, 2.0, 1.0], (Term(2, 0),)),  # a repeated pole
-        ([1.0, 2.0, 3.0], TERMS),  # not as many poles
+        ([1.0, 2.0, 3.0], TERMS),  # another number of poles
         ([1.0, 2.0, 3.0], (Term(1, 0), Term(1, 0))),  # complex poles in two submodels
         ([1.0, 2.0, 3.0], (Term(1, 0), Term(0, 0, 1))),  # no integrator
-        ([1.0, 2.0, 3.0], None),  # not asked for
+        ([1.0, 2.0, 3.0], None),  # not requested
         ([1.0, 1e200, 1e-200], (Term(2, 0),)),  # no poles in double precision
     ],
 )

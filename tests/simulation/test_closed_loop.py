@@ -1,4 +1,4 @@
-"""Data sets of sums of submodels, in open and closed loop: the equations that their records satisfy."""
+"""Data sets of sums of submodels, in open and closed loop: equations satisfied by their records."""
 
 import pickle
 
@@ -28,7 +28,7 @@ SYSTEMS = {
     "fraction": TransferFunction([2.0], [0.25, 0.7, 1.0], 0.1),
 }
 PID = DiscreteController.from_pid(0.0115, 0.00725, 0.00454)
-#: Stabilises every one of the systems.
+#: Controller that stabilises all of the systems.
 LEAD = DiscreteController([0.5, -0.48], [1.0, -0.8])
 RECORD = RegularSampling(0.05, 400)
 

@@ -1,4 +1,4 @@
-"""What custom components may return, and what they may not do."""
+"""Allowed and refused results of custom components."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,7 +24,7 @@ def record():
 
 @dataclass
 class Answer:
-    """Answers whatever it was told to."""
+    """Component that returns a given value."""
 
     answer: Any = None
     calls: list[Any] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Data sets of one specification: what those of different cells and replicates share, and records from files."""
+"""Data sets of one specification: shared parts of different cells and replicates, and records from files."""
 
 import pickle
 
@@ -73,7 +73,7 @@ def test_random_starts():
     assert drawn[3] == 9 * stream(11, "start", 3).random()
     assert all(0 <= delay <= 9 for delay in drawn)
     assert len(set(drawn)) == 50
-    # Nor does a start depend on which others there are.
+    # A start does not depend on the other starts either.
     more = plan_of("starts.initial_delay=[{uniform: [0, 5]},{uniform: [0, 9]}]")
     assert more.starts[1].draw(11, 3) == random.draw(11, 3)
     assert StartPoint("3", "delay", 3.0).draw(None, 0).delay == 3.0
@@ -122,7 +122,7 @@ def test_a_record_that_changed_since_is_refused(file):
     file.write_text(file.read_text() + "10.0,3,5\n")
     with pytest.raises(DataError, match="differs from that of the planned experiment"):
         plan.data_cells[0].dataset(0)
-    # Its results can be read all the same.
+    # Its results can still be read.
     assert build_plan(spec_from_canonical(plan.spec.canonical())).data_cells[0].hash == plan.data_cells[0].hash
     assert plan_of(spec=measured(file)).data_cells[0].hash != plan.data_cells[0].hash
 

@@ -54,7 +54,7 @@ def test_measures_of_a_made_up_track():
     first = np.where(t < 2.0, 5.0, 1.8)  # wrong until 2 s, right until the step, late by 1.5 s after it
     first[t >= 7.5] = 2.01
     flags = np.where(t < 3.0, int(Flag.STARTING), 0).astype(np.uint16)
-    # before the step; three that answer to it, two of them one alarm; two periods of 2 rad/s after it
+    # before the step; three responses to it, two of them one alarm; two periods of 2 rad/s after it
     flags[np.isin(t, (4.0, 7.0, 7.5, 12.0, 13.0))] = int(Flag.CHANGED)
     true = signal.frequencies_at(t)
     found = measure_track(made(t, first, flags), t, true, signal, Measuring(0.05, (9.0, 12.0)), alarms=True)

@@ -1,4 +1,4 @@
-"""Fit on fresh data: other random numbers than those that were estimated from, and no noise."""
+"""Fit on fresh data: with other random numbers than the estimation data, and without noise."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_it_is_computed_where_it_is_asked_for_only(tmp_path):
     )
     asked, plain = build_plan(load_spec(file)), build_plan(load_spec(file, ["measures=[rmse]"]))
     assert (asked.data_cells[0].source.fresh, plain.data_cells[0].source.fresh) == (True, False)
-    # What is stored belongs to the identity of a result; what is only shown does not.
+    # Stored measures are part of the identity of a result; measures that are only shown are not.
     assert asked.data_cells[0].hash != plain.data_cells[0].hash
     shown = build_plan(load_spec(file, ["measures=[bias]"]))
     assert (shown.data_cells[0].hash, shown.spec_hash) == (plain.data_cells[0].hash, plain.spec_hash)

@@ -1,4 +1,4 @@
-"""Specifications of sums of submodels and of loops: what is accepted, and what is said about what is not."""
+"""Specifications of sums of submodels and of loops: valid ones, and messages about invalid ones."""
 
 import pytest
 
@@ -64,7 +64,7 @@ def test_fractions_are_taken_apart_as_the_sorted_system_is(tmp_path):
     rest = ["loop=null", "excitation={kind: gaussian}", "starts=null"]
     one = "estimators={one: {kind: srivc, poles: 3, zeros: 2}}"
     assert build_plan(load(tmp_path, CLOSED, system, one, *rest)).terms == (Term(2, 0), Term(1, 0))
-    # Nobody asked for submodels.
+    # No submodels were requested.
     fraction = "system={numerator: [1], denominator: [1, 2, 3]}"
     two = "estimators={one: {kind: srivc, poles: 2, zeros: 0}}"
     assert build_plan(load(tmp_path, CLOSED, fraction, two, *rest, "success=null")).terms is None
@@ -87,7 +87,7 @@ def test_starts_and_estimators_of_both_kinds(tmp_path):
         "search": ["0.1", "uniform(0, 0.2)"],
         "filter": ["none"],
     }
-    # An estimator that takes parameters makes its own where none are named, and needs no delay.
+    # An estimator that accepts parameters computes its own if none are given, and needs no delay.
     plan = build_plan(load(tmp_path, CLOSED, "starts={initial_delay: 0.1}", *overrides[1:2]))
     assert [(cell.name, start.label) for _, cell, start in plan.keys(0, 0)] == [
         ("both", "none"), ("one", "none"), ("search", "0.1"),

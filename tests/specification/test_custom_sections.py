@@ -1,4 +1,4 @@
-"""Custom components in a specification: what is wrong with them is said with its place, and never a traceback."""
+"""Custom components in a specification: errors are reported with their place, without a traceback."""
 
 import sys
 
@@ -94,7 +94,7 @@ def test_every_folder_has_neighbours_of_its_own(folder, tmp_path_factory):
         (other / name).write_text(text, encoding="utf-8")
     first, second = find_class("./parts.py:Noise", folder), find_class("./parts.py:A", other)
     assert (first.generate.__globals__["GAIN"], second.f()) == (2.0, (3.0, 6.0, 6.0, 6.0))
-    # The same file with another content is another module, also behind a module that did not change.
+    # The same file with other content is another module, also when imported by an unchanged module.
     edited(folder, "gains.py", "2.0", "4.0")
     after = find_class("./parts.py:Noise", folder)
     assert [c.generate.__globals__["GAIN"] for c in (first, after)] == [2.0, 4.0]
@@ -108,7 +108,7 @@ def test_only_the_code_of_shipped_studies_runs_without_permission(tmp_path):
     comparators = STUDIES / "finite_time_frequency" / "comparators"
     kind = "{kind: '%s/whole_record.py:Esprit', tones: 2, averaging: 0.05}"
     assert load_text(tmp_path, changed(SIGNAL, (WINDOW, kind % comparators))).warnings
-    # A link to the file would have its neighbours looked for beside the link.
+    # Imports of a linked file would be resolved next to the link.
     (tmp_path / "whole_record.py").symlink_to(comparators / "whole_record.py")
     for place in (".", f"{comparators}/../../../tests"):
         with pytest.raises(RefusedError, match="--allow-code"):

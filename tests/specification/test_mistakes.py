@@ -1,4 +1,4 @@
-"""What is said of specifications, word for word and with the place: mistakes, and what is unwise (`mistakes.yaml`)."""
+"""Messages about specifications, word for word and with places: errors and warnings (`mistakes.yaml`)."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ CASES = {
 
 
 def said(folder, base, case):
-    """Return what is said of a case: a file of this folder, or a text, with changes and overrides."""
+    """Return the messages about a case: a file of this folder, or a text, with changes and overrides."""
     files = {"parts.py": CUSTOM_PARTS, "gains.py": "GAIN = 2.0\n", "record.csv": RECORD} | case.get("files", {})
     for file, old, new in case.get("code", ()):
         files[file] = changed(files[file], (old, new))
@@ -37,7 +37,7 @@ def said(folder, base, case):
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_said_and_nothing_else(tmp_path, name, monkeypatch):
-    # In this process: what becomes of one that custom components end is tested where they are run.
+    # In this process: components that end their process are tested elsewhere.
     monkeypatch.setattr(trial, "call_alone", lambda folder, function, *given: (function(*given), "", 0.0))
     base, case = CASES[name]
     assert said(tmp_path, base, case) == {kind: case[kind] for kind in ("says", "warns") if kind in case}

@@ -1,4 +1,4 @@
-"""The reference says of every key what the option classes and the sections themselves say."""
+"""The reference has the description of every key from the option classes and sections."""
 
 import re
 from dataclasses import MISSING, fields
@@ -43,7 +43,7 @@ def test_types_units_and_choices_in_words():
     assert "        cutoff: number [rad/s] (or a list); required\n" in text  # of its low-pass filter
     assert "svf: " not in text
     assert "    runs: whole number at least 1, at most 1000000; optional\n" in reference_text("monte_carlo")
-    # A column of times is a text, not a number of seconds.
+    # A column of times is text, not a number of seconds.
     assert "    time: text; default t\n        Column of the instants [s].\n" in reference_text("data")
     assert "null for a new value" in reference_text("gaussian")
 

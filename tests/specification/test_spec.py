@@ -1,4 +1,4 @@
-"""Specifications: what is accepted, and what is said, with line and column, about what is not."""
+"""Valid specifications, and the messages, with line and column, about invalid ones."""
 
 import copy
 import hashlib
@@ -74,7 +74,7 @@ def test_the_hash_ignores_key_order_comments_and_layout(tmp_path_factory, data):
 
 
 def test_hashes_are_what_they_were():
-    """Identity is forever: another hash of the same content would leave all earlier results aside."""
+    """Hashes must never change: all earlier results would be unused."""
     assert canonical_json({"b": [1.0, 1e-3, None], "a": "é"}) == '{"a":"é","b":[1.0,0.001,null]}'
     assert content_hash({"b": [1.0, 1e-3, None], "a": "é"}) == "1700a7aeb6dfa5c8"
     with pytest.raises(ValueError, match="JSON compliant"):
@@ -122,7 +122,7 @@ def test_whatever_is_wrong_ends_in_problems_with_their_places(tmp_path_factory, 
 def test_a_measured_record(tmp_path):
     (tmp_path / "record.csv").write_text(RECORD)
     spec = load(tmp_path, MEASURED)
-    # as it was written: results must not depend on where the command was typed
+    # relative, as written: results must not depend on the working directory
     assert (spec.data.file, spec.folder) == ("record.csv", tmp_path)
     assert spec.measured.file == (tmp_path / "record.csv").as_posix()
     assert len(spec.data.sha256) == 64
@@ -160,7 +160,7 @@ def test_a_file_of_instants(tmp_path):
     np.testing.assert_array_equal(build_plan(load(tmp_path, text)).data_cells[0].dataset(0).record.y, record.y)
 
 
-# -- what is shipped --------------------------------------------------------------------------------------------------
+# -- shipped files ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("config", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)

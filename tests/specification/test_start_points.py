@@ -1,4 +1,4 @@
-"""Starts at initial parameters: how they are drawn, and what they are called."""
+"""Starts at initial parameters: random values and labels."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a specification or a record of somebody else must not do: read elsewhere, repeat what it read, never end."""
+"""Untrusted specifications and records must not read elsewhere, reveal what they read, or run for ever."""
 
 import os
 
@@ -32,7 +32,7 @@ ROWS = "".join(f"{0.1 * k:.1f},{(-1) ** (k // 3)},{k % 5}\n" for k in range(40))
 
 @pytest.fixture
 def inside(tmp_path):
-    """A folder for a specification, beside a record that is not in it, and with links that lead to that."""
+    """Return a folder for a specification, next to a record outside it, with links to that record."""
     (tmp_path / "outside.csv").write_text("t,u,y\n" + ROWS)
     (tmp_path / "inside" / "below").mkdir(parents=True)
     (tmp_path / "inside" / "link.csv").symlink_to(tmp_path / "outside.csv")

@@ -1,4 +1,4 @@
-"""YAML values without YAML's traps, and the place of each."""
+"""YAML values without implicit conversions, and their places."""
 
 from pathlib import Path
 

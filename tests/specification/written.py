@@ -1,4 +1,4 @@
-"""Specifications that tests write to a file, and what is wrong with them."""
+"""Specifications written to a file by tests, and their errors."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A folder of stored estimates, made once, of which every test gets a copy that it may damage."""
+"""A folder of stored estimates, made once and copied for each test, which may damage it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stored estimates that a test makes, and may change until they are first read as a table."""
+"""Stored estimates made by a test, which may be changed until they are first read as a table."""
 
 import io
 from functools import cached_property
@@ -35,12 +35,12 @@ SPEC = {
 
 
 def plan_of(runs=3, **changes):
-    """The plan with other data sets or sections."""
+    """Return the plan with other data sets or sections."""
     return build_plan(load_spec({**SPEC, **changes}), runs)
 
 
 def outcome(key, delay=0.35):
-    """A made-up estimate; one in five is a failure."""
+    """Return a made-up estimate; one in five is a failure."""
     if key.replicate % 5 == 4:
         return Outcome(key, failed("ValueError: singular\n  svf.py:3 in fit", "FAILED"), 0.25)
     numbers = {"delay": delay + key.replicate / 7, "numerator": [2.0], "denominator": [1.0, 2.0 + key.replicate / 3]}
@@ -49,12 +49,12 @@ def outcome(key, delay=0.35):
 
 
 def outcomes_of(manifest):
-    """Made-up estimates of all that a plan asks for."""
+    """Return made-up estimates of a whole plan."""
     return [outcome(key) for key in dict.fromkeys(slot.key for slot in slots(manifest))]
 
 
 def run_folder(manifest, place, outcomes=None, origin=ORIGIN, **info):
-    """A folder as a run leaves it that has computed some estimates, or all that its plan asks for."""
+    """Write a folder like that of a run that has computed some or all estimates of its plan."""
     place.mkdir(parents=True)
     log = open_journal(place / "journal.sqlite")
     log.write_spec(b"# toys\n")
@@ -67,7 +67,7 @@ def run_folder(manifest, place, outcomes=None, origin=ORIGIN, **info):
 
 
 class MadeResults(Estimates):
-    """Results by key, all of which took the same time but those that have their own [s]; some hold a CPU time."""
+    """Results by key with a common computing time, except given ones [s]; some have a CPU time."""
 
     def __init__(self, manifest, results, origins=ORIGINS, seconds=0.02):
         self.plan, self.given_origins, self.results = manifest, origins, results
@@ -96,7 +96,7 @@ class MadeResults(Estimates):
 
 
 def export_image(manifest, origins, results):
-    """The bytes of ``runs.h5`` for some results."""
+    """Return the bytes of ``runs.h5`` for some results."""
     image = io.BytesIO()
     planned = [(slot, results[slot.key]) for slot in slots(manifest) if slot.key in results]
     write_export(image, manifest, lambda: origins, lambda: planned)

@@ -1,4 +1,4 @@
-"""Estimates as other programs get them."""
+"""Estimates in the format for other programs."""
 
 from ctid_cli.storage.estimates import ESTIMATE_KEYS, as_object
 

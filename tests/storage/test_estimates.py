@@ -97,7 +97,7 @@ def test_an_estimate_is_found_by_the_beginning_of_its_id(place: Path) -> None:
 def test_folders_without_results_and_with_odd_names(place: Path, tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
-    # As a run leaves it that is killed before it has planned anything.
+    # State left by a run that was killed before planning.
     for make in (lambda: None, lambda: open_journal(empty / "journal.sqlite").close()):
         make()
         for read in (read_estimates, experiment_status):
@@ -193,7 +193,7 @@ def test_coefficients_go_with_their_errors_by_their_power_of_s() -> None:
 
 def test_true_values_are_those_of_the_estimated_form() -> None:
     submodels = [{"numerator": [2.0], "denominator": [0.1, 1.0]}, {"numerator": [3.0], "denominator": [2.0, 1.0]}]
-    # Monic, and sums of submodels by rising natural frequency.
+    # Monic, and sums of submodels by ascending natural frequency.
     fraction = {"numerator": [0, 2.0], "denominator": [0.25, 0.7, 1.0], "delay": 8.0}
     assert true_values({"content": {"system": fraction}}) == {"a1": 2.8, "a2": 4.0, "b0": 8.0, "delay": 8.0}
     sum_of_two = {"additive": submodels, "delay": 0.0}

@@ -1,4 +1,4 @@
-"""Damaged results: what is found, said, kept and computed again."""
+"""Damaged results: detection, messages, recovery and recomputation."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_what_can_be_read_of_damaged_results_is_kept(place: Path, export: bool) 
     found = read_estimates(place).drop(columns=["seconds", "cpu_seconds"])
     assert found.equals(whole[whole["id"].isin(found["id"])].reset_index(drop=True))
     assert verify(place).is_intact
-    # Of other code nothing is kept, unless it may be mixed.
+    # Results of other code are recovered only if mixing is allowed.
     other = Origin("other", "p", ())
     for allow_mixed in (False, True):
         folder = place.with_name(f"mixed {allow_mixed}")

@@ -1,4 +1,4 @@
-"""``fit.json`` read back: the same fit to the last bit, or one sentence."""
+"""Reading of ``fit.json``: an identical fit to the last bit, or a one-sentence error."""
 
 import dataclasses
 import json
@@ -39,7 +39,7 @@ def record_of(seed=0, n=300, noise=0.05):
 
 
 def require_same(one, other):
-    """The same type and the same bits, all the way down."""
+    """Assert equal types and bits in all parts."""
     assert type(one) is type(other) or isinstance(one, float | int | bool)
     if dataclasses.is_dataclass(one):
         for field in dataclasses.fields(one):
@@ -88,7 +88,7 @@ def test_a_fit_is_read_back_to_the_last_bit(case, tmp_path):
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A record as a file, and its fit."""
+    """Return a record as a file, and its fit."""
     record = record_of()
     lines = ["t [s],u [V],y [mm]"]
     lines += [
@@ -100,7 +100,7 @@ def fitted():
 
 @pytest.fixture
 def stored(fitted, tmp_path):
-    """``fit.json`` beside the folder of its record."""
+    """Return ``fit.json`` next to the folder of its record."""
     (tmp_path / "data").mkdir()
     file = tmp_path / "data" / "record.csv"
     file.write_text(fitted, encoding="utf-8")

@@ -24,7 +24,7 @@ from ctid_cli.storage.identity import (
 
 @pytest.fixture
 def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package with a module in every place that computes, and in some others."""
+    """Return a package with a module in every computing folder, and in some others."""
     monkeypatch.setattr(identity, "_KEPT", tmp_path / "kept.json")
     for name in (*COMPUTING, "cli/main.py", "reporting/layout.py", "storage/journal.py", "errors.py"):
         assert (ROOT / name).exists()
@@ -37,7 +37,7 @@ def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_what_computes_counts_and_words_do_not(tree: Path) -> None:
     before = code_version((), tree)
     for file in tree.rglob("*.py"):
-        # Neither comments nor the places of line breaks survive this.
+        # Comments and line breaks are lost here.
         changed = ast.unparse(ast.parse(file.read_text(encoding="utf-8")))
         file.write_text(changed.replace('"""', '"""In other words: ', 1) + "\n# a comment\n", encoding="utf-8")
     for name in ("cli/main.py", "reporting/layout.py", "storage/journal.py", "errors.py"):
@@ -101,7 +101,7 @@ def test_a_module_that_python_imports_itself_counts_if_it_is_not_installed(
     monkeypatch.syspath_prepend(tmp_path)
     options = find_class("mine_for_test.noise:Noise", tmp_path)()
     versions = [code_version(modules_of(options))]
-    # Without a readable source the bytes count.
+    # Without a readable source the bytes are hashed.
     for content in (b"LEVEL = 2.5\n", b"\x00\x01"):
         (package / "levels.py").write_bytes(content)
         versions.append(code_version(modules_of(options)))
@@ -121,7 +121,7 @@ def test_numeric_platform_follows_the_kernels_in_use() -> None:
     other = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     here = numeric_platform()
     assert f"python {sys.version_info.major}.{sys.version_info.minor}" in here
-    # Where OpenBLAS was built for a single processor there is nothing to choose.
+    # An OpenBLAS built for a single processor has no choice of kernels.
     assert other.stdout.strip() != here if "Nehalem" in other.stdout else "unknown" not in here
 
 
@@ -133,6 +133,6 @@ def test_the_commit_is_that_of_the_checkout_itself(tmp_path: Path) -> None:
     subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "first"], check=True)
     found = subprocess.run([*git, "rev-parse", "HEAD"], check=True, capture_output=True, text=True)
     assert git_commit(tmp_path) == found.stdout.strip()
-    # A folder in it is no checkout.
+    # A folder inside it is not a checkout.
     (tmp_path / "inside").mkdir()
     assert git_commit(tmp_path / "inside") is None

@@ -92,7 +92,7 @@ def test_others_read_while_a_run_writes_each_as_it_was_when_they_began(
     before = files(tmp_path)
     with read_journal(log.path, live=True) as early:
         assert len(delays(early)) == 3
-        # The index in memory is shared with the writer, which is in the same process here.
+        # The index in memory is shared with the writer, which is in this process.
         assert {**files(tmp_path), "journal.sqlite-shm": ""} == {**before, "journal.sqlite-shm": ""}
         log.add([outcome(3), outcome(4)], log.sessions()[0].id)
         with read_journal(log.path, live=True) as late:
@@ -130,7 +130,7 @@ def test_reading_after_a_kill_finds_everything_and_changes_nothing(tmp_path: Pat
     log = filled(tmp_path / "journal.sqlite")
     dead = tmp_path / "dead"
     dead.mkdir()
-    # The files as a killed process leaves them: most of the content is still in the write-ahead log.
+    # Files as left by a killed process: most of the content is still in the write-ahead log.
     for name in ("journal.sqlite", "journal.sqlite-wal"):
         (dead / name).write_bytes((tmp_path / name).read_bytes())
     log.close()
@@ -253,7 +253,7 @@ def test_other_files_are_not_taken_for_a_journal(
         pass
     with pytest.raises(error):
         open_journal(path)
-    # SQLite's own header of 100 bytes says how a file is written.
+    # SQLite's header of 100 bytes describes how a file is written.
     assert path.read_bytes()[100:] == before[100:]
 
 

@@ -1,4 +1,4 @@
-"""The lock of a folder where there are no locks."""
+"""The lock of a folder on file systems without locks."""
 
 from __future__ import annotations
 

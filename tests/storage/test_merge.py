@@ -1,4 +1,4 @@
-"""Merging: shards in any order are one run; what is in the way is named, and nothing is written."""
+"""Merging: shards in any order equal one run; conflicts are named, and then nothing is written."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_what_is_missing_is_named_and_can_be_left_out(parts: list[Path], whole: 
     with pytest.raises(RefusedError, match="12 estimates of shard 3 of 3 are missing"):
         merge([parts[0]], target)
     assert files(target) == before
-    # The rest comes by a later merge, or by a run.
+    # The rest is added by a later merge, or by a run.
     assert joined([parts[0], parts[2]], target) == (whole / "runs.h5").read_bytes()
     unfinished = run_folder(shard(1), tmp_path / "unfinished", outcomes_of(shard(1))[3:])
     with pytest.raises(RefusedError, match="3 estimates of shard 1 of 3 are missing"):
@@ -103,7 +103,7 @@ def test_a_result_is_better_than_a_limit_and_a_high_limit_better_than_a_low_one(
     for number, order in enumerate([[low, high], [high, low]]):
         merge([*order, *parts[1:]], tmp_path / "limited" / f"{number}")
         assert "under 2 s" in set(read_estimates(tmp_path / "limited" / f"{number}")["message"])
-    # What is there already is replaced too.
+    # Existing estimates are replaced too.
     again = merge([parts[0]], tmp_path / "limited" / "0")
     assert (again.new, again.missing) == (1, "")
     assert (tmp_path / "limited" / "0" / "runs.h5").read_bytes() == (whole / "runs.h5").read_bytes()

@@ -1,4 +1,4 @@
-"""How data sets are dealt to shards."""
+"""Assignment of data sets to shards."""
 
 from collections import Counter
 
@@ -21,7 +21,7 @@ def test_every_shard_gets_its_share(cells: int, runs: int, of: int) -> None:
 
 @given(st.integers(1, 12), st.integers(1, 12))
 def test_no_shard_is_left_with_the_same_cells(cells: int, of: int) -> None:
-    # After as many data sets of each cell as there are shards, each has had one of every cell.
+    # With as many replicates as shards, each shard has one data set of every cell.
     for cell in range(cells):
         assert {owner(cell, replicate, cells, of) for replicate in range(of)} == set(range(1, of + 1))
 

@@ -1,4 +1,4 @@
-"""``track.json``: what is read is what was written, and nothing else is taken for it."""
+"""``track.json``: it is read as written, and other files are refused."""
 
 import json
 
@@ -26,7 +26,7 @@ def track():
 
 @pytest.fixture
 def written(tmp_path):
-    """The file of a track and the record that it is of."""
+    """Return the file of a track and its record."""
     record = tmp_path / "data" / "hum.csv"
     record.parent.mkdir()
     lines = ["t [ms],y,z", *(f"{k},{np.sin(k):.6f},1" for k in range(100))]
@@ -39,7 +39,7 @@ def written(tmp_path):
 
 
 def rewritten(file, change):
-    """The file with another content and a checksum that fits to it."""
+    """Return the file with other content and a matching checksum."""
     content = json.loads(file.read_text(encoding="utf-8"))
     content.pop("checksum")
     change(content)

@@ -1,4 +1,4 @@
-"""Studies: whether each is complete, its first estimates, and what is refused to be published."""
+"""Studies: completeness, first estimates, and refusals to publish."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ SHORT = ("sampling.interval=0.01", "sampling.duration=33", "success.window=[28, 
 
 @pytest.fixture(scope="module")
 def small():
-    """A study of one experiment, with a single short record."""
+    """Return a study of one experiment, with a single short record."""
     return dataclasses.replace(
         find_study("finite-time-frequency"),
         experiments={"finite-time-frequency/two-tones": {"config": "finite_time_frequency/two_tones.yaml"}},
@@ -41,7 +41,7 @@ def test_every_study_is_complete(study):
     shorts = {last_part(name) for name in study.configs}
     for short in shorts:
         assert study.plan(short).experiment == study.experiment(short)
-        # What ignores the loop, or the edges of the input, is there to show what that costs.
+        # Estimators that ignore the loop, or the edges of the input, are included to show the effect.
         assert all("unless that is the point" in warning for warning in study.plan(short).spec.warnings)
     functions = {
         "figures": [f"figure_{number}" for number in study.figures],
@@ -125,7 +125,7 @@ def test_a_chaotic_iteration_is_compared_over_one_step():
 
 @pytest.fixture
 def clean(monkeypatch, tmp_path):
-    """A checkout without changes, whose code computed the results, and a folder that everything is published in."""
+    """Set up a checkout without changes, whose code computed the results, and a folder for publishing."""
     answers = {"status": "", "rev-parse": "1234abcd"}
     monkeypatch.setattr(publishing, "_git", lambda *arguments: answers[arguments[0]])
     monkeypatch.setattr(publishing, "spec_from_canonical", lambda content, folder: content)

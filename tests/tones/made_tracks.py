@@ -1,4 +1,4 @@
-"""Tracks made by hand: of two tones, with rows that are not valid, and with one that comes later."""
+"""Hand-made tracks: of two tones, with invalid rows, and with a tone that begins later."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def some_invalid():
 
 
 def coming_later():
-    """Tones of which one is there for a part, with a line left over."""
+    """Return tones one of which is present for a part, with a remaining line."""
     flags = np.zeros((ROWS, 2), np.uint16)
     flags[:20, 1] = int(Flag.ABSENT)
     flags[20:25, 1] = int(Flag.UNRESOLVED)

@@ -1,4 +1,4 @@
-"""What the tones of a track leave of its record."""
+"""Residual of a record after subtraction of its tones."""
 
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ def test_noise_steps_and_pulses_are_no_spikes():
     y[1000:] *= 50.0
     assert not find_spikes(y).any()
     y = 0.01 * rng.standard_normal(4000)
-    y[::70] += 1.0  # pulses are what such a signal is made of
+    y[::70] += 1.0  # a train of pulses
     assert not find_spikes(y).any()
     assert not find_spikes(np.full(100, np.nan)).any()
     assert not find_spikes(np.full(100, 3.0)).any()

@@ -25,13 +25,13 @@ def test_a_summary_is_over_valid_rows():
 
 
 def test_the_error_of_the_mean_counts_common_samples_once():
-    """One window as long as the record in all rows: the mean is as good as one row; windows apart: as sqrt(N) rows."""
+    """Full-length windows in all rows: the mean is as good as one row; disjoint windows: as sqrt(N) rows."""
     error = np.full((ROWS, 2), 2 * np.pi * 0.01)
     one = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.1 * ROWS)))
     assert [tone.standard_error_hz for tone in one] == pytest.approx([0.01, 0.01])
     apart = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.05)))
     assert apart[0].standard_error_hz == pytest.approx(0.01 / np.sqrt(ROWS))
-    # Half of the windows in common with each neighbour: the variance of the mean is twice as large.
+    # Half of each window is shared with each neighbour: the variance of the mean is twice as large.
     half = summarise(make_track(error=error, window=np.full((ROWS, 2), 0.2)))
     assert half[1].standard_error_hz == pytest.approx(0.01 * np.sqrt(2 / ROWS))
     assert np.isnan(summarise(make_track())[0].standard_error_hz)

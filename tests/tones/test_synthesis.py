@@ -1,4 +1,4 @@
-"""The signal that the rows of a track describe."""
+"""Signal described by the rows of a track."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ ROWS = 0.1 + 0.05 * np.arange(76)
 
 
 def sweep(t):
-    """Phase, frequency and rate of a tone that rises, and its amplitude, which falls."""
+    """Return phase, frequency and rate of a tone of rising frequency, and its falling amplitude."""
     return 100.0 * t + 2.0 * t**2, 100.0 + 4.0 * t, np.full(t.size, 4.0), np.exp(-0.3 * t)
 
 

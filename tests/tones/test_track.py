@@ -1,4 +1,4 @@
-"""All tones of a record: what is called valid is right, whatever else the record holds."""
+"""All tones of a record: valid rows are right, whatever else the record contains."""
 
 from types import SimpleNamespace
 
@@ -28,14 +28,14 @@ def follow(y, tones=None, **options):
 
 
 def wrong(track, column, truth):
-    """Valid rows that are off by more than the accuracy and more than 3.3 of their errors."""
+    """Return the valid rows whose errors exceed the accuracy and 3.3 standard errors."""
     off = np.abs(track.omega[:, column] - HERTZ * np.interp(track.t, T, np.broadcast_to(truth, T.shape)))
     limit = np.maximum(3.3 * track.error[:, column], 1e-3 * track.omega[:, column])
     return int((track.valid[:, column] & (off > limit)).sum())
 
 
 def test_a_steady_tone_is_known_as_well_as_can_be():
-    """The bound of Cramer and Rao for the frequency of a whole record: 24 s^2/(A^2 N^3) [rad/sample]^2."""
+    """Cramer-Rao bound of the frequency from a whole record: 24 s^2/(A^2 N^3) [rad/sample]^2."""
     track = follow(tone(60.0, phase=0.4), 1)
     bound = np.sqrt(24.0 * 1e-4 / T.size**3) / INTERVAL
     middle = track.t.size // 2
@@ -93,7 +93,7 @@ def test_a_tone_that_moves_is_followed(hertz):
 @pytest.mark.parametrize("tones", [1, None])
 @pytest.mark.parametrize(("deviation", "rate"), [(2.5, 0.5), (5.0, 1.0), (2.5, 2.0), (20.0, 0.5)])
 def test_a_tone_whose_frequency_swings_is_not_the_lines_that_it_makes(deviation, rate, tones):
-    """Of 2.5 Hz at .5 Hz there are 13 lines of more than a tenth of the tone; of 20 Hz more than a window takes."""
+    """At 2.5 Hz and .5 Hz, 13 lines exceed a tenth of the tone; at 20 Hz, more lines than a window resolves."""
     t = INTERVAL * np.arange(10_000)
     hertz = 100.0 + deviation * np.sin(HERTZ * rate * t)
     y = np.sin(HERTZ * 100.0 * t - deviation / rate * np.cos(HERTZ * rate * t))

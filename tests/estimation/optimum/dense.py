@@ -1,4 +1,4 @@
-"""The projected squared error by another route: dense matrices, polynomials and a general simulation."""
+"""The projected squared error by a second method: dense matrices, polynomials and a general simulation."""
 
 import numpy as np
 from scipy.linalg import expm
@@ -9,25 +9,25 @@ from ctid_cli.signals.held import HeldSignal
 
 
 def squared_error(*args, **options):
-    """Sum of squares of the residual."""
+    """Return the sum of squares of the residual."""
     left = residual(*args, **options)
     return float(left @ left)
 
 
 def residual(record, denominator, zeros, delay=0.0, free_response=False, offset=False, period=0.0):
-    """What least squares of the record on ``s^k/A u(t - tau)``, the free responses and a constant leaves."""
+    """Return the residual of least squares of the record on ``s^k/A u(t - tau)``, free responses and a constant."""
     shared, own = columns_of(record, denominator, zeros, delay, free_response, offset, period)
     return left_over(np.hstack((shared, own)), record.y[record.valid])
 
 
 def left_over(phi, y):
-    """What the columns of a matrix do not explain."""
+    """Return the residual of a projection on the columns of a matrix."""
     phi = phi / np.linalg.norm(phi, axis=0)
     return y - phi @ np.linalg.lstsq(phi, y, rcond=1e-12)[0]
 
 
 def columns_of(record, denominator, zeros, delay=0.0, free_response=False, offset=False, period=0.0):
-    """Columns that records have in common, and those of this one alone."""
+    """Return the columns common to all records, and those of this record only."""
     used = record.valid
     shared = [_response(record, np.eye(zeros + 1)[k], denominator, delay, period) for k in range(zeros + 1)]
     columns = []
@@ -46,7 +46,7 @@ def _response(record, numerator, denominator, delay, period):
     model = TransferFunction(numerator, denominator, delay)
     if not period:
         return simulate(model, record.input, record.t)
-    # The last of so many periods that nothing of the start is left.
+    # The last of enough periods for the transient to vanish.
     slowest = np.abs(np.roots(denominator).real).min()
     shifts = period * np.arange(-int(np.ceil(40.0 / (slowest * period))), 1)
     breaks = (record.input.t + shifts[:, None]).ravel()

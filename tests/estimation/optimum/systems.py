@@ -1,4 +1,4 @@
-"""Random systems and records of them."""
+"""Random systems and their records."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ MODEL = TransferFunction([2.0, 5.0], np.poly([-0.3, -1.0 + 2.0j, -1.0 - 2.0j]).r
 
 
 def random_poles(rng, n, slowest=0.1, fastest=2.0):
-    """Real poles and pairs, lightly damped ones among them."""
+    """Return real poles and pairs, including lightly damped ones."""
     poles = []
     while len(poles) < n:
         w = np.exp(rng.uniform(np.log(slowest), np.log(fastest)))
@@ -26,7 +26,7 @@ def random_poles(rng, n, slowest=0.1, fastest=2.0):
 
 
 def random_model(rng, n, m, delay=0.0):
-    """A system of unit static gain with that many poles and zeros."""
+    """Return a system of unit static gain with the given numbers of poles and zeros."""
     denominator = np.poly(random_poles(rng, n)).real
     zeros = -np.exp(rng.uniform(np.log(0.1), np.log(2.0), m)) * rng.choice([1, 1, -1], m)
     numerator = np.poly(zeros).real if m else np.ones(1)
@@ -34,7 +34,7 @@ def random_model(rng, n, m, delay=0.0):
 
 
 def record_of(model, rng, *, samples=300, noise=0.0, regular=True, hold="zoh", offset=0.0):
-    """The answer to random steps, one of two samples long each, every .5 s."""
+    """Return the response to random steps, one of them two samples long, every .5 s."""
     t = 0.5 * np.arange(samples) if regular else np.cumsum(rng.uniform(0.2, 0.8, samples))
     u = np.repeat(rng.choice([-1.0, 1.0], samples // 2 + 1), 2)[:samples]
     x = simulate(model, HeldSignal(t, u, hold), t)
@@ -43,13 +43,13 @@ def record_of(model, rng, *, samples=300, noise=0.0, regular=True, hold="zoh", o
 
 
 def problem_of(records, zeros, *, free_response=False, offset=False, periods=None, integrators=0):
-    """Laid out records, and what is eliminated with them."""
+    """Lay out records with the treatment of their nuisance parameters."""
     periods = periods or (0.0,) * len(records)
     return Problem(tuple(records), zeros, free_response, (0,) * offset, periods, integrators=integrators)
 
 
 def best(records, poles, zeros, *, delays=(0.0, 0.0), starts=(), **options):
-    """The least output error of laid out records."""
+    """Return the minimum output error of records."""
     names = "free_response", "offset", "periods", "integrators"
     problem = problem_of(records, zeros, **{name: options.pop(name) for name in names if name in options})
     return best_output_error(problem, poles, delays, starts, **options)

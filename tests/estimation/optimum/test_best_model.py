@@ -1,4 +1,4 @@
-"""The best model of a structure: systems are found, and no structure is worse than one that it contains."""
+"""Best model of a structure: systems are found, and no structure is worse than one that it contains."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def test_a_mode_that_hardly_decays_is_found_between_the_others_of_the_noise(seed
 
 
 def test_a_superfluous_pole_runs_to_infinity():
-    # What comes a sample too early cannot be helped by a lag.
+    # A lag cannot correct an output one sample too early.
     rng = np.random.default_rng(4)
     record = record_of(TransferFunction([0.8], [1.0, 0.8]), rng, noise=0.02)
     early = Record.from_arrays(record.t[:-1], record.input.values[:-1], record.y[1:])
@@ -71,7 +71,7 @@ def test_the_model_has_the_squared_error_that_is_said():
     data = filter_data(record, 2.0)
     options = {"delays": (0.0, 2.0), "free_response": True, "offset": True, "random_starts": 0}
     found = best([data], 2, 1, **options)
-    # C/A of an impulse is C p/A of a step, with what jumps at once taken apart.
+    # C/A of an impulse is C p/A of a step, with the immediate jump separated.
     used = data.t[data.use]
     free = simulate(
         TransferFunction(np.append(found.free_responses[0], 0.0), found.denominator),
@@ -91,7 +91,7 @@ def test_a_biproper_model_has_a_direct_way_through():
 
 
 def test_a_periodic_record_is_exact_for_a_lightly_damped_model():
-    # The free response of a damping of .002 lives for many periods.
+    # The free response with a damping of .002 lasts many periods.
     rng = np.random.default_rng(7)
     model = TransferFunction([0.6], [1.0, 2 * 0.002 * 0.8, 0.64], 0.7)
     t = 0.5 * np.arange(120)
@@ -131,7 +131,7 @@ def test_an_integrating_drive_at_rest_is_next_to_the_set():
     x = simulate(TransferFunction([1.0], [8.0, 1.0, 0.0]), HeldSignal(t, u), t)
     noise = 0.01 * x.std() * rng.standard_normal(t.size)
     found = best([filter_data(Record.from_arrays(t, u, x + noise))], 2, 0, random_starts=0)
-    # Three parameters fit noise too; the slowest pole is not zero.
+    # Three parameters also fit noise; the slowest pole is not zero.
     assert found.squared_error <= 1.001 * (noise @ noise)
     np.testing.assert_allclose(found.denominator[1], 0.125, rtol=0.02)
     assert found.ending is Ending.AT_BOUND
@@ -151,7 +151,7 @@ def test_given_starts_alone_are_refined_where_nothing_else_is_wanted():
 
 @pytest.mark.parametrize("seed", [2, 8, 10, 14, 26, 41, 53])
 def test_a_lightly_damped_pair_is_found_without_a_smaller_model_that_shows_it(seed):
-    # In so much noise no single pole leads there, and the cost has a minimum at every peak of the noise.
+    # With this noise no single pole leads there, and the cost has a minimum at every peak of the noise.
     rng = np.random.default_rng(seed)
     w, zeta = np.exp(rng.uniform(np.log((0.05, 0.005)), np.log((5.0, 0.5))))
     denominator = [1.0, 2 * zeta * w, w * w]
@@ -163,7 +163,7 @@ def test_a_lightly_damped_pair_is_found_without_a_smaller_model_that_shows_it(se
 
 @pytest.mark.parametrize("seed", [11, 35, 60])
 def test_a_delay_is_found_across_a_kink(seed):
-    # A pole as fast as the clock: each cell of the delay has a minimum of its own.
+    # A pole as fast as the clock: the cost has a minimum in each interval of the delay.
     rng = np.random.default_rng(seed)
     hold, t = int(rng.integers(1, 6)), np.arange(120.0)
     held = HeldSignal(t, np.repeat(rng.choice([-1.0, 1.0], 120 // hold + 1), hold)[:120])
@@ -190,7 +190,7 @@ def test_a_long_record_is_searched_by_a_part_of_it(monkeypatch, delay, free_resp
 
 
 def test_a_part_that_tells_too_little_is_not_trusted(monkeypatch):
-    # A quick start and a long slow end: the most active part has not met the slow pole.
+    # A fast start and a long slow end: the most active part does not contain the slow pole.
     rng = np.random.default_rng(1)
     t = np.arange(3000.0)
     u = np.where(t < 300, np.repeat(rng.choice([-1.0, 1.0], 1000), 3), 1.0)

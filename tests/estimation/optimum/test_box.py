@@ -87,7 +87,7 @@ def test_the_set_depends_on_what_is_known_of_the_state(free_response, period, st
     assert box.fastest == pytest.approx(limits["fastest"] / 0.5)
     assert box.least_damping == limits["least_damping"]
     assert box.imaginary == pytest.approx(limits["imaginary"] * np.pi / 0.5)
-    # Starts are spread over the same range whatever the state.
+    # Starts are spread over the same range for every treatment of the state.
     assert box.spread == pytest.approx((LIMITS["slowest"].estimated / 24.5, LIMITS["least_damping"].estimated))
 
 

@@ -1,4 +1,4 @@
-"""Poles at 0 beside those that are searched, against simulations."""
+"""Poles at 0 in addition to the searched ones, against simulations."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Models with known coefficients: projection by dense matrices, feasible points, and minima that are proved."""
+"""Models with known coefficients: projection by dense matrices, feasible points, and verified minima."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ BOX = Box(1e-3, 50.0)
 
 
 def numerator_of(size, known):
-    """NaN for free coefficients."""
+    """Return the coefficients with NaN for free ones."""
     values = np.full(size, np.nan)
     values[list(known)] = list(known.values())
     return values
@@ -64,7 +64,7 @@ def test_points_move_to_where_the_denominator_has_its_values(seed):
     point = known.met(point_of(start.poles, 0.0, BOX), BOX)
     np.testing.assert_allclose(point.denominator[1:][known.places], known.denominator[known.places], rtol=1e-10)
     assert (np.abs(point.poles) >= BOX.slowest * (1 - 1e-9)).all()
-    # Directions of the null space keep the values to first order.
+    # Directions of the null space preserve the values to first order.
     direction = null_space(known.slopes(point, n))[:, -1]
     speed, damping = point.shifted(1e-6 * direction)
     moved = type(point)(speed, damping, point.edge, point.delays).denominator[1:][known.places]
@@ -72,7 +72,7 @@ def test_points_move_to_where_the_denominator_has_its_values(seed):
 
 
 def test_known_coefficients_that_hold_poles_at_a_bound():
-    """At the end the bounds have multipliers of the right sign: no admissible model nearby is better."""
+    """At the solution the bounds have multipliers of the right sign: no admissible model nearby is better."""
     rng = np.random.default_rng(3)
     record = record_of(TransferFunction([1.0], [1.0, 1.0, 0.0625]), rng, samples=300, noise=0.05)
     data = filter_data(record)

@@ -16,7 +16,7 @@ from ctid_cli.signals.record import Record
 from tests.estimation.optimum.dense import columns_of, left_over, squared_error
 from tests.estimation.optimum.systems import MODEL, record_of
 
-#: A point beside the model that the records are of.
+#: A point near the model of the records.
 SPEED, DAMPING = np.array([4.0, 2.2, 0.4]), np.array([-1.0, 0.3, -1.0])
 POLES = np.array([-4.0, 2.2 * complex(-0.3, np.sqrt(0.91)), 2.2 * complex(-0.3, -np.sqrt(0.91)), -0.4])
 DENOMINATOR = np.poly(POLES).real
@@ -92,7 +92,7 @@ def test_curvature_is_that_of_the_gradient_where_residuals_vanish():
 
 @pytest.mark.parametrize("cell", [3, 4])
 def test_a_sample_belongs_to_the_cells_on_both_sides(cell):
-    # The squared error is continuous there; its slope is that of each side.
+    # The squared error is continuous there; its slope is one-sided.
     record = record_of(MODEL, np.random.default_rng(4), noise=0.1)
     problem = problem_of(record, 3)
     at, side = Delay(2.0, cell), 1.0 if cell == 4 else -1.0
@@ -129,7 +129,7 @@ def test_records_share_the_numerator_and_have_their_own_state_and_offset(free_re
 
 
 def test_double_poles_are_no_special_case():
-    # Two real sections meet, and a section passes a damping of 1.
+    # Two real sections coincide, and a section passes a damping of 1.
     record = record_of(MODEL, np.random.default_rng(6), noise=0.1)
     problem = problem_of(record, 2)
     apart = project(problem, np.array([2.0, 2.0, 0.5]), -np.ones(3), Delay(0.0, -1)).squared_error
@@ -144,7 +144,7 @@ def test_double_poles_are_no_special_case():
 
 @pytest.mark.parametrize("length", [100.0, 1e-6])
 def test_states_and_slopes_have_the_transfer_functions_that_they_claim(length):
-    # Within a very short record all responses overlap.
+    # All responses overlap in a very short record.
     form, rows = forms_of([(SPEED, DAMPING)], [slice(None)], length)[0], numerators(SPEED, DAMPING)
     assert isinstance(form, Modal if length > 1.0 else Chain)
     output, direct = np.array([0.3, -0.2, 0.5, 1.0]), np.array([0.7])

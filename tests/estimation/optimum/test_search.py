@@ -1,4 +1,4 @@
-"""Local searches against a general optimiser in the same box, and what they say about where they end."""
+"""Local searches against a general optimiser in the same box, and their reported statuses."""
 
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ def test_wherever_it_starts_a_search_does_not_rise():
 
 
 def test_without_a_delay_the_slope_is_that_of_a_later_input():
-    # Every sample of an irregular record coincides with an edge of its input, where the cost has a kink.
+    # Every sample of an irregular record coincides with an edge of its input, at which the cost has a kink.
     rng = np.random.default_rng(5)
     record = record_of(TransferFunction([0.5], [1.0, 0.5], 0.3), rng, samples=60, regular=False)
     data = filter_data(record)
