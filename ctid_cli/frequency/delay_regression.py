@@ -76,7 +76,7 @@ class DelayRegression(Checked, FrequencyEstimator):
 
     @abstractmethod
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
 
     def track(self, samples: ArrayLike, interval: float) -> FrequencyTrack:
         """Estimate the frequencies at every sample of a record: see :meth:`FrequencyEstimator.track`."""
@@ -160,7 +160,7 @@ class Online(ABC):
 
     @abstractmethod
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
 
     def update(self, sample: float) -> FrequencyTrack:
         """Take the next sample, NaN if it is missing; return the one row of the track at its instant."""

@@ -97,7 +97,7 @@ class DremGradient(MixingOptions):
             require_integer("power", self.power, 1)
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         return OnlineGradient(self, interval)
 
 
@@ -180,7 +180,7 @@ class DremWindow(MixingOptions):
     memory: Annotated[float, require_positive, "s"]
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         window = whole_delay("memory", self.memory, interval)
         self.require_samples(self.memory, window, interval)
         return OnlineMixing(self, interval, window)
@@ -214,7 +214,7 @@ class OnlineMixing(Online):
             return sums[:, :n] / sums[:, n : n + 1], sums[:, n + 1]
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
         rows, n = self.rows(samples), omega.shape[1]
         history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):

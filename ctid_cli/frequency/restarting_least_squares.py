@@ -76,7 +76,7 @@ class RestartingLeastSquares(DelayRegression):
     solution: Solution = "least_squares"
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         return OnlineRestarting(self, interval)
 
 
@@ -106,7 +106,7 @@ class OnlineRestarting(Online):
         self._fit = Fit(np.zeros((3, n + 1, n + 1)), theta, omega, np.zeros(4), np.zeros(4, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
         restarting_fits(self.rows(samples), self.clock, self._settings, self._fit, omega, flags)
 
 
