@@ -290,7 +290,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return self._judged(fit, laid_out.problem)[0]
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
-        """The model in the loop of another record, with its own best state and offset there."""
+        """Return the model in the loop of another record, with the best state and offset for it."""
         problem = laid_out.problem
         own = self._own(problem, self._theta(fit))
         states = own.size - int(problem.offset)
