@@ -1,1 +1,1 @@
-"""What the estimators share: problems, iterations, searches over the delay, starts."""
+"""Common parts of the estimators: problems, iterations, searches over the delay, starts."""

@@ -1,4 +1,4 @@
-"""The estimation problem of a sum of submodels, in open or closed loop, and the iteration that solves it."""
+"""Estimation problem of a sum of submodels, in open or closed loop, and its iteration."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record, named
 
-#: An unstable loop is simulated over a record unless it would grow beyond this factor.
+#: Largest growth of an unstable loop over a record that is simulated.
 LARGEST_GROWTH = 1e20
-#: Lags of the response of an input to the reference, samples for each of them at least, and what keeps it determined.
+#: Impulse response of the input to the reference: most lags, fewest samples per lag, and regularisation.
 MOST_LAGS, SAMPLES_PER_LAG, RIDGE = 300, 10, 1e-9
 
-#: Where instruments come from: the measured input, the noise-free loop of the model, or what of the input follows the
-#: reference through an unknown loop.
+#: Source of the instruments: the measured input, the noise-free loop of the model, or the part of the input that is
+#: predicted from the reference through an unknown loop.
 Instruments = Literal["open_loop", "closed_loop", "reference"]
 
 
 def check_closed_loop(instruments: Instruments, variant: str) -> None:
-    """Refuse to guard a cost that the solution does not minimise."""
+    """Raise ValueError for guarded steps on a cost that the solution does not minimise."""
     if instruments != "open_loop" and variant == "guarded":
         reason = "in closed loop the solution is not the least output error"
         raise ValueError(f"variant guarded is for open-loop instruments: {reason}; use relaxed or plain")
 
 
 def loop_data(record: Record, instruments: Instruments) -> LoopData:
-    """The feedback that instruments are simulated with."""
+    """Return the feedback with which instruments are simulated."""
     if instruments == "open_loop":
         return OPEN_LOOP
     by_reference = instruments == "reference"
@@ -68,7 +68,7 @@ def loop_data(record: Record, instruments: Instruments) -> LoopData:
 
 
 def following(reference: Array, u: Array) -> Array:
-    """Return what of an input follows the reference: its best prediction by a finite impulse response, from rest."""
+    """Return the best prediction of an input from the reference by a finite impulse response, from rest."""
     from scipy.linalg import solve_toeplitz  # slow to import
 
     r, moved = reference - reference.mean(), u - u.mean()
@@ -85,28 +85,28 @@ def following(reference: Array, u: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AdditiveProblem:
-    """Parameters of a sum of submodels: ``theta = (a_1 … a_n, b_0 … b_m)`` of each submodel in turn."""
+    """Parameters of a sum of submodels: ``theta = (a_1 … a_n, b_0 … b_m)``, concatenated for all submodels."""
 
     data: FilterData
     terms: tuple[Term, ...]
     delay: float
     loop: LoopData = OPEN_LOOP
     initial_state: InitialState = "rest"
-    #: Parameters that are known, by their places, and their values.
+    #: Values of known parameters by their indices.
     fixed: Mapping[int, float] = field(default_factory=dict)
 
     @cached_property
     def filter(self) -> SubmodelFilter:
-        """What makes second moments of the record."""
+        """Filter that computes the second moments of the record."""
         return SubmodelFilter(self.data, self.terms, self.delay, self.loop, self.initial_state)
 
     @property
     def tangent(self) -> Array:
-        """Directions in which the parameters are free, those of a free response included, shape (p, f)."""
+        """Free directions of the parameters, including those of a free response, shape (p, f)."""
         return np.delete(np.eye(self.free), list(self.fixed), axis=1)
 
     def with_fixed(self, theta: Array) -> Array:
-        """Parameters with the known ones at their values."""
+        """Return the parameters with known ones at their values."""
         found = theta.copy()
         for place, value in self.fixed.items():
             found[place] = value
@@ -119,20 +119,20 @@ class AdditiveProblem:
 
     @property
     def free(self) -> int:
-        """Number of parameters to iterate on, those of a free response included."""
+        """Number of parameters of the iteration, including those of a free response."""
         return self.size + self.filter.free
 
     @property
     def size(self) -> int:
-        """Number of parameters of the model, those of a free response not counted."""
+        """Number of parameters of the model, without those of a free response."""
         return sum(term.size for term in self.terms)
 
     def model(self, theta: Array) -> AdditiveModel:
-        """The model that parameters describe."""
+        """Return the model with given parameters."""
         return AdditiveModel.from_theta(theta[: self.size], self.terms, self.delay)
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Unfactored denominator, numerator and delay [s] of a parameter vector."""
+        """Return the unfactored denominator, numerator and delay [s] of a parameter vector."""
         try:
             whole = unfactored(self.model(theta))
         except DataError:
@@ -142,21 +142,21 @@ class AdditiveProblem:
     def admissible(self, theta: Array) -> Array:
         """Reflect unstable submodels.
 
-        A real pole that changes sides changes the sign of the response either below its frequency or above it. What the
-        record shows must keep its sign: a pole in the lower half of the record's frequencies (in octaves, from one
-        period in the record to two samples) keeps the gain above itself, any other the static gain.
+        Reflecting a real pole changes the sign of the response either below or above its frequency. The sign must be
+        kept in the band of the record: a pole in the lower half of the record's frequencies (in octaves, from one
+        period in the record to two samples) keeps the gain above its frequency, any other the static gain.
         """
         if not np.isfinite(theta).all():
             return theta
         if self.fixed:
-            # To mirror a pole may move what is known; what is then still unstable is no model, and the step shorter.
+            # Reflecting a pole may change known parameters; if the model is then still unstable, the step is shortened.
             mirrored = self.with_fixed(self._mirrored(self.with_fixed(theta)))
             stable = np.array_equal(self._mirrored(mirrored), mirrored)
             return mirrored if stable else np.full_like(theta, np.nan)
         return self._mirrored(theta)
 
     def _mirrored(self, theta: Array) -> Array:
-        """Parameters of stable submodels."""
+        """Return the parameters with unstable submodels reflected."""
         result = theta.copy()
         offset = 0
         for term in self.terms:
@@ -172,7 +172,7 @@ class AdditiveProblem:
         return result
 
     def _changes_sign(self, denominator: Array) -> bool:
-        """Whether the gain above an odd number of slow poles is to be kept by changing the sign of the numerator."""
+        """Return whether the numerator changes sign, to keep the gain above an odd number of slow poles."""
         roots = np.roots(denominator)
         slow = (roots.imag == 0.0) & (roots.real > 0.0) & (np.abs(roots) < self._middle_frequency)
         return bool(np.count_nonzero(slow) % 2)
@@ -185,24 +185,24 @@ class AdditiveProblem:
         return math.pi * math.sqrt(2.0 * (t.size - 1)) / duration
 
     def equations(self, theta: Array) -> Equations:
-        """Second moments of the iteration."""
+        """Return the second moments of the iteration."""
         moments = self.filter.moments(theta) if np.isfinite(theta).all() else None
         found: Equations = moments or inadmissible(theta.size)
         return self._without_fixed(found) if self.fixed else found
 
     def rows(self, theta: Array) -> tuple[Array, Array] | None:
-        """Sensitivities and output error at the used samples; in closed loop instruments in place of the former."""
+        """Return sensitivities, or instruments in closed loop, and the output error at the used samples."""
         rows = self.filter.rows(theta)
         return None if rows is None else (rows[0], rows[2])
 
     def consistency_margin(self, theta: Array) -> float:
-        r"""Margin of the condition for consistent estimates: right side over left side; it holds above 1.
+        r"""Return the right side over the left side of the condition for consistency, which holds above 1.
 
         .. math:: \|E\,\hat\varphi\,\Delta'\|_2 < \sigma_{\min}(E\,\hat\varphi\,\tilde\varphi')
 
-        of González et al. (2025), (36) in open and (37) in closed loop, at the estimate in the place of the system,
-        with instruments of unit length. Delta is what the interpolation of the output between its samples makes of the
-        regressors. NaN where state or clock are others than those that it was derived for.
+        of González et al. (2025), (36) in open and (37) in closed loop, at the estimate instead of the system, with
+        instruments of unit length. Delta is the error of the regressors due to the interpolation of the output. NaN for
+        an initial state or a clock for which the condition was not derived.
         """
         source = None if self.filter.free or self.data.interval == 0.0 else self.filter.instrument_input(theta)
         if source is None or self.initial_state != "rest":
@@ -212,7 +212,7 @@ class AdditiveProblem:
         rows = still.filter.rows(theta)
         if rows is None:
             return math.nan
-        # Without noise: the output of the model, known at its samples.
+        # Noise-free regressors: from samples of the output of the model.
         rows = replace(still, data=whole._replace(y=plain_array(rows[3]), use=self.data.use)).filter.rows(theta)
         if rows is None:
             return math.nan
@@ -221,12 +221,12 @@ class AdditiveProblem:
         return float(least / greatest) if greatest > 0.0 else math.inf
 
     def loop_radius(self, model: AdditiveModel) -> float:
-        """Spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
+        """Return the spectral radius of the sampled loop of a model with the controller [-]; NaN in open loop."""
         controller, interval = self.loop.controller, self.data.interval
         return math.nan if controller is None or interval == 0.0 else loop_radius(model, controller, interval)
 
     def _without_fixed(self, found: Equations) -> Equations:
-        """Equations in which a known parameter has a row and a column of its own, and nothing moves it."""
+        """Return the equations with each known parameter decoupled and its step zero."""
         matrices = [found.instrument_regressor.copy(), found.hessian.copy()]
         error, known = found.instrument_error.copy(), list(self.fixed)
         for matrix in matrices:
@@ -237,7 +237,7 @@ class AdditiveProblem:
 
 
 class History(Sequence[IterationRecord]):
-    """Accepted iterations, each multiplied out to a transfer function only when it is looked at."""
+    """Accepted iterations, each converted to an unfactored transfer function only on access."""
 
     def __init__(self, problem: AdditiveProblem) -> None:
         self._problem = problem
@@ -250,7 +250,7 @@ class History(Sequence[IterationRecord]):
 
     @property
     def steps(self) -> int:
-        """Number of accepted steps, starts not counted."""
+        """Number of accepted steps, without starts."""
         return sum(number > 0 for _, number, _ in self._entries)
 
     def __len__(self) -> int:
@@ -264,7 +264,7 @@ class History(Sequence[IterationRecord]):
 
 
 class SubmodelEstimate(NamedTuple):
-    """Where the iteration for a sum of submodels ended."""
+    """Final estimate of the iteration for a sum of submodels."""
 
     problem: AdditiveProblem
     #: Parameters of the model in the order of the problem's terms, then those of the free response.
@@ -275,7 +275,7 @@ class SubmodelEstimate(NamedTuple):
 
     @property
     def model(self) -> AdditiveModel:
-        """The estimate, its submodels by rising natural frequency where none of its parameters is known by name."""
+        """Estimated model, its submodels sorted by natural frequency unless parameters are fixed by name."""
         try:
             found = self.problem.model(self.theta)
         except DataError as error:
@@ -285,7 +285,7 @@ class SubmodelEstimate(NamedTuple):
 
     @property
     def order(self) -> IndexArray:
-        """Places of all parameters in the order of those of the model, the free response's last."""
+        """Indices of all parameters in the order of the model, those of the free response last."""
         problem = self.problem
         if problem.fixed:
             return np.arange(self.theta.size)
@@ -296,9 +296,9 @@ class SubmodelEstimate(NamedTuple):
         return np.concatenate(own)
 
     def described(self, covariance: Covariance, draws: int, jacobian: Array) -> dict[str, Any]:
-        """What a `Fit` says of parameters with these derivatives by those of the model."""
+        """Return the fields of a `Fit` for parameters with this Jacobian by the parameters of the model."""
         problem = self.problem
-        # In a loop what is no solution is far off, and says nothing of its error.
+        # In closed loop an unconverged estimate may be far off, so that it has no standard errors.
         unsolved = problem.loop.closed and not self.status.succeeded
         tangent = problem.tangent[:, :0] if unsolved or self.status is Status.DIVERGED else problem.tangent
         values = assessed(problem, self.theta, self.equations, self.status, covariance, draws, tangent)
@@ -314,8 +314,8 @@ class SubmodelEstimate(NamedTuple):
 def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> SubmodelEstimate:
     """Iterate from a start.
 
-    Where the iteration does not converge it is run once more with the other interpolation of the output; and in open
-    loop, if that does not help, goes on with guarded steps.
+    If the iteration does not converge, it is repeated with the other interpolation of the output; in open loop, if that
+    fails too, it continues with guarded steps.
     """
     whole = problem.with_fixed(np.concatenate((theta, np.zeros(problem.filter.free))))
     radius = 0.0 if problem.loop.controller is None else problem.loop_radius(problem.model(whole))
@@ -336,7 +336,7 @@ def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> 
         otherwise_held = replace(problem, data=problem.data._replace(y_foh=not problem.data.y_foh))
         result = _better(result, run("refine_again", otherwise_held, whole, steps))
     if result is not None and result.status is Status.MAX_ITERATIONS and not problem.loop.closed:
-        # Slow on its way to a minimum: near it the cost may guard the steps, and Gauss-Newton is faster.
+        # Slow convergence: near a minimum the cost may guard the steps, and Gauss-Newton steps are faster.
         result = _better(result, run("refine_guarded", problem, result.theta, steps._replace(rule=GUARDED)))
     if result is None:
         return SubmodelEstimate(problem, whole, inadmissible(whole.size), Status.DIVERGED, history)
@@ -344,7 +344,7 @@ def estimate_submodels(problem: AdditiveProblem, theta: Array, steps: Steps) -> 
 
 
 def _better(one: Iterated | None, other: Iterated | None) -> Iterated | None:
-    """The one that converged; of two that did not, that with the smaller output error."""
+    """Return the converged result; if none converged, that with the smaller output error."""
     if one is None or other is None:
         return other if one is None else one
     if other.status is Status.CONVERGED:

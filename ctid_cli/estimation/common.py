@@ -1,4 +1,4 @@
-"""What every estimator of a system checks, lays out and reports in the same way."""
+"""Checks, data preparation and results common to all estimators of systems."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ class Fixed:
     Parameters
     ----------
     name : str
-        Its name in the table of parameters, for example a1 or g1_b0.
+        Name in the table of parameters, for example a1 or g1_b0.
     value : float
-        Its value, in the unit of that table.
+        Value in the unit of that table.
 
     Raises
     ------
@@ -64,15 +64,15 @@ class Bound:
     Parameters
     ----------
     name : str
-        A coefficient by its name in the table of parameters, for example a1 or u1_b0; delay; or gain of a model with
-        one or two poles, time_constant with one, damping with two; of several inputs u1_gain.
+        Name of a coefficient in the table of parameters, for example a1 or u1_b0; delay; gain of a model with one or
+        two poles, time_constant with one, damping with two; with several inputs u1_gain.
     low, high : float
-        Least and greatest value, in the unit of the tables.
+        Lower and upper bound, in the unit of the tables.
 
     Raises
     ------
     ValueError
-        If these are no two finite numbers of which the first is below the second.
+        Unless both are finite and ``low`` is below ``high``.
     """
 
     name: str
@@ -86,12 +86,12 @@ class Bound:
 
     @property
     def scale(self) -> float:
-        """The greater magnitude of both."""
+        """Larger magnitude of both bounds."""
         return max(abs(self.low), abs(self.high))
 
 
 def places_of(fixed: Iterable[Fixed] | None, names: Sequence[str]) -> dict[int, float]:
-    """Values of known parameters by their places among the names; unknown names and repetitions are refused."""
+    """Return values of known parameters by their index in ``names``; refuse unknown and repeated names."""
     found: dict[int, float] = {}
     for one in fixed or ():
         if one.name == "delay":
@@ -107,20 +107,20 @@ def places_of(fixed: Iterable[Fixed] | None, names: Sequence[str]) -> dict[int, 
     return found
 
 
-#: More integrators are not told apart in records.
+#: Largest number of integrators that records can distinguish.
 MOST_INTEGRATORS = 3
-#: Draws without which the 95 % quantile of a bootstrap means nothing.
+#: Fewest draws for a 95 % quantile of a bootstrap.
 LEAST_DRAWS = 40
-#: What an estimator takes from a start: an initial delay, or initial parameters.
+#: Part of a start that an estimator uses: the initial delay, or initial parameters.
 StartFrom = Literal["delay", "parameters"]
-#: What an estimator makes of a record before it knows a start, and what it returns.
+#: Prepared form of a record, before a start is known, and result of an estimator.
 LaidOut = TypeVar("LaidOut")
 AnyFit = TypeVar("AnyFit", bound=Fit)
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where an estimator starts.
+    """Start of an estimator.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Start:
 
 
 class Estimator(Generic[LaidOut, AnyFit]):
-    """An estimator of a system: frozen options, checked when they are given, and how it uses them."""
+    """Estimator of a system: a frozen dataclass of options, checked on creation."""
 
     kind: ClassVar[str]
     start_from: ClassVar[StartFrom | None] = None
@@ -144,22 +144,22 @@ class Estimator(Generic[LaidOut, AnyFit]):
         check_options(self)
 
     def _lay_out(self, record: Any) -> LaidOut:
-        """What can be computed, and refused, before a start is known."""
+        """Check and prepare a record before a start is known."""
         raise NotImplementedError
 
     def _estimate(self, laid_out: LaidOut, start: Start | None) -> AnyFit:
         raise NotImplementedError
 
     def check_start(self, start: Start) -> None:
-        """Refuse, with a DataError, a start that the options exclude; no record is needed to tell.
+        """Raise DataError for a start that the options exclude, without a record.
 
-        Most estimators choose their starts themselves and refuse none.
+        Most estimators choose their starts and accept any.
         """
 
     def prepare(self, record: Any) -> Prepared[LaidOut, AnyFit]:
-        """Check a record, or several where they may be, and lay it out once for any number of starts.
+        """Check a record, or several if allowed, and prepare it once for any number of starts.
 
-        A DataError says why nothing can be estimated.
+        A DataError states why estimation is impossible.
         """
         records = as_records(record)
         for one in records if not hasattr(self, "inputs") else ():
@@ -168,20 +168,20 @@ class Estimator(Generic[LaidOut, AnyFit]):
         return Prepared(self, self._lay_out(record), in_loop)
 
     def fit(self, record: Any, start: Start | None = None) -> AnyFit:
-        """Estimate from a record, or several where they may be, and from a start where the estimator takes one.
+        """Estimate from a record, or several if allowed, and from a start if the estimator uses one.
 
-        A DataError says why nothing can be estimated.
+        A DataError states why estimation is impossible.
         """
         return self.prepare(record).fit(start)
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared(Generic[LaidOut, AnyFit]):
-    """A record laid out for an estimator, ready to fit from any start."""
+    """Record prepared for an estimator, ready to fit from any start."""
 
     estimator: Estimator[LaidOut, AnyFit]
     laid_out: LaidOut
-    #: Whether the record is from a loop of which the estimator knows nothing.
+    #: Whether the record is from a feedback loop that the estimator ignores.
     in_ignored_loop: bool = False
 
     def fit(self, start: Start | None = None) -> AnyFit:
@@ -192,7 +192,7 @@ class Prepared(Generic[LaidOut, AnyFit]):
         if not self.in_ignored_loop:
             return fit
         if fit.law is not None and getattr(self.estimator, "covariance", "") == "auto":
-            # One fit and its parts in other forms: what is not defined in one is not in any.
+            # If the covariance is undefined in one form of the parameters, it is undefined in all.
             law = fit.law.in_ignored_loop
             covariance = fit.covariance if law is fit.law else np.full_like(fit.covariance, np.nan)
             fit = replace(fit, law=law, covariance=covariance)
@@ -207,7 +207,7 @@ def _require_fraction(name: str, value: float) -> None:
         raise OptionError(name, f"{name} must lie between 0 and 1, not {value}")
 
 
-#: Checks of the options that several estimators share, by name; None stands for an option that was not given.
+#: Checks of options common to several estimators, by name; None means that an option was not given.
 CHECKS: Mapping[str, Callable[[str, Any], object]] = {
     "integrators": lambda name, value: require_integer(name, value, 0, MOST_INTEGRATORS),
     "zeros": lambda name, value: require_integer(name, value, 0),
@@ -227,17 +227,17 @@ CHECKS: Mapping[str, Callable[[str, Any], object]] = {
 
 @lru_cache
 def _choices(options: type) -> dict[str, tuple[str, ...]]:
-    """The words that each option of a Literal type may be."""
+    """Return the allowed values of each option of a Literal type."""
     return {name: get_args(hint) for name, hint in get_type_hints(options).items() if get_origin(hint) is Literal}
 
 
 def check_options(options: Any) -> None:
-    """Check every option by itself."""
+    """Check every option separately."""
     choices = _choices(options.__class__)
     for item in fields(options):
         name, value = item.name, getattr(options, item.name)
         if name == "poles":
-            # A system may consist of integrators alone.
+            # A system may consist of integrators only.
             require_integer(name, value, int(not getattr(options, "integrators", 0)), 12)
         elif name in choices:
             require_choice(name, value, choices[name])
@@ -253,7 +253,7 @@ def check_proper(poles: int, zeros: int) -> None:
 
 
 def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> tuple[float, float]:
-    """Bounds of the delay as numbers; two equal ones are a known delay."""
+    """Return the bounds of the delay as floats; equal bounds are a known delay."""
     try:
         low, high = (float(bound) for bound in bounds)
     except (TypeError, ValueError):
@@ -268,7 +268,7 @@ def checked_bounds(bounds: tuple[float, float], known_allowed: bool = False) -> 
 
 
 def check_record(record: Record, data: FilterData, parameters: int, free_response: bool = False) -> None:
-    """Refuse records from which nothing can be estimated; a free response needs no input that varies."""
+    """Refuse records without the data for an estimate; a free response does not require a varying input."""
     if data.count <= parameters:
         what = f"{named(record)}{data.count} usable samples are too few for {parameters} parameters"
         raise DataError(f"{what}; take a longer record, a smaller model, or a smaller largest delay")
@@ -283,7 +283,7 @@ def check_record(record: Record, data: FilterData, parameters: int, free_respons
 
 
 def check_greatest_delay(record: Record, greatest: float) -> None:
-    """Refuse a delay that may last as long as the record."""
+    """Refuse a greatest delay as long as the record."""
     duration = record.t[-1] - max(signal.t[0] for signal in record.held.values())
     if greatest >= duration:
         delay = f"{named(record)}the greatest delay, {greatest:g} s,"
@@ -291,7 +291,7 @@ def check_greatest_delay(record: Record, greatest: float) -> None:
 
 
 def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
-    """Delay from which a search starts."""
+    """Return the delay from which a search starts."""
     low, high = bounds
     delay = 0.5 * (low + high) if start is None or start.delay is None else start.delay
     if not low <= delay <= high:
@@ -303,19 +303,19 @@ def initial_delay(start: Start | None, bounds: tuple[float, float]) -> float:
 
 
 def history_entry(stage: str, iteration: int, problem: Problem, row: Array) -> IterationRecord:
-    """Describe one accepted iteration by its parameters, with their squared error behind them."""
+    """Describe one accepted iteration by its parameters, followed by their squared error."""
     a, b, delay = problem.split(row[:-1])
     cost = float(row[-1]) / problem.samples
     return IterationRecord(stage, iteration, delay, cost, tuple(a.tolist()), tuple(b.tolist()))
 
 
 def history_of(stage: str, problem: Problem, path: Array) -> list[IterationRecord]:
-    """Describe the start and the accepted steps of an iteration, which are the rows of its path."""
+    """Describe the start and the accepted steps of an iteration, the rows of its path."""
     return [history_entry(stage, k, problem, row) for k, row in enumerate(path)]
 
 
 def quality(equations: Equations, spread: float, count: int) -> dict[str, Any]:
-    """Cost, agreement and conditioning by the names of `Fit`; ``spread`` is ``sum (y - mean y)^2``."""
+    """Return cost, fit and conditioning as fields of `Fit`; ``spread`` is ``sum (y - mean y)^2``."""
     r2 = 1.0 - equations.squared_error / spread
     return {
         "cost": equations.squared_error / count,
@@ -335,7 +335,7 @@ def assessed(
     draws: int,
     tangent: Array,
 ) -> dict[str, Any]:
-    """Uncertainty, status, cost and agreement by the names of `Fit`; the tangent has the free directions as columns."""
+    """Return uncertainty, status, cost and fit as fields of `Fit`; the columns of ``tangent`` are free directions."""
     y, nothing = problem.data.y_used, np.full((len(tangent),) * 2, np.nan)
     if not np.isfinite(equations.squared_error):
         unknown = dict.fromkeys(("cost", "fit_percent", "r2", "condition_number"), float("nan"))
@@ -368,8 +368,8 @@ def finish(
     """Assemble the result of an estimation, with standard errors for a kind of noise."""
     a, b, delay = problem.split(theta)
     size = problem.free
-    # A delay that is held is no parameter of the result. One at its bound is no minimum: it has no standard error, and
-    # the others hold for that delay.
+    # A fixed delay is not a parameter of the result. A delay at its bound is not a minimum and has no standard error;
+    # the other standard errors are valid for that delay.
     accurate = 0 if status is Status.LEAST_SQUARES else size - int(status is Status.DELAY_AT_BOUND)
     found = problem.equations(theta)
     found = found._replace(hessian=found.hessian[:size, :size])

@@ -1,4 +1,4 @@
-"""What a run calls is compiled before its worker processes begin, so that not each of them has to."""
+"""Compilation of the kernels of a run before its worker processes start."""
 
 import time
 from collections.abc import Iterable
@@ -15,8 +15,8 @@ from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Loop, Record
 
-#: Options with which an estimator of any kind soon ends on the record below. What remains of its options, and with it
-#: the kernels that it calls, are its own.
+#: Options that make an estimator of any kind finish quickly on the record below. All other options, which determine the
+#: kernels that are called, are kept.
 SHORT_WORK: dict[str, Any] = {
     "delay": 0.0,
     "delay_bounds": (0.0, 1.0),
@@ -26,16 +26,16 @@ SHORT_WORK: dict[str, Any] = {
     "beta": 2.0,
     "max_iterations": 1,
     "max_rounds": 1,
-    # Of several inputs the record below has one.
+    # The record below has one input.
     "inputs": None,
     "fixed": None,
 }
 
 
 def compile_kernels(estimators: Iterable[Any], *, regular: bool = True, closed: bool = False) -> float:
-    """Compile what estimators need for one kind of record, or load it from the cache on disk; the seconds that it took.
+    """Compile the kernels of estimators for one kind of record, or load them from the disk cache; return the time [s].
 
-    Numba keeps the compiled code beside the package, or in ``NUMBA_CACHE_DIR`` if that is set.
+    Numba stores compiled code in the package's folders, or in ``NUMBA_CACHE_DIR`` if that is set.
     """
     began = time.perf_counter()
     rng = np.random.default_rng(0)
@@ -48,7 +48,7 @@ def compile_kernels(estimators: Iterable[Any], *, regular: bool = True, closed: 
     record = Record(t, output, held, loop=Loop(held.values, gain) if closed else None)
     for estimator in estimators:
         names = {item.name for item in fields(estimator)}
-        # Not every structure can be estimated from this record: what was called before that is found is compiled.
+        # Not every structure can be estimated from this record; kernels called before the error are compiled.
         with suppress(DataError):
             replace(estimator, **{name: value for name, value in SHORT_WORK.items() if name in names}).fit(record)
     return time.perf_counter() - began

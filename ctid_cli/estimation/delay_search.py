@@ -1,9 +1,9 @@
-r"""Searches over the delay, the coefficients estimated anew at every trial delay (separable least squares).
+r"""Searches over the delay, with the coefficients estimated at every trial delay (separable least squares).
 
 With ``eps = y - B/A u(t - tau)``, ``d eps/d tau = p B/A u(t - tau)`` and psi the sensitivities to the coefficients, the
 cost minimised over the coefficients has the gradient ``g = eps_tau' eps`` and the curvature
 ``H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau``; the Gauss-Newton step of the delay is ``-g/H``.
-Which data the cost is made of, filtered or not, samples or spectra, is the business of the *cost*.
+The *cost* defines the data: filtered or not, samples or spectra.
 """
 
 from collections.abc import Sequence
@@ -20,26 +20,26 @@ from ctid_cli.inference.fit import Fit, Status
 
 #: The smallest delay step, as a fraction of the range of the delay.
 SMALLEST_STEP = 1e-5
-#: The delay counts as undetermined where projecting the coefficients out leaves less of the curvature; more has to be
-#: left before a bound counts as being in the way.
+#: Least share of the curvature that remains after projecting out the coefficients, below which the delay is
+#: undetermined; and the larger share that is required before a bound counts as active.
 LEAST_CURVATURE = 1e-14
 LEAST_AT_BOUND = 1e-8
-#: Fewest delays of a grid over the whole range, whatever the bandwidth asks for.
+#: Fewest delays of a grid over the whole range, for any bandwidth.
 FEWEST_DELAYS = 24
-#: Local minima of a level around which the next level looks, and those of the last level that are returned.
+#: Numbers of local minima of a level that the next level refines, and of the last level that are returned.
 KEPT = 8
 MINIMA = 3
-#: Spacings of a level's grid on either side of its minima that the next level covers.
+#: Half-width of the next level's search around each minimum, in grid spacings of the current level.
 REACH = 1.5
-#: A minimum whose cost exceeds the least of its level by more than this factor is given up.
+#: Minima with a cost above the least of their level by more than this factor are discarded.
 HOPELESS = 4.0
-#: Gauss-Newton steps on the delay that end the search on levels.
+#: Final Gauss-Newton steps on the delay after the search on levels.
 DESCENT_ITERATIONS = 10
 DESCENT_TOLERANCE = 1e-4
-#: Most delays that are compared with an estimate, and how hard the lowest minima among them are refined.
+#: Largest number of delays compared with an estimate, and steps for refining the lowest minima among them.
 MOST_COMPARED = 400
 EFFORT = Steps(10, 1e-3, GUARDED)
-#: The cost counts as lower elsewhere where it is so by this fraction.
+#: Relative decrease by which the cost counts as lower at another delay.
 LOWER = 1e-3
 
 
@@ -48,14 +48,14 @@ class Minimum(NamedTuple):
 
     #: ``(a_1 … a_n, b_0 … b_m, delay [s])``, shape (n + m + 2,).
     theta: Array
-    #: Sum of squared output errors [output unit^2]; infinite where nothing could be computed.
+    #: Sum of squared output errors [output unit^2]; infinite if it could not be computed.
     squared_error: float
-    #: Gauss-Newton step of the delay [s]; NaN where the data do not determine it.
+    #: Gauss-Newton step of the delay [s]; NaN if the data do not determine it.
     step: float = np.nan
 
     @property
     def delay(self) -> float:
-        """The delay [s]."""
+        """Delay [s]."""
         return float(self.theta[-1])
 
 
@@ -64,17 +64,17 @@ class Minima(NamedTuple):
 
     #: ``(a_1 … a_n, b_0 … b_m, delay [s])``, shape (K, n + m + 2).
     thetas: Array
-    #: Infinite where nothing could be computed, shape (K,).
+    #: Infinite if it could not be computed, shape (K,).
     squared_errors: Array
 
     def lowest(self, most: int) -> list[Minimum]:
-        """The lowest local minima over rising delays, lowest first."""
+        """Return the lowest local minima over ascending delays, lowest first."""
         places = lowest_minima(self.squared_errors, most).tolist()
         return [Minimum(self.thetas[k], float(self.squared_errors[k])) for k in places]
 
 
 def lowest_minima(costs: Array, most: int) -> IndexArray:
-    """Where the lowest local minima of a profile are, lowest first."""
+    """Return the indices of the lowest local minima of a profile, lowest first."""
     padded = np.concatenate(([np.inf], costs, [np.inf]))
     lowest = (costs <= padded[:-2]) & (costs <= padded[2:]) & np.isfinite(costs)
     indices = np.flatnonzero(lowest)
@@ -82,18 +82,18 @@ def lowest_minima(costs: Array, most: int) -> IndexArray:
 
 
 class DelayCost(Protocol):
-    """A cost as a function of the delay, minimised over the coefficients."""
+    """Cost as a function of the delay, minimised over the coefficients."""
 
     @property
     def size(self) -> int:
         """Number of parameters, the delay included."""
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """Least cost at a delay over starts of any delay, shape (K, n + m + 2), and those that the cost has itself."""
+        """Return the least cost at a delay from given starts, shape (K, n + m + 2), and with ``own`` least squares."""
 
 
 class Limits(NamedTuple):
-    """Where a descent may go, how far in one step, and when it ends."""
+    """Bounds, step lengths and end of a descent."""
 
     low: float
     high: float
@@ -101,23 +101,23 @@ class Limits(NamedTuple):
     tolerance: float
     smallest_step: float
     largest_step: float = np.inf
-    #: Whether steps beyond a bound are mirrored there, not halved.
+    #: Whether steps beyond a bound are reflected, not halved.
     reflect: bool = False
 
 
 class Descent(NamedTuple):
-    """Where a descent went: its end, the start and all it accepted, how it ended, and after how many iterations."""
+    """Descent: its minimum, its start and accepted steps, its status and its number of iterations."""
 
     minimum: Minimum
-    #: Parameters with their squared errors in the last column, shape (K, n + m + 3); none without a start.
+    #: Parameters with their squared errors in the last column, shape (K, n + m + 3); empty without a start.
     path: Array
-    #: None where the cost could be computed nowhere.
+    #: None if the cost could not be computed.
     end: Status | None
     iterations: int
 
 
 def delay_step(current: Equations, least_curvature: float) -> float:
-    """Gauss-Newton step of the delay, the last parameter, with the coefficients projected out; NaN if undetermined."""
+    """Return the Gauss-Newton step of the delay, the last parameter, with coefficients projected out; or NaN."""
     hessian, gradient = current.hessian, current.instrument_error
     last = gradient.size - 1
     lengths, mixed = np.diag(hessian).copy(), hessian[:, last].copy()
@@ -133,12 +133,12 @@ def delay_step(current: Equations, least_curvature: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class SampledCost:
-    """The cost of a record's samples as a function of the delay, by refined instrumental variables at each."""
+    """Cost of a record's samples as a function of the delay, minimised by refined instrumental variables."""
 
-    #: The coefficients, at a delay that is held.
+    #: Problem of the coefficients at a fixed delay.
     problem: SampledProblem
     steps: Steps
-    #: Cut-offs of the state-variable filters of its own starts [rad/s].
+    #: Cut-offs of the state-variable filters of least-squares starts [rad/s].
     svf_cutoffs: Sequence[float]
 
     @property
@@ -147,7 +147,7 @@ class SampledCost:
         return self.problem.free + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """Least cost at one delay, from given coefficients and, if asked for, from the least-squares starts."""
+        """Return the least cost at one delay, from given coefficients and with ``own`` from least squares."""
         problem, refit, cutoffs = self.problem, self.steps.rule == GUARDED, self.svf_cutoffs if own else ()
         tried = [*least_squares_starts(problem.data, problem.structure, delay, cutoffs, refit), *starts]
         ends = (iterate(problem, np.append(start[:-1], delay), self.steps) for start in tried)
@@ -161,10 +161,10 @@ class SampledCost:
 
 
 def descend(cost: DelayCost, delay: float, starts: Array, limits: Limits) -> Descent:
-    """Gauss-Newton on the delay from the best of several starts, or from the cost's own if there is none.
+    """Run Gauss-Newton on the delay from the best of several starts, or without any from least squares.
 
-    A step is halved while it leaves the bounds (unless it is mirrored) or does not lower the cost, and the search ends
-    where that makes it shorter than the shortest step.
+    A step is halved while it leaves the bounds (unless it is reflected) or does not reduce the cost; the search ends
+    when the step is shorter than the shortest one.
     """
     current = cost.minimise(delay, starts, starts.shape[0] == 0)
     if not np.isfinite(current.squared_error):
@@ -185,7 +185,7 @@ def descend(cost: DelayCost, delay: float, starts: Array, limits: Limits) -> Des
 
 
 def _lower(cost: DelayCost, current: Minimum, limits: Limits) -> Minimum | Status:
-    """The minimum after one step of the delay, or why there is none."""
+    """Return the minimum after one step of the delay, or the status that ends the search."""
     if not np.isfinite(current.step):
         return Status.SINGULAR
     step = min(max(current.step, -limits.largest_step), limits.largest_step)
@@ -202,7 +202,7 @@ def _lower(cost: DelayCost, current: Minimum, limits: Limits) -> Minimum | Statu
 
 
 def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, float]) -> float | None:
-    """The bound that keeps the delay, the last parameter, from a lower cost."""
+    """Return the bound that prevents a lower cost by the delay, the last parameter; else None."""
     target = delay + delay_step(current, LEAST_AT_BOUND)
     if target < bounds[0]:
         return bounds[0]
@@ -213,7 +213,7 @@ def bound_in_the_way(current: Equations, delay: float, bounds: tuple[float, floa
 
 
 def quarter_periods(low: float, high: float, bandwidth: float, most: int) -> Array:
-    """Delays no more than a quarter period of a bandwidth apart, unless these are too many."""
+    """Return delays with a spacing of at most a quarter period of a bandwidth, unless these are too many."""
     wanted = int(np.ceil((high - low) * bandwidth / (0.5 * np.pi))) + 1
     return np.linspace(low, high, min(max(wanted, FEWEST_DELAYS), most))
 
@@ -223,9 +223,9 @@ def search_levels(
 ) -> tuple[Array, Array, list[Minimum]]:
     """Search the whole range of the delay on levels, one for each cost with the spacing of its grid [s].
 
-    The spacing is no more than a quarter period of the highest frequency that matters to the cost. At each delay the
-    coefficients start from those of both neighbours and from least squares, and the cheapest are kept. Returns the grid
-    of the first level [s] with its costs, NaN where the equations were singular, and the lowest minima of the last.
+    The spacing is at most a quarter period of the highest relevant frequency of the cost. At each delay the
+    coefficients start from those of both neighbours and from least squares, and the best are kept. Returns the grid of
+    the first level [s], its costs, NaN for singular equations, and the lowest minima of the last level.
     """
     low, high = bounds
     grid = np.linspace(low, high, max(int(np.ceil((high - low) / spacings[0])) + 1, FEWEST_DELAYS))
@@ -234,7 +234,7 @@ def search_levels(
     for level, spacing in enumerate(spacings[1:], 1):
         count = int(np.ceil(REACH * coarser / spacing))
         offsets = spacing * np.arange(-count, count + 1)
-        # Grids that overlap share their points.
+        # Overlapping grids share their points.
         places = {
             round(float(minimum.delay + offset) / spacing) for minimum in _hopeful(found, KEPT) for offset in offsets
         }
@@ -248,13 +248,13 @@ def search_levels(
 
 
 def scan(costs: Sequence[DelayCost], delays: Sequence[float], own: bool = True) -> Minima:
-    """Least costs at delays, of one cost each, one after the other.
+    """Return the least of each cost at its delay.
 
-    Each starts from the coefficients of both neighbours, and from its own; or, if not ``own``, from its own only where
-    the neighbour has none.
+    Each starts from the coefficients of both neighbours, and from least squares; if not ``own``, from least squares
+    only if the neighbour has none.
     """
     found = Minima(np.zeros((len(costs), costs[0].size)), np.full(len(costs), np.inf))
-    # Along the delays and back: the way back only hands good coefficients on to worse neighbours.
+    # Forward and backward pass: the backward pass only transfers good coefficients to worse neighbours.
     for order in (range(len(costs)), range(len(costs) - 1, -1, -1)):
         neighbour = np.empty((0, costs[0].size))
         for k in order:
@@ -267,13 +267,13 @@ def scan(costs: Sequence[DelayCost], delays: Sequence[float], own: bool = True) 
 
 
 def _hopeful(found: Minima, most: int) -> list[Minimum]:
-    """The lowest local minima, without those that are far above the least."""
+    """Return the lowest local minima, without those far above the least."""
     lowest = found.lowest(most)
     return [minimum for minimum in lowest if minimum.squared_error <= HOPELESS * lowest[0].squared_error]
 
 
 def lower_elsewhere(problem: SampledProblem, fit: Fit, bandwidth: float) -> bool:
-    """Whether the cost is lower at another delay: the numerator alone is fitted there first, then all parameters."""
+    """Return whether the cost is lower at another delay: first only the numerator is fitted, then all parameters."""
     n, m = problem.poles, problem.zeros
     held = problem._replace(free_delay=False)
 

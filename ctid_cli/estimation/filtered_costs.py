@@ -1,6 +1,6 @@
-"""Output-error costs of a record behind low-pass filters as functions of the delay, on spectra, and their search.
+"""Output-error costs of a low-pass filtered record as functions of the delay, computed from spectra, and their search.
 
-Useful redundancy over the delay: solver paths on the costs of several filters, ranked by the mean of all.
+Useful redundancy over the delay: solver paths on the costs of several filters, ranked by the mean of all costs.
 """
 
 from collections.abc import Sequence
@@ -24,35 +24,35 @@ from ctid_cli.signals.record import Record
 
 #: Highest frequency, as a multiple of the highest cut-off: a filter of order 10 passes 3e-4 of the power there.
 HIGHEST = 1.5
-#: Frequencies above the last one whose weight exceeds this fraction of the greatest are left out.
+#: Frequencies above the last one with a weight over this fraction of the greatest are omitted.
 NEGLIGIBLE_WEIGHT = 1e-6
-#: The search moves on a lattice of delays of this fraction of the shortest period: candidates that agree are one, and
-#: searches of the same data from different initial delays share costs and paths.
+#: Spacing of the lattice of delays, as a fraction of the shortest period: equal candidates coincide, and searches of
+#: one record from different initial delays share costs and paths.
 LATTICE = 0.1
 #: The shortest Gauss-Newton step of the search, as a fraction of the shortest period.
 SMALLEST_STEP = 0.01
-#: The longest Gauss-Newton step, as a fraction of the range of the delay: from a fifth to four fifths all serve, with a
-#: tenth the paths end in small bumps far from the minimum.
+#: The longest Gauss-Newton step, as a fraction of the range of the delay: values from 0.2 to 0.8 work; with 0.1 the
+#: paths end in shallow local minima far from the global one.
 LARGEST_STEP = 1 / 3
-#: Where no path leads lower and J0 exceeds this [%], the paths start once more a period of their filter away.
+#: If no path reduces J0 and J0 exceeds this [%], the paths are restarted one period of their filter away.
 POOR = 25.0
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredCost:
-    """The output-error cost of a record behind a low-pass filter as a function of the delay."""
+    """Output-error cost of a low-pass filtered record as a function of the delay."""
 
     spectra: RecordSpectra
-    #: ``|L|^2`` at the first frequencies, those where it matters.
+    #: ``|L|^2`` at the lowest frequencies, where it is significant.
     weights: Array
-    #: Mean square of the filtered output less its mean [output unit^2].
+    #: Variance of the filtered output [output unit^2].
     spread: float
     #: Cut-off of the state-variable filter of the least-squares start [rad/s].
     svf_cutoff: float
     structure: Structure
-    #: Poles at the origin besides; with any the mean is left out.
+    #: Additional poles at the origin; with any the mean is omitted.
     integrators: int
-    #: How hard to work at each delay.
+    #: Steps of the minimisation at each delay.
     steps: Steps
 
     @property
@@ -61,15 +61,15 @@ class FilteredCost:
         return self.structure.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """Least cost at a delay over starts of any delay and, if asked for, from least squares."""
+        """Return the least cost at a delay from given starts and with ``own`` from least squares."""
         spectra, reach, steps = self.spectra, self.weights.size, self.steps
         data = spectra.frequencies[:reach], spectra.outputs[:reach], spectra.inputs(delay, reach), self.weights
         poles, order = self.structure.poles, self.structure.poles + self.integrators
-        # B, and what the states at the ends of the window add.
+        # B, and the terms of the states at the ends of the window.
         linear = np.zeros(self.structure.zeros + 1 + order)
         tried = [np.concatenate((start[:poles], linear)) for start in starts]
         if own:
-            # The state-variable filter 1/(p + w)^n; of no poles NumPy makes a number.
+            # The state-variable filter 1/(p + w)^n; without poles np.poly returns a scalar.
             filter_ = np.concatenate((np.atleast_1d(np.poly(np.full(poles, -self.svf_cutoff)))[1:], linear))
             solved, theta = least_squares(*data, filter_, poles, order)
             if solved:
@@ -83,7 +83,7 @@ class FilteredCost:
 
 
 def percents(squared_errors: Array, spreads: Array | float) -> Array:
-    """``100 ||y - x|| / ||y - mean y||`` of filtered data [%]; 100 where nothing could be computed."""
+    """Return ``100 ||y - x|| / ||y - mean y||`` of filtered data [%]; 100 if it could not be computed."""
     return np.where(np.isfinite(squared_errors), 100.0 * np.sqrt(squared_errors / spreads), 100.0)
 
 
@@ -98,7 +98,7 @@ def filtered_costs(
     steps: Steps,
     integrators: int = 0,
 ) -> list[FilteredCost]:
-    """Costs of one record behind filters; samples earlier than ``start`` after the first input are not used."""
+    """Return the costs of one record for several filters; samples until ``start`` after the first input are unused."""
     highest = HIGHEST * max(lowpass.cutoff for lowpass in lowpasses)
     spectra = record_spectra(record, start, highest, greatest_delay, keep_mean=integrators == 0)
     power = np.where(spectra.frequencies > 0.0, 2.0, 0.0) * np.abs(spectra.outputs) ** 2
@@ -114,32 +114,32 @@ def filtered_costs(
 
 @dataclass(frozen=True, eq=False)
 class FilterPath:
-    """One solver path: Gauss-Newton on the delay with one filter."""
+    """Solver path: Gauss-Newton on the delay with one filter."""
 
     round: int
     filter: int
-    #: From the incumbent, or a period of the filter away from it.
+    #: Start at the incumbent, or one period of the filter away from it.
     descent: Descent
-    #: Mean square of the filtered output less its mean, or the sum of these squares.
+    #: Variance of the filtered output, or its sum of squares about the mean.
     spread: float
-    #: The candidate that the end of the path became [s].
+    #: Candidate at the end of the path [s].
     end: float
 
     @cached_property
     def delays(self) -> Array:
-        """Accepted trial delays [s], where it started first, shape (K,)."""
+        """Start and accepted trial delays [s], shape (K,)."""
         return self.descent.path[:, -2]
 
     @cached_property
     def costs(self) -> Array:
-        """``100 ||y - x|| / ||y - mean y||`` of the filtered data there [%], shape (K,)."""
+        """``100 ||y - x|| / ||y - mean y||`` of the filtered data at these delays [%], shape (K,)."""
         return percents(self.descent.path[:, -1], self.spread)
 
 
 def path_history(
     stage: str, search: RedundantMinimum[float], paths: Sequence[FilterPath], poles: int, samples: int = 1
 ) -> list[IterationRecord]:
-    """Describe the steps of the paths that led from incumbent to incumbent."""
+    """Describe the steps of the paths between successive incumbents."""
     led = {(path.round, path.filter, path.end): path for path in reversed(paths)}
     return [
         IterationRecord(
@@ -152,10 +152,10 @@ def path_history(
 
 
 class FilterSearch:
-    """The costs of a record behind a set of filters, and the search through them."""
+    """Costs of a record for a set of filters, and the search over them."""
 
     def __init__(self, costs: Sequence[FilteredCost], filters: FilterSet, limits: Limits) -> None:
-        #: That of the lowest cut-off first.
+        #: Ascending cut-offs.
         self.costs = costs
         self.filters = filters
         self.period = float(filters.periods[-1])
@@ -169,12 +169,12 @@ class FilterSearch:
         return min(max(round(delay / step) * step, self.limits.low), self.limits.high)
 
     def reference_cost(self, delay: float) -> float:
-        """J0 (45), the mean of the costs behind all filters, at the nearest point of the lattice [%]."""
+        """Return J0 (45), the mean of the costs of all filters, at the nearest point of the lattice [%]."""
         spreads = np.array([cost.spread for cost in self.costs])
         return float(percents(self.at(self.on_lattice(delay)).squared_errors, spreads).mean())
 
     def run(self, delay: float, max_rounds: int) -> tuple[RedundantMinimum[float], list[FilterPath]]:
-        """Follow the paths of all filters from incumbent to incumbent, round by round."""
+        """Follow the paths of all filters from successive incumbents, round by round."""
         found = minimise_redundantly(
             self.on_lattice(delay),
             self.reference_cost,
@@ -193,17 +193,17 @@ class FilterSearch:
         return found, paths
 
     def _minima(self, delay: float) -> Minima:
-        """Least costs behind all filters at a delay."""
-        # Least squares on a narrow band is hopeless in noise: the next wider band knows the system better.
+        """Return the least costs of all filters at a delay."""
+        # Least squares on a narrow band fails in noise: start from the estimate of the next wider band.
         found = scan(self.costs[::-1], [delay] * len(self.costs), own=False)
         return Minima(found.thetas[::-1], found.squared_errors[::-1])
 
     def _ends(self, k: int, delay: float) -> list[float]:
-        """Where the paths of one filter from an incumbent end, on the lattice."""
+        """Return the ends of the paths of one filter from an incumbent, on the lattice."""
         return [self.on_lattice(descent.minimum.delay) for descent in self._followed(k, delay)]
 
     def _followed(self, k: int, delay: float) -> list[Descent]:
-        """Descents of one filter's cost from an incumbent, and from the next valleys if it is poor and a dead end."""
+        """Return descents from an incumbent, and from adjacent valleys if it is poor and no filter improves it."""
         near, cost = self._descended(k, delay, 0), self.reference_cost(delay)
         if cost <= POOR:
             return near
@@ -213,12 +213,12 @@ class FilterSearch:
         return near + self._descended(k, delay, -1) + self._descended(k, delay, 1)
 
     def _descend(self, k: int, delay: float, periods: int) -> list[Descent]:
-        """Descents of one filter's cost from a number of its periods away from a point of the lattice."""
+        """Return descents of one filter's cost, started a number of its periods away from a point of the lattice."""
         none, here = np.empty((0, self.costs[k].size)), self.at(delay)
         start = delay + periods * float(self.filters.periods[k])
         if not self.limits.low <= start <= self.limits.high:
             return []
-        # From the coefficients of J0 and from least squares: where one is trapped the other often is not.
+        # From the coefficients of J0 and from least squares: often only one of these is trapped.
         known = periods == 0 and np.isfinite(here.squared_errors[k])
         thetas = [here.thetas[k : k + 1], none] if known else [none]
         found = [descend(self.costs[k], start, theta, self.limits) for theta in thetas]

@@ -1,9 +1,9 @@
-r"""The one refined instrumental variable iteration: ``theta+ = theta + [sum psi phi']^-1 sum psi eps``.
+r"""Refined instrumental variable iteration: ``theta+ = theta + [sum psi phi']^-1 sum psi eps``.
 
 ``psi`` are the sensitivities of the simulated output (the optimal instruments), ``phi`` the regressors built with the
 measured output, ``eps`` the output error. At a fixed point ``sum psi eps = 0``: the gradient of the output-error cost
-vanishes, whatever ``phi`` was. Which signals make up psi and phi (delay or not, regular clock or not) is the business
-of the *problem*; this file only iterates.
+is zero for any ``phi``. The *problem* defines the signals of psi and phi (with or without delay, regular or irregular
+clock).
 """
 
 from dataclasses import dataclass
@@ -16,32 +16,32 @@ from ctid_cli.filtering.bank import Equations
 from ctid_cli.filtering.filter_data import FilterData
 from ctid_cli.inference.fit import Status
 
-#: How steps are accepted where the solution is a minimum of the output-error cost, and in general.
+#: Step rules if the solution is a minimum of the output-error cost, and in general.
 Variant = Literal["plain", "guarded"]
 StepRule = Literal["plain", "relaxed", "guarded"]
 GUARDED: StepRule = "guarded"
 
-#: Halvings of a step before a direction is given up.
+#: Largest number of halvings of a step.
 HALVINGS = 12
-#: The guarded variant gives up after this many steps in a row that lower the cost by less than this fraction of what
-#: the linearised problem promises.
+#: The guarded variant ends after SLOW_STEPS consecutive steps that reduce the cost by less than the fraction
+#: NEGLIGIBLE_FALL of the prediction of the linearised problem.
 SLOW_STEPS = 8
 NEGLIGIBLE_FALL = 1e-2
-#: The guarded variant takes a step only if the cost falls by this fraction of what its slope promises: a step that
-#: overshoots and lands as high on the other side is halved instead (Armijo's rule).
+#: The guarded variant accepts a step only if the cost decreases by this fraction of the prediction of its slope; a step
+#: that overshoots is halved instead (Armijo's rule).
 SUFFICIENT_FALL = 0.1
-#: The relaxed variant takes the next of these fractions of every step once steps have not become shorter for this
-#: number of iterations.
+#: The relaxed variant proceeds to the next of these fractions of a full step after PATIENCE iterations without shorter
+#: steps.
 RELAXATIONS = (1.0, 0.7, 0.5)
 PATIENCE = 10
-#: A rise of the cost below this fraction is rounding, not a rise.
+#: Relative increase of the cost that counts as rounding.
 ROUNDING = 1e-13
-#: A change of the output below this fraction is convergence where rounding leaves no lower cost.
+#: Relative change of the output that counts as convergence if rounding prevents a lower cost.
 AT_ROUNDING = 1e-7
 
 
 class Steps(NamedTuple):
-    """How steps are taken and when they end."""
+    """Step rule and end of an iteration."""
 
     max_iterations: int
     #: Stop when a step changes the simulated output by less than this fraction of its rms value [-].
@@ -51,56 +51,56 @@ class Steps(NamedTuple):
 
 
 class Problem(Protocol):
-    """What the iteration needs to know of an estimation problem."""
+    """Interface of an estimation problem for the iteration."""
 
     @property
     def free(self) -> int:
-        """Number of parameters to iterate on, from the first; the others are held."""
+        """Number of leading parameters to iterate on; the others are fixed."""
 
     @property
     def data(self) -> FilterData:
-        """The record."""
+        """Record."""
 
     @property
     def samples(self) -> int:
         """Number of samples in the sums."""
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay [s] of a parameter vector."""
+        """Return denominator, numerator and delay [s] of a parameter vector."""
 
     def equations(self, theta: Array) -> Equations:
-        """Second moments of sensitivities, regressors and output error."""
+        """Return second moments of sensitivities, regressors and output error."""
 
     def rows(self, theta: Array) -> tuple[Array, Array] | None:
-        """Sensitivities and output error at the used samples; None where the response is not finite."""
+        """Return sensitivities and output error at the used samples; None if the response is not finite."""
 
     def admissible(self, theta: Array) -> Array:
-        """Bring parameters into the admissible set: unstable models are reflected."""
+        """Project parameters onto the admissible set: unstable models are reflected."""
 
 
 @dataclass(frozen=True, eq=False)
 class Iterated:
     """Result of an iteration."""
 
-    #: The last accepted parameters, shape (p,).
+    #: Last accepted parameters, shape (p,).
     theta: Array
     equations: Equations
     status: Status
     iterations: int
-    #: The start and all accepted parameters with their squared errors in the last column, shape (K, p + 1).
+    #: Start and all accepted parameters with their squared errors in the last column, shape (K, p + 1).
     path: Array
 
 
 def inadmissible(size: int) -> Equations:
-    """Return equations where there are none."""
+    """Return the equations of an inadmissible point."""
     return Equations(np.zeros((size, size)), np.zeros(size), np.zeros((size, size)), np.inf, 0.0)
 
 
 def solve_scaled(matrix: Array, right: Array, rows: Array, columns: Array, count: int) -> tuple[bool, Array]:
-    """Solve the leading ``count`` equations with rows and columns brought to a common scale; zeros for the rest."""
+    """Solve the leading ``count`` equations with scaled rows and columns; return zeros for the rest."""
     solution = np.zeros(right.size)
     scales = np.array((rows[:count], columns[:count]))
-    # Units of the parameters may differ by hundreds of decades: unscaled, elimination would pivot on units.
+    # Parameters may differ by hundreds of decades: without scaling, units would determine the pivots.
     if not ((scales > 0.0) & (scales < np.inf)).all():
         return False, solution
     row, column = 1.0 / np.sqrt(scales)
@@ -113,13 +113,13 @@ def solve_scaled(matrix: Array, right: Array, rows: Array, columns: Array, count
 
 
 def relative_change(current: Equations, step: Array) -> float:
-    """Return the change of the simulated output that a step makes, to first order and relative to its rms value."""
+    """Return the first-order change of the simulated output by a step, relative to its rms value."""
     change = max(float(step @ current.hessian @ step), 0.0)
     return float(np.sqrt(change / current.output_power)) if current.output_power > 0.0 else np.inf
 
 
 def _accepted_up_to(current: Equations, trial: Equations, fraction: float, slope: float) -> float:
-    """Return the squared error up to which a guarded step is accepted."""
+    """Return the largest squared error at which a guarded step is accepted."""
     rounding = ROUNDING * (trial.output_power + current.output_power)
     promised = 2.0 * fraction * slope
     return current.squared_error * (1.0 + ROUNDING) + rounding * ROUNDING - SUFFICIENT_FALL * promised
@@ -135,7 +135,7 @@ def _step(current: Equations, free: int, gauss_newton: bool) -> tuple[bool, Arra
 
 
 class _Pace:
-    """Fraction of every step of the relaxed variant, smaller once full steps no longer become shorter."""
+    """Step fraction of the relaxed variant, reduced when full steps no longer become shorter."""
 
     def __init__(self) -> None:
         self.place, self.shortest, self.waited = 0, np.inf, 0
@@ -147,17 +147,17 @@ class _Pace:
         else:
             self.waited += 1
         if self.waited == PATIENCE and self.place + 1 < len(RELAXATIONS):
-            # What was reached before does not bind: shorter steps lead elsewhere at first.
+            # Earlier step lengths are discarded, since reduced steps follow another path at first.
             self.place, self.shortest, self.waited = self.place + 1, change, 0
         return RELAXATIONS[self.place]
 
 
 class _Move(NamedTuple):
-    """An accepted step: where it led, what fraction of the full one it was, and how far the full one reaches."""
+    """Accepted step: its end, its fraction of the full step, and the output change of the full step."""
 
     theta: Array
     equations: Equations
-    #: Whether the step ended where it aimed; not where an unstable model was reflected.
+    #: False if an unstable model was reflected after the step.
     as_aimed: bool
     fraction: float
     change: float
@@ -165,14 +165,14 @@ class _Move(NamedTuple):
 
 
 def iterate(problem: Problem, theta: Array, steps: Steps) -> Iterated | None:
-    """Run the iteration; None from an inadmissible start."""
+    """Run the iteration; return None for an inadmissible start."""
     theta = problem.admissible(np.array(theta, dtype=np.float64))
     current = problem.equations(theta)
     if not np.isfinite(current.squared_error):
         return None
     path = [np.append(theta, current.squared_error)]
     guarded, pace = steps.rule == GUARDED, _Pace()
-    # A direction in which the cost does not fall will not be better at the next step: it is not tried again.
+    # After the first failure of an instrumental variable step, only Gauss-Newton steps are tried.
     gauss_newton = False
     slow, converged, ending = 0, Status.CONVERGED, Status.MAX_ITERATIONS
     for _ in range(steps.max_iterations):
@@ -182,20 +182,20 @@ def iterate(problem: Problem, theta: Array, steps: Steps) -> Iterated | None:
             if isinstance(move, _Move):
                 break
         if isinstance(move, Status):
-            # At the minimum up to rounding no step can lower the cost: that is convergence, not failure.
+            # At the minimum up to rounding no step reduces the cost: this is convergence.
             ending = converged if move is Status.CONVERGED else move
             break
         gauss_newton = gauss_newton or (guarded and move.gauss_newton)
         fall = current.squared_error - move.equations.squared_error
         expected = move.change**2 * current.output_power
         theta, current = move.theta, move.equations
-        # Where the last step led out of the stable models, what it was moved to is no fixed point of the iteration.
+        # A reflected model is not a fixed point of the iteration.
         converged = Status.CONVERGED if move.as_aimed else Status.REFLECTED
         path.append(np.append(theta, current.squared_error))
         if (move.fraction == 1.0 or steps.rule == "relaxed") and move.change <= steps.tolerance:
             ending = converged
             break
-        # Steps that keep promising more than they give: along a curved valley of equal cost, or across a kink of it.
+        # Decreases remain below the prediction in a curved valley of equal cost, or across a kink.
         slow = slow + 1 if fall < NEGLIGIBLE_FALL * expected else 0
         if guarded and slow == SLOW_STEPS:
             ending = Status.STALLED
@@ -206,9 +206,9 @@ def iterate(problem: Problem, theta: Array, steps: Steps) -> Iterated | None:
 def _moved(
     problem: Problem, theta: Array, current: Equations, steps: Steps, gauss_newton: bool, pace: _Pace
 ) -> _Move | Status:
-    """Take a step of one kind; the status says how the iteration ends if none is accepted.
+    """Take a step of one kind; return the final status of the iteration if none is accepted.
 
-    The first acceptable fraction: any with a finite response, unless the cost is guarded.
+    The first acceptable fraction is taken: any with a finite response, unless the cost is guarded.
     """
     guarded = steps.rule == GUARDED
     solved, step = _step(current, problem.free, gauss_newton)
@@ -234,13 +234,13 @@ def _moved(
 
 
 def with_best(problem: Problem, theta: Array, first: int, last: int) -> Array:
-    """Return parameters of which some, on which the output depends linearly, minimise the squared error."""
+    """Return parameters with the linear ones, ``first`` to ``last``, minimising the squared error."""
     best = theta.copy()
     best[first:last] = 0.0
     current = problem.equations(best)
     if not np.isfinite(current.squared_error):
         return theta
-    # At zero the output error is what these parameters have to explain: one Gauss-Newton step is the minimum.
+    # From zero, one Gauss-Newton step reaches the minimum of a linear problem.
     gram = current.hessian[first:last, first:last]
     lengths = np.diag(gram)
     solved, solution = solve_scaled(gram, current.instrument_error[first:last], lengths, lengths, last - first)

@@ -1,10 +1,10 @@
-r"""The output error of a loop: what is left of the output when the reference drives the simulated loop.
+r"""Output error of a feedback loop: output minus the response of the simulated loop to the reference.
 
 .. math:: y(t_k) = T(\theta) r(t_k) + (\text{response to the first state}) + c + e_k
 
-T has the plant and the known controller. As r is independent of the noise, the least squares estimate is consistent
-whatever the noise, and for unstable plants too; e is the noise as the loop lets it through, and hardly ever white.
-State and offset c are eliminated: they are least squares for every theta (projection of the sensitivities, L. Kaufman,
+T contains the plant and the known controller. As r is independent of the noise, the least-squares estimate is
+consistent for any noise, and for unstable plants too; e is the noise filtered by the loop, and rarely white.
+State and offset c are eliminated by least squares for every theta (projection of the sensitivities, L. Kaufman,
 *A variable projection method for solving separable nonlinear least squares problems*, BIT 15 (1975) 49-57).
 """
 
@@ -30,38 +30,38 @@ from ctid_cli.models.additive import Term
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
 
-#: Cut-offs of the filters of starts, spread from six over the length of the record to the Nyquist frequency over two;
-#: for each delay of a search every third does.
+#: Number of cut-offs of the filters of starts, from six over the length of the record to half the Nyquist frequency; a
+#: search over the delay uses every third one at each delay.
 CUTOFFS, OF_DELAY = 9, 3
-#: Times that the filter of a start is made from its own poles.
+#: Number of updates of the filter of a start with the estimated poles.
 ROUNDS = 4
-#: Up to this number of poles the reference alone leads to the minimum.
+#: Largest number of poles for which starts by the reference suffice.
 FEW_POLES = 2
-#: Starts that are refined, and starts of a search over the delay.
+#: Number of starts that are refined, and of delays of a search.
 REFINED, MOST_DELAYS = 4, 60
-#: Steps of the refinement, and those at each delay of a search.
+#: Steps of the refinement, and at each delay of a search.
 STEPS, FEW_STEPS = Steps(100, 1e-6, "guarded"), Steps(4, 1e-4, "guarded")
-#: Sampling intervals over which a delay may move to its minimum.
+#: Largest number of sampling intervals by which a delay may move to its minimum.
 MOST_CELLS = 30
-#: Directions of state and offset are told apart down to this fraction of the greatest.
+#: Relative singular value below which directions of state and offset are dropped.
 RANK = 1e-10
-#: Squared errors that differ by less than this fraction are those of one minimum.
+#: Squared errors that differ by less than this fraction belong to one minimum.
 SAME = 1e-6
 
 
 class Columns(NamedTuple):
-    """What an estimate says of each used sample."""
+    """Signals of an estimate at each used sample."""
 
     #: Sensitivities to the parameters, shape (count, p).
     slopes: Array
-    #: Responses to the first state, and ones where an offset is estimated, shape (count, f).
+    #: Responses to the first state, and ones if an offset is estimated, shape (count, f).
     linear: Array
-    #: Measured output less the response to the reference, shape (count,).
+    #: Measured output minus the response to the reference, shape (count,).
     left: Array
 
     @property
     def basis(self) -> tuple[Array, Array]:
-        """Orthonormal basis of the linear columns, and the combinations of them that it is."""
+        """Orthonormal basis of the linear columns, and the matrix that combines the columns to it."""
         if not self.linear.shape[1]:
             return self.linear, np.zeros((0, 0))
         lengths = np.linalg.norm(self.linear, axis=0)
@@ -72,7 +72,7 @@ class Columns(NamedTuple):
 
     @property
     def own(self) -> Array:
-        """The best state and offset."""
+        """Least-squares state and offset."""
         Q, combined = self.basis
         return np.asarray(combined @ (Q.T @ self.left))
 
@@ -81,15 +81,15 @@ class Columns(NamedTuple):
 class LoopProblem:
     """Parameters of a plant in a loop: ``theta = (a_1 … a_n, b_0 … b_m, tau)``."""
 
-    #: The record.
+    #: Record.
     data: FilterData
     response: LoopResponse
     offset: bool
-    #: Whether the state at the first sample is estimated, and not that of rest.
+    #: Whether the state at the first sample is estimated, not zero.
     free_state: bool
-    #: Bounds of the delay [s]; equal where it is known.
+    #: Bounds of the delay [s]; equal for a known delay.
     delays: tuple[float, float]
-    #: Sampling interval that the delay is in, None where it is not moved.
+    #: Index of the sampling interval of the delay; None for a fixed delay.
     cell: int | None = None
 
     @property
@@ -108,7 +108,7 @@ class LoopProblem:
         return self.data.count
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay [s] of a parameter vector."""
+        """Return denominator, numerator and delay [s] of a parameter vector."""
         n = self.response.poles
         a = np.concatenate(([1.0], theta[:n], np.zeros(self.response.integrators)))
         return a, theta[n:-1], float(theta[-1])
@@ -122,19 +122,19 @@ class LoopProblem:
         return max(self.delays[0], self.cell * h), min(self.delays[1], (self.cell + 1) * h)
 
     def cell_of(self, delay: float) -> int:
-        """Return the sampling interval that a delay is in, the last one if it is the greatest."""
+        """Return the index of the sampling interval of a delay, the last one for the greatest delay."""
         h = self.data.interval
         return min(int(delay / h), int(np.ceil(self.delays[1] / h)) - 1)
 
     def admissible(self, theta: Array) -> Array:
-        """Parameters with the delay moved into its bounds; poles may be anywhere."""
+        """Return the parameters with the delay clipped to its bounds; poles are unrestricted."""
         moved = theta.copy()
         if self.cell is not None:
             moved[-1] = np.clip(theta[-1], *self.bounds)
         return moved
 
     def columns(self, theta: Array, count: int | None = None) -> Columns | None:
-        """Return what parameters say of the samples with the best state and offset; None where it is not finite."""
+        """Return the signals of parameters with least-squares state and offset; None if they are not finite."""
         count, use = self.free if count is None else count, self.data.use
         linear, state = np.ones((self.samples, int(self.offset))), None
         with np.errstate(all="ignore"):
@@ -153,7 +153,7 @@ class LoopProblem:
         return Columns(rows.slopes[use], linear, left)
 
     def rows(self, theta: Array) -> tuple[Array, Array] | None:
-        """Sensitivities and output error at the used samples, of the best state and offset."""
+        """Return sensitivities and output error at the used samples with least-squares state and offset."""
         columns = self.columns(theta)
         if columns is None:
             return None
@@ -161,7 +161,7 @@ class LoopProblem:
         return columns.slopes - Q @ (Q.T @ columns.slopes), columns.left - Q @ (Q.T @ columns.left)
 
     def equations(self, theta: Array) -> Equations:
-        """Second moments of the iteration, which is that of Gauss and Newton here."""
+        """Return the second moments of the iteration, here Gauss-Newton."""
         found = self.rows(theta) if np.isfinite(theta).all() else None
         if found is None:
             return inadmissible(theta.size)
@@ -175,7 +175,7 @@ class LoopProblem:
         return Equations(hessian, gradient, hessian, squared, float(output @ output))
 
     def squared_error(self, theta: Array) -> float:
-        """Return the least squared error over state and offset; infinite where the response is not finite."""
+        """Return the least squared error over state and offset; infinite if the response is not finite."""
         columns = self.columns(theta, 0) if np.isfinite(theta).all() else None
         if columns is None:
             return np.inf
@@ -187,11 +187,11 @@ class LoopProblem:
     # --- starts --------------------------------------------------------------------------------------
 
     def starts(self, delay: float, every: int = 1, rounds: int = ROUNDS) -> Iterator[Array]:
-        """Yield estimates from the measured input by instrumental variables that the reference makes.
+        """Yield estimates from the measured input with the reference as instrument.
 
-        The model holds behind any filter ``1/E``: ``p^n/E y = -sum a_i p^(n-i)/E y + sum b_j p^(m-j)/E u``. Of the
-        right side only what follows the filtered reference counts (two-stage least squares), so that noise in the loop
-        leaves no bias. E is first that of a Butterworth filter, then the denominator with its unstable poles mirrored.
+        For any filter ``1/E``: ``p^n/E y = -sum a_i p^(n-i)/E y + sum b_j p^(m-j)/E u``. The right side is projected
+        onto the filtered reference (two-stage least squares), so that noise in the loop causes no bias. E is first a
+        Butterworth polynomial, then the denominator with its unstable poles reflected.
         """
         from scipy.signal import butter  # slow to import
 
@@ -213,9 +213,9 @@ class LoopProblem:
                 E = reflect_unstable(np.real(np.poly(np.where(np.abs(poles) < slowest, -slowest, poles))))
 
     def stable_start(self, record: Record, delay: float) -> Array | None:
-        """Return the estimate of a stable plant whose poles are found pair by pair, with the reference as instrument.
+        """Return the estimate of a stable plant with poles found pair by pair and the reference as instrument.
 
-        Filters that are one for all frequencies do not show a pair that is little damped beside a stronger one.
+        A single filter for all frequencies does not reveal a lightly damped pair in the presence of a stronger one.
         """
         response, loop = self.response, OPEN_LOOP
         if self.data.interval and not response.continuous:
@@ -251,10 +251,10 @@ class LoopProblem:
         theta = np.append(found[: self.size - 1], delay)
         return theta if np.isfinite(theta).all() else None
 
-    # --- the least output error ----------------------------------------------------------------------
+    # --- minimum of the output error -----------------------------------------------------------------
 
     def best(self, record: Record) -> "LoopEstimate | None":
-        """Return the least of the minima that starts lead to."""
+        """Return the lowest of the minima reached from all starts."""
         starts = self._delays()
         if self.response.poles > FEW_POLES:
             delays = dict.fromkeys(float(theta[-1]) for theta in starts[:REFINED]) or [sum(self.delays) / 2]
@@ -271,7 +271,7 @@ class LoopProblem:
         return least._replace(tried=len(results), agree=agree, iterations=evaluations)
 
     def _lowest(self, thetas: Iterator[Array], most: int) -> list[Array]:
-        """Return the parameters of the least squared errors, different ones."""
+        """Return the parameters with the lowest distinct squared errors."""
         errors = sorted(((self.squared_error(theta), k, theta) for k, theta in enumerate(thetas)), key=lambda e: e[:2])
         kept: list[tuple[float, Array]] = []
         for error, _, theta in errors:
@@ -280,12 +280,12 @@ class LoopProblem:
         return [theta for _, theta in kept[:most]]
 
     def _delays(self) -> list[Array]:
-        """Return where to start: of a searched delay the lowest minima of its profile."""
+        """Return the starts: for a free delay the lowest minima of its profile."""
         low, high = self.delays
         if low == high:
             return self._lowest(self.starts(low), REFINED)
         h = self.data.interval
-        # Within the sampling intervals, whose ends have kinks.
+        # Inside the sampling intervals, since the cost has kinks at their ends.
         count = min(max(2 * int(np.ceil((high - low) / h)), 3), MOST_DELAYS)
         profile = []
         for delay in low + (np.arange(count) + 0.5) / count * (high - low):
@@ -302,7 +302,7 @@ class LoopProblem:
         return [profile[k][1] for k in sorted(lowest, key=lambda k: errors[k + 1])[:REFINED]]
 
     def _local(self, theta: Array) -> "LoopEstimate | None":
-        """Return the minimum that parameters lead to, from one sampling interval of the delay to the next."""
+        """Return the minimum reached from parameters, across sampling intervals of the delay."""
         low, high = self.delays
         if low == high:
             result = iterate(self, theta, STEPS)
@@ -316,7 +316,7 @@ class LoopProblem:
             theta, (first, end) = result.theta, problem.bounds
             if first < theta[-1] < end:
                 return LoopEstimate(problem, result)
-            # At a sample, where the cost has a kink: the others' minimum there, and whether either side goes downhill.
+            # At a sample the cost has a kink: minimise over the others there, and test both sides for a descent.
             side = 1 if theta[-1] == end else -1
             held = iterate(self, theta, STEPS)
             theta = theta if held is None else held.theta
@@ -333,11 +333,11 @@ class LoopProblem:
 
 
 class LoopEstimate(NamedTuple):
-    """A minimum, and how it was found."""
+    """Minimum, and statistics of its search."""
 
     problem: LoopProblem
     result: Iterated
-    #: Whether the delay would leave its bounds.
+    #: Whether the delay is held at a bound.
     at_bound: bool = False
     tried: int = 1
     agree: int = 1
@@ -350,7 +350,7 @@ class LoopEstimate(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """How the search ended; no model whose loop is unstable is a minimum."""
+        """Status of the search; a model with an unstable loop is not a minimum."""
         if not self.radius < 1.0:
             return Status.DIVERGED
         return Status.DELAY_AT_BOUND if self.at_bound and self.result.status is Status.CONVERGED else self.result.status

@@ -1,4 +1,4 @@
-"""A frequency response laid out for estimation, as records are."""
+"""Frequency response prepared for estimation like records."""
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from ctid_cli.signals.frequency_data import FrequencyData
 
 
 class MeasuredLines(MeasuredRecords):
-    """A frequency response of a system at rest, and its least-squares cost over all parameters.
+    """Frequency response of a system at rest, and its least-squares cost over all parameters.
 
-    The parts of the weighted values, real ones first, stand where records have their samples.
+    The weighted real, then imaginary, parts take the place of the samples of a record.
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class MeasuredLines(MeasuredRecords):
         self.problem = Problem((self.lines,), structure.zeros, False, (), (0.0,), integrators=integrators)
 
     def check(self) -> None:
-        """Refuse data from which the structure cannot be estimated."""
+        """Raise DataError if the structure cannot be estimated from the data."""
         what, size = f"{self.source.name}: " if self.source.name else "", self.structure.size
         count = min(self.lines.count, 2 * np.unique(self.lines.frequencies).size)
         if count <= size:
@@ -57,16 +57,16 @@ class MeasuredLines(MeasuredRecords):
 
     @property
     def regular(self) -> bool:
-        """Whether lags counted in values are lags in frequency."""
+        """Whether lags in values are lags in frequency."""
         return True
 
     def used(self) -> tuple[BoolArray, ...]:
-        """Which real and imaginary parts are equations."""
+        """Mask of the real and imaginary parts that are equations."""
         return (self.lines.use,)
 
 
 def lines_of(data: FrequencyData) -> FrequencyLines:
-    """Lay a frequency response out with the weights of its lines.
+    """Return the lines of a frequency response with their weights.
 
     With standard errors the real and the imaginary part of each error have the variance one.
     """

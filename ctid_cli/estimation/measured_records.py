@@ -1,10 +1,10 @@
-r"""Measured records laid out for estimation: delay, initial state, offset, several experiments, and what is refused.
+r"""Measured records prepared for estimation: delay, initial state, offset, several experiments, and data checks.
 
 .. math:: y(t_k) = \frac{B}{A} u(t_k-\tau) + \frac{C}{A}\delta(t_k-t_s) + c + d (t_k-t_0) + e_k
 
 ``C/A`` applied to an impulse at the first used instant ``t_s`` spans every free response of A, so the n coefficients of
-C are the initial state, whatever happened before. C, the offset c and the drift d belong to one experiment each, the
-rest is common.
+C represent any initial state. C, the offset c and the drift d are separate for each experiment, all other parameters
+are common.
 """
 
 from collections.abc import Sequence
@@ -47,18 +47,17 @@ from ctid_cli.signals.noise import ArmaNoise
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import InitialState, InputBefore, Offset, OutputHold
 
-#: Random starts, this number and as many again for each pole.
+#: Number of random starts, plus the same number for each pole.
 RANDOM_STARTS = 2
-#: Inputs are collinear if a combination of them, each of length one, is shorter than this; those with more than so
-#: large a share in it are named.
+#: Inputs are collinear if a combination of them, each scaled to length one, is shorter than the first number; inputs
+#: with a larger share in it than the second are named.
 COLLINEAR, INVOLVED = 1e-6, 1e-3
 
 
 def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequence[float]) -> list[tuple[Array, Array]]:
-    """Derivatives of the simulated output to the parameters, and the output error, at the used samples of each record.
+    """Return the derivatives of the output by the parameters, and the output error, at the used samples of each record.
 
-    The delays are those of theta where they are parameters. The last coefficients of a denominator are zero where the
-    problem has integrators.
+    Delays that are parameters equal those of theta. With integrators the last coefficients of a denominator are zero.
     """
     degrees = layout.degrees
     fractions, chain_rule = degrees.fractions_of(theta)
@@ -67,8 +66,8 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequen
     seconds = [given if place is None else theta[place] for given, place in zip(delays, places, strict=True)]
     arrangement = problem.arranged(degrees.poles - sum(problem.each_integrators))
     columns = Columns.of(arrangement, True, layout.initial_state, layout.trend)
-    # Columns of the rows that are wanted, each a combination of the states, the inputs and what else stands there:
-    # first the derivatives to the coefficients of all monic fractions.
+    # Required combinations of the columns of the rows (states, inputs and others): first the derivatives by the
+    # coefficients of all monic fractions.
     monic = np.zeros((columns.size, total))
     common, free = np.zeros((columns.size, layout.size + 1)), np.zeros((columns.size, total))
     forms, to_powers, column = list[tuple[Chain, Array, Array]](), np.zeros((arrangement.order,) * 2), 0
@@ -122,7 +121,7 @@ def sensitivities(problem: Problem, layout: Layout, theta: Array, delays: Sequen
 
 
 def _sections_of(denominator: Array, integrators: int, problem: Problem) -> tuple[Array, Array]:
-    """Return the sections of a denominator, whose last coefficients are zero where it has integrators."""
+    """Return the sections of a denominator, whose last coefficients are zero with integrators."""
     stable = np.roots(denominator[: denominator.size - integrators]).astype(complex)
     point = point_of(stable, 0.0, ANYWHERE)
     (sections,) = problem._replace(terms=(), integrators=integrators).rows(point.speed, point.damping)
@@ -130,15 +129,15 @@ def _sections_of(denominator: Array, integrators: int, problem: Problem) -> tupl
 
 
 class Treatment(NamedTuple):
-    """How records are laid out."""
+    """Options of the preparation of records."""
 
     delay_bounds: Bounds
     initial_state: InitialState
     offset: Offset
     hold_output: OutputHold
-    #: Whether samples far from their neighbours are bridged while the search looks for starts.
+    #: Whether outliers are interpolated during the search for starts.
     bridge: bool = False
-    #: Poles at the origin, counted among those of the structure; of each denominator.
+    #: Poles at the origin of each denominator, included in those of the structure.
     integrators: tuple[int, ...] = (0,)
     #: Input before the first sample of a record that begins at rest [input unit].
     input_before: InputBefore = None
@@ -146,7 +145,7 @@ class Treatment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class AppliedModel:
-    """A given model on records that it need not have been estimated from."""
+    """A given model applied to records, which may differ from those of its estimation."""
 
     #: Output errors at the used samples of each experiment [output unit].
     residuals: tuple[Array, ...] = field(repr=False)
@@ -154,13 +153,13 @@ class AppliedModel:
     initial_states: tuple[Array, ...]
     #: Output offset of each experiment [output unit].
     offsets: tuple[float, ...]
-    #: Derivatives of the output at the used samples to all parameters, the delay and what is each experiment's among
-    #: them, shape (count, p).
+    #: Derivatives of the output at the used samples by all parameters, including the delay and those of each
+    #: experiment, shape (count, p).
     sensitivities: tuple[Array, ...] = field(repr=False)
 
 
 class MeasuredRecords:
-    """Records of one system, laid out for estimation, and their output-error cost over all parameters."""
+    """Records of one system, prepared for estimation, and their output-error cost over all parameters."""
 
     def __init__(
         self,
@@ -174,7 +173,7 @@ class MeasuredRecords:
         self.treatment, self.known = treatment, known
         free_state, integrators = treatment.initial_state == "estimate", max(treatment.integrators)
         degrees = Degrees.of(structure, integrators) if isinstance(structure, Structure) else structure
-        # Integrators make powers of time of an offset of their input; the lower ones are their free responses.
+        # Integrators turn an offset of their input into powers of time; the lower powers are free responses.
         highest = {"estimate": integrators, "drift": 1}.get(treatment.offset, -1)
         trend = tuple(range(integrators if free_state else 0, highest + 1))
         self.layout = Layout(degrees, len(records), free_state, trend)
@@ -194,12 +193,12 @@ class MeasuredRecords:
             may_be_constant = self.layout.initial_state or treatment.input_before is not None
             check_record(record, data, self.layout.size, may_be_constant)
         each = zip(records, self.offsets, self.data, strict=True)
-        #: Outputs at the used samples as they were measured, less their means where those are removed.
+        #: Measured outputs at the used samples, minus their means if those are removed.
         self.outputs = [record.y[used_samples(data, record)] - y0 for record, y0, data in each]
 
     @cached_property
     def bandwidth(self) -> float:
-        """Highest frequency that matters in an output [rad/s]."""
+        """Highest significant frequency of an output [rad/s]."""
         return max(output_bandwidth(record) for record in self.records)
 
     @property
@@ -213,7 +212,7 @@ class MeasuredRecords:
         return self.degrees.structure
 
     def with_degrees(self, poles: int, zeros: Sequence[int]) -> "MeasuredRecords":
-        """The same records for a common denominator, integrators among its poles, and numerators of other degrees."""
+        """Return a copy for a common denominator, with integrators in ``poles``, and other numerator degrees."""
         other = copy(self)
         assert isinstance(self.degrees, Degrees)
         degrees = replace(self.degrees, orders=(poles,), zeros=tuple(zeros))
@@ -223,7 +222,7 @@ class MeasuredRecords:
 
     @property
     def plain(self) -> bool:
-        """Whether there is but one record and nothing of its own to be estimated."""
+        """Whether there is a single record without further parameters, with one input and from rest."""
         treatment, degrees = self.treatment, self.degrees
         if isinstance(degrees, SumDegrees):
             return False
@@ -232,7 +231,7 @@ class MeasuredRecords:
         return from_rest and single and max(degrees.zeros) < degrees.poles
 
     def _check_input(self, record: Record) -> None:
-        """Refuse what an input cannot tell."""
+        """Raise DataError if an input does not determine the model."""
         if tuple(record.held) != self.degrees.inputs and self.degrees.several:
             raise DataError(
                 f"{named(record)}the inputs are {', '.join(record.held)}, and those of the model are "
@@ -257,8 +256,7 @@ class MeasuredRecords:
                 )
 
     def _lay_out(self, record: Record) -> FilterData:
-        # At rest the input before the record is known to be zero, whatever the delay, and that of a periodic record is
-        # known too; otherwise it is not known.
+        # The input before the record is zero at rest, and known for a periodic record; otherwise it is unknown.
         treatment = self.treatment
         known_after = self.greatest_delay if treatment.initial_state == "estimate" else 0.0
         periodic = treatment.initial_state == "periodic"
@@ -266,12 +264,12 @@ class MeasuredRecords:
 
     @property
     def greatest_delay(self) -> float:
-        """The greatest delay of all inputs [s]."""
+        """Greatest delay of all inputs [s]."""
         return max(high for _, high in each_bounds(self.treatment.delay_bounds))
 
     @cached_property
     def problem(self) -> Problem:
-        """The records and what is eliminated with them."""
+        """Records and eliminated terms of the search."""
         if self.treatment.initial_state == "periodic":
             periods = tuple(_period(record) for record in self.records)
             data = tuple(_one_period(*pair) for pair in zip(self.data, periods, strict=True))
@@ -281,7 +279,7 @@ class MeasuredRecords:
         return Problem(data, asked.pop("zeros"), layout.initial_state, layout.trend, periods, **asked)
 
     def part(self) -> "MeasuredRecords | None":
-        """The most active parts of long records, each from a state of its own; None where they tell too little."""
+        """Return the most active parts of long records, with separate initial states; None if they do not suffice."""
         treatment = self.treatment
         parts = most_active_parts(self.data, self.greatest_delay)
         if parts is None or treatment.initial_state == "periodic":
@@ -295,7 +293,7 @@ class MeasuredRecords:
 
     @cached_property
     def centred(self) -> FilterData:
-        """The first record without its means, for starts that know no offset and no initial state."""
+        """First record without its means, for starts that do not estimate an offset and an initial state."""
         if self.treatment.offset not in ("estimate", "drift"):
             return self.data[0]
         return self._lay_out(without_means(self.records[0])[0])
@@ -306,13 +304,13 @@ class MeasuredRecords:
         return float(sum(np.sum((y - y.mean()) ** 2) for y in self.outputs))
 
     def used(self) -> tuple[BoolArray, ...]:
-        """Which samples of each record enter the sums."""
+        """Return the mask of the samples of each record that enter the sums."""
         return tuple(used_samples(*pair) for pair in zip(self.data, self.records, strict=True))
 
-    # --- the least output error ----------------------------------------------------------------------
+    # --- minimum of the output error -----------------------------------------------------------------
 
     def with_outputs(self, outputs: Sequence[Array]) -> "MeasuredRecords":
-        """The same with other outputs at the used samples of each record."""
+        """Return a copy with other outputs at the used samples of each record."""
         records = []
         for data, values in zip(self.problem.sampled, outputs, strict=True):
             y = data.y.copy()
@@ -323,7 +321,7 @@ class MeasuredRecords:
         return other
 
     def whitened_by(self, noise: ArmaNoise) -> "MeasuredRecords":
-        """The same where errors count by their innovations under a noise."""
+        """Return a copy with errors whitened by a noise model."""
         other = copy(self)
         other.problem = self.problem._replace(noises=sampled(noise, self.used()))
         return other
@@ -331,7 +329,7 @@ class MeasuredRecords:
     def near(
         self, errors: Sequence[Array], weighting: Weighting | None, noise: ArmaNoise | None = None
     ) -> "MeasuredRecords":
-        """The records whose least squares are, near the estimate, what its loss or likelihood is."""
+        """Return records whose least squares approximate the loss or likelihood near the estimate."""
         if noise is not None:
             return self.whitened_by(noise)
         if weighting is None:
@@ -340,10 +338,10 @@ class MeasuredRecords:
         return self.with_outputs([y - r + pseudo for y, r, pseudo in each])
 
     def best(self, starts: Sequence[Begin], nested: bool) -> Optimum:
-        """The least output error from denominators and delays, and if nested of smaller models and at random too.
+        """Return the least output error from given starts, and if nested from smaller models and random starts.
 
-        Of several denominators a start has the poles, and sums grow term by term in any case. A profile under an
-        unknown initial state, an offset or a period has too few basins: smaller models help then.
+        A start of several denominators consists of poles, and sums are extended term by term in any case. With an
+        unknown initial state, an offset or a period, a profile has too few basins: smaller models are needed then.
         """
         random_starts = RANDOM_STARTS if nested or self.plain else 0
         if self.problem.terms:
@@ -370,11 +368,11 @@ class MeasuredRecords:
         return replace(found, poles_at_infinity=self.degrees.poles - self.problem.integrators - poles)
 
     def model(self, found: Optimum) -> AnyModel:
-        """The model of an optimum; a sum as one transfer function."""
+        """Return the model of an optimum; a sum as one transfer function."""
         return self.degrees.model(found)
 
     def parameters(self, found: Optimum) -> tuple[Layout, Array]:
-        """Which numbers an optimum has, and what they are."""
+        """Return the layout and the values of the parameters of an optimum."""
         layout = self.layout_of(self.model(found))
         theta = layout.theta(found.additive or self.model(found))
         for k in range(layout.experiments):
@@ -383,12 +381,12 @@ class MeasuredRecords:
         return layout, theta
 
     def simulated(self, found: Optimum) -> list[Array]:
-        """Outputs of an optimum at the used samples of each record."""
+        """Return the outputs of an optimum at the used samples of each record."""
         parts = sensitivities(self.problem, *self.parameters(found), found.delays)
         return [data.y_used - eps for data, (_, eps) in zip(self.problem.records, parts, strict=True)]
 
     def squared_error_at(self, model: AnyModel | AdditiveModel, delay: float, k: int = 0) -> float:
-        """Least sum of squared output errors at a given delay of an input, in the basin of a model."""
+        """Return the least sum of squared output errors at a given delay of an input, in the basin of a model."""
         delays = delays_of(model)
         delays[k] = delay
         bounds = tuple(
@@ -398,7 +396,7 @@ class MeasuredRecords:
         return local_minimum(self.problem, poles, delays, bounds, known=self.known).squared_error
 
     def errors_of(self, model: AnyModel | AdditiveModel) -> AppliedModel:
-        """Errors of a given model on these records, each with its own best initial state and offset."""
+        """Return the errors of a given model on these records, each with its best initial state and offset."""
         free = [True] * len(delays_of(model))
         layout = replace(self.layout, degrees=self.degrees.with_orders(model, free))
         theta, residuals = layout.theta(model), []
@@ -414,7 +412,7 @@ class MeasuredRecords:
         return AppliedModel(tuple(residuals), self.used(), *self.own(layout, theta), slopes)
 
     def free_poles(self, model: AnyModel | AdditiveModel) -> ComplexArray:
-        """The poles of a model but its integrators."""
+        """Return the poles of a model without its integrators."""
         if isinstance(model, AdditiveModel):
             return poles_of_submodels(model)
         each = zip(fractions_of(model), self.problem.each_integrators, strict=False)
@@ -424,22 +422,22 @@ class MeasuredRecords:
 
     @property
     def given(self) -> BoolArray:
-        """Which of the coefficients are known, those that integrators make zero among them."""
+        """Mask of the known coefficients, including those that are zero due to integrators."""
         return self.degrees.given(self.known)
 
     def layout_of(self, model: AnyModel | AdditiveModel) -> Layout:
-        """Layout of the parameters of a model, some of whose poles may be missing."""
+        """Return the layout of the parameters of a model that may have fewer poles."""
         return replace(self.layout, degrees=self.degrees.with_orders(model, self.degrees.delays))
 
     def own(self, layout: Layout, theta: Array) -> tuple[tuple[Array, ...], tuple[float, ...]]:
-        """Initial states and offsets of the experiments, means that were subtracted included."""
+        """Return initial states and offsets of the experiments, including subtracted means."""
         own = [layout.own_of(theta, k) for k in range(layout.experiments)]
         offsets = tuple(y0 + c for y0, (_, c) in zip(self.offsets, own, strict=True))
         return tuple(state for state, _ in own), offsets
 
 
 def _bridged(record: Record) -> Record:
-    """Record whose outliers are replaced by what lies between their neighbours."""
+    """Return a record with outliers replaced by interpolation between their neighbours."""
     present = np.flatnonzero(record.valid)
     wild = present[outliers(record.y[present])]
     kept = np.setdiff1d(present, wild)
@@ -449,21 +447,21 @@ def _bridged(record: Record) -> Record:
 
 
 def _cut(record: Record, part: slice) -> Record:
-    """Some samples of a record whose input is known at them."""
+    """Return part of a record, with the input known at its samples."""
     t = record.t[part]
     inputs = {name: HeldSignal(t, signal.values[part], signal.hold) for name, signal in record.held.items()}
     return Record(t, record.y[part], inputs, name=record.name)
 
 
 def above_level(record: Record, before: InputBefore) -> tuple[Record, list[float], float]:
-    """Record whose inputs count from the levels before its first sample, these levels, and zero for its output."""
+    """Return a record with inputs relative to their levels before it, these levels, and zero for its output."""
     firsts = [float(signal.values[0]) for signal in record.held.values()]
     levels = firsts if before == "first" else [float(before or 0.0)] * len(firsts)
     return _lowered(record, levels), levels, 0.0
 
 
 def without_means(record: Record) -> tuple[Record, list[float], float]:
-    """Record less the mean of its output samples and the time averages of its inputs."""
+    """Return a record without the mean of its output and the time averages of its inputs, and these levels."""
     y0 = float(np.nanmean(record.y))
     means = [float(np.mean(signal.at(record.t))) for signal in record.held.values()]
     loop = record.loop and replace(record.loop, reference=record.loop.reference - record.loop.reference.mean())
@@ -471,7 +469,7 @@ def without_means(record: Record) -> tuple[Record, list[float], float]:
 
 
 def _lowered(record: Record, levels: Sequence[float]) -> Record:
-    """Record whose inputs are less by some levels."""
+    """Return a record with levels subtracted from its inputs."""
     if not any(levels):
         return record
     pairs = zip(record.held.items(), levels, strict=True)
@@ -481,7 +479,7 @@ def _lowered(record: Record, levels: Sequence[float]) -> Record:
 
 
 def refuse_collinear(record: Record) -> None:
-    """Refuse inputs of which one is a combination of the others: nothing tells their responses apart."""
+    """Refuse collinear inputs, whose responses cannot be distinguished."""
     u = np.column_stack([signal.at(record.t) for signal in record.held.values()])
     u = u - u.mean(axis=0)
     lengths = np.linalg.norm(u, axis=0)
@@ -497,7 +495,7 @@ def refuse_collinear(record: Record) -> None:
 
 
 def _period(record: Record) -> float:
-    """Period of a record that repeats: its duration and one more interval."""
+    """Return the period of a periodic record: its duration plus one interval."""
     return record.duration + (record.interval or float(np.median(np.diff(record.t))))
 
 
@@ -507,5 +505,5 @@ def _one_period(data: FilterData, period: float) -> FilterData:
     within = data.tu < data.tu[0] + period * (1 - 1e-9)
     if within.all():
         return data
-    # A regular pass takes a break for each sample.
+    # Filters for regular clocks require one break per sample.
     return data._replace(tu=data.tu[within].copy(), u=data.u[within].copy(), interval=0.0)

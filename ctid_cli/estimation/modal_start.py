@@ -1,10 +1,10 @@
-r"""A start for the estimation of a sum of submodels, from the record alone.
+r"""Start for the estimation of a sum of submodels, from the record only.
 
-Poles are those of a transfer function with a free numerator, to which they are added pair by pair: as many as the sum
-has, and two more of which the least important are left out. Both sets are shared out among the terms. For given poles
-the output is linear in the numerators, which least squares on the output error supplies; the set whose output errors
-are least, each band of frequencies compared with its own noise level, wins. Where these errors are coloured, poles are
-found once more in the record filtered so that they are white.
+Poles are those of a transfer function with a free numerator, to which they are added pair by pair: the number of the
+sum, and two more, of which the least important are removed. Both sets are assigned to the terms. For given poles the
+output is linear in the numerators, which follow by least squares on the output error; the set with the least output
+errors, each frequency band weighted by its noise level, is chosen. If these errors are coloured, poles are found again
+in a prewhitened record.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from ctid_cli.inference.noise_model import fit_noise_model
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.signals.record import Record, beginning, named
 
-#: Of longer records these first samples are used: poles need not be exact.
+#: Number of first samples that are used of longer records: poles need not be exact.
 LONGEST = 20_000
-#: Frequencies of an added pole or pair, and the dampings of a pair, that are tried.
+#: Number of trial frequencies of an added pole or pair, and trial dampings of a pair.
 FREQUENCIES = 20
 DAMPINGS = (0.03, 0.3)
-#: Poles that are added beyond those of the terms, for noise and modes that were not asked for.
+#: Number of additional poles for noise and unmodelled modes.
 SPARE_POLES = 2
-#: Ways of sharing poles out among terms of different structure that are tried.
+#: Largest number of assignments of poles to terms that are tried.
 MOST_ARRANGEMENTS = 24
 #: Frequencies of a periodogram that share one noise level.
 BAND = 16
-#: A complex pair that must give two real poles gives them this factor below and above its magnitude.
+#: A complex pair is split into two real poles this factor below and above its magnitude.
 SPLIT = 1.25
 
 
-#: How poles were found; the real ones and one of each pair.
+#: Method by which poles were found; the real poles and one of each pair.
 PoleSet = tuple[str, list[complex]]
 
 
 class ModalStart(NamedTuple):
-    """Where the estimation of a sum of submodels may start."""
+    """Start of the estimation of a sum of submodels."""
 
     model: AdditiveModel
     method: str
@@ -64,11 +64,11 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
 
     where E is the discrete Fourier transform of the output error and b runs over bands of :math:`n_b` neighbouring
     frequencies: twice the negative logarithm of the likelihood for noise of an unknown level in each band. The plain
-    output error would prefer a mode that follows a few lines of strong coloured noise to a weak one where noise is low.
+    output error would prefer a mode that fits a few lines of strong coloured noise to a weak mode in low noise.
 
-    In closed loop the measured input is taken as it is: that biases the numbers a little, which a start may be.
+    In closed loop the measured input is used: the small bias is acceptable for a start.
 
-    It fails for modes slower than the record or hidden in the noise, and for two modes that no frequency separates.
+    The method fails for modes slower than the record or below the noise, and for two modes of nearly equal frequency.
     """
     data = filter_data(beginning(record, LONGEST), problem.delay)
     problem = replace(problem, data=data, loop=OPEN_LOOP, fixed={})
@@ -89,7 +89,7 @@ def automatic_start(record: Record, problem: AdditiveProblem) -> ModalStart:
 
 
 def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[PoleSet]:
-    """Candidates for all poles but the integrators; none where the record is too short for them."""
+    """Return candidates for all poles except integrators; none if the record is too short."""
     search = _Search(problem, data)
     count, order = search.poles, search.poles + search.integrators
     if count == 0:
@@ -106,7 +106,7 @@ def _pole_sets(problem: AdditiveProblem, data: FilterData) -> list[PoleSet]:
 
 
 def _whitened(data: FilterData, error: Array) -> FilterData | None:
-    """The record filtered so that noise like an output error is white; None where it is, or lags are not in time."""
+    """Return the record filtered to whiten an output error; None if it is white or the clock is irregular."""
     gaps = not data.use[np.argmax(data.use) :].all()
     if data.interval == 0.0 or not data.common_clock or gaps:
         return None
@@ -120,43 +120,43 @@ def _whitened(data: FilterData, error: Array) -> FilterData | None:
 
 
 class _Search:
-    """Transfer functions with the poles of a sum; their numerators and initial states are eliminated."""
+    """Search for the poles of a sum as one transfer function; numerators and initial states are eliminated."""
 
     def __init__(self, problem: AdditiveProblem, data: FilterData) -> None:
         terms, delays = problem.terms, (problem.delay, problem.delay)
         self.poles, self.integrators = sum(term.poles for term in terms), sum(term.integrators for term in terms)
         self.direct = any(term.zeros == term.order for term in terms)
-        # Of one period the state at the first sample is unknown, too.
+        # The state at the first sample is unknown for a single period, too.
         unknown = problem.initial_state != "rest"
         self.problem = Problem((data,), 0, unknown, (), (0.0,), integrators=self.integrators)
         self.box = box_of(self.problem, delays)
 
     def descent(self, poles: int) -> Descent:
-        """Searches with that number of poles besides the integrators, and a full numerator."""
+        """Return the local search with ``poles`` poles in addition to the integrators, and a full numerator."""
         return Descent(self.problem._replace(zeros=poles + self.integrators - 1 + self.direct), self.box)
 
     def point(self, poles: Sequence[complex] | ComplexArray) -> Point:
-        """Poles with their conjugates, moved into the set that is searched."""
+        """Return the point of poles with their conjugates, projected onto the searched set."""
         return point_of(np.array(poles, dtype=complex), self.box.middle, self.box)
 
     def found(self) -> ComplexArray:
-        """As many poles as the sum has."""
+        """Return the poles of a search with the number of poles of the sum."""
         poles = np.zeros(0, dtype=complex)
         while poles.size < self.poles:
             poles = self.with_more(poles, min(2, self.poles - poles.size))
         return poles
 
     def with_more(self, poles: ComplexArray, added: int) -> ComplexArray:
-        """The poles of the least squared error with one more or two; those that there are move along."""
+        """Return the poles of least squared error after adding one or two; existing poles are re-estimated."""
         frequencies = np.geomspace(self.box.spread[0], self.box.fastest, FREQUENCIES + 2)[1:-1].tolist()
         new = [(-w,) for w in frequencies] if added == 1 else [_pair(w, zeta) for w in frequencies for zeta in DAMPINGS]
         descent = self.descent(poles.size + added)
         trials = descent.sorted([self.point([*poles, *own]) for own in new])
-        # What moves the squared error by less than the variance of the noise is not seen.
+        # Changes of the squared error below the variance of the noise are not significant.
         return descent.descend(trials[0], near=1.0 / descent.count).point.poles
 
     def without(self, poles: ComplexArray, left_out: int) -> list[complex]:
-        """The poles of the least squared error after some have been left out; one of each pair is listed."""
+        """Return the poles of least squared error after removing ``left_out``; one of each pair is listed."""
         upper = _upper(poles)
         kept = []
         for number in range(1, left_out + 1):
@@ -169,24 +169,24 @@ class _Search:
 
 
 def _pair(frequency: float, damping: float) -> tuple[complex, complex]:
-    """A pair of poles."""
+    """Return a complex pair of poles."""
     pole = frequency * complex(-damping, np.sqrt(1.0 - damping**2))
     return pole, pole.conjugate()
 
 
 def _upper(poles: ComplexArray) -> list[complex]:
-    """The real poles and one of each pair."""
+    """Return the real poles and one of each pair."""
     return [complex(pole) for pole in poles if pole.imag >= 0]
 
 
-# --- poles to terms --------------------------------------------------------------------------------
+# --- assignment of poles to terms ------------------------------------------------------------------
 
 
 def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[list[list[complex]]]:
-    """Ways of giving each term its poles, conjugates not listed.
+    """Yield assignments of poles to terms, conjugates not listed.
 
-    Complex pairs beyond what the terms can hold become real poles, and real poles that are left over fill pairs as
-    neighbours. Groups go to the terms by rising frequency, in every order of the different structures.
+    Surplus complex pairs become real poles, and surplus real poles are paired with their neighbours. Groups are
+    assigned to the terms by ascending frequency, in every order of the different structures.
     """
     single, double = sum(term.poles % 2 for term in terms), sum(term.poles // 2 for term in terms)
     pairs, reals = _at_most_pairs(poles, double)
@@ -197,7 +197,7 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
         doubles.sort(key=lambda group: abs(group[0]))
         for order in _distinct_orders(terms, range(len(terms))):
             groups = _dealt(terms, order, doubles, [reals[k] for k in alone])
-            # Exchanging a term of one pole with one of two changes nothing.
+            # Exchanging a term of one pole with one of two poles gives an equal assignment.
             if groups not in tried:
                 tried.append(groups)
                 yield groups
@@ -206,7 +206,7 @@ def _arrangements(poles: Sequence[complex], terms: Sequence[Term]) -> Iterator[l
 def _dealt(
     terms: Sequence[Term], order: Sequence[int], doubles: list[list[complex]], singles: list[complex]
 ) -> list[list[complex]]:
-    """Pairs and single poles given to the terms in an order."""
+    """Return pairs and single poles assigned to the terms in a given order."""
     two, one = iter(doubles), iter(singles)
     groups: list[list[complex]] = [[] for _ in terms]
     for k in order:
@@ -216,18 +216,18 @@ def _dealt(
 
 
 def _at_most_pairs(poles: Sequence[complex], count: int) -> tuple[list[complex], list[complex]]:
-    """Complex poles, one of each pair and at most a number of them, and real ones; both by rising magnitude."""
+    """Return at most ``count`` complex poles, one of each pair, and real poles; both by ascending magnitude."""
     pairs = sorted((pole for pole in poles if pole.imag), key=abs)
     reals = [pole for pole in poles if not pole.imag]
     while len(pairs) > count:
-        # The best damped pair is nearest to two real poles.
+        # The pair with the highest damping is closest to two real poles.
         pole = pairs.pop(int(np.argmax([-pole.real / abs(pole) for pole in pairs])))
         reals += [complex(-abs(pole) / SPLIT), complex(-abs(pole) * SPLIT)]
     return pairs, sorted(reals, key=abs)
 
 
 def _distinct_orders(terms: Sequence[Term], left: Sequence[int]) -> Iterator[list[int]]:
-    """Orders of those of the terms that are left which differ in structure; equal terms keep theirs."""
+    """Yield the orders of the remaining terms that differ in structure; equal terms keep their order."""
     if not left:
         yield []
     for k in sorted({terms[j]: j for j in reversed(left)}.values()):
@@ -239,7 +239,7 @@ def _distinct_orders(terms: Sequence[Term], left: Sequence[int]) -> Iterator[lis
 
 
 class _Fitted(NamedTuple):
-    """A model with fitted numerators, its output error, its J, and how its poles were found."""
+    """Model with fitted numerators, its output error, its J, and the method that found its poles."""
 
     model: AdditiveModel
     error: Array
@@ -248,7 +248,7 @@ class _Fitted(NamedTuple):
 
 
 def _best(problem: AdditiveProblem, sets: Sequence[PoleSet]) -> _Fitted | None:
-    """The fit of least J with the poles of one of several sets, shared out among the terms."""
+    """Return the fit of least J over several sets of poles and their assignments to the terms."""
     found = [
         fitted
         for way, poles in sets
@@ -259,7 +259,7 @@ def _best(problem: AdditiveProblem, sets: Sequence[PoleSet]) -> _Fitted | None:
 
 
 def _with_numerators(problem: AdditiveProblem, groups: Sequence[Sequence[complex]], way: str) -> _Fitted | None:
-    """The model with given poles of each term; None where they give no valid model or no finite response."""
+    """Return the model with given poles of each term; None if the model is invalid or its response not finite."""
     theta, free = np.zeros(problem.free), np.ones(problem.free, dtype=bool)
     first = 0
     for poles, term in zip(groups, problem.terms, strict=True):
@@ -270,7 +270,7 @@ def _with_numerators(problem: AdditiveProblem, groups: Sequence[Sequence[complex
     rows = problem.rows(theta)
     if rows is None or not np.isfinite(rows[0]).all():
         return None
-    # With all of them zero the output error is what numerators and free response have to explain.
+    # With zero numerators the output error is the regressand of numerators and free response.
     columns, error = rows[0][:, free], rows[1]
     gram = columns.T @ columns
     scales = np.diag(gram).copy()
@@ -286,7 +286,7 @@ def _with_numerators(problem: AdditiveProblem, groups: Sequence[Sequence[complex
 
 
 def _criterion(error: Array) -> float:
-    """The criterion J of :func:`automatic_start`."""
+    """Return the criterion J of :func:`automatic_start`."""
     power = np.abs(np.fft.rfft(error)) ** 2
     edges = BAND * np.arange(max(power.size // BAND, 1))
     counts = np.diff(np.append(edges, power.size))

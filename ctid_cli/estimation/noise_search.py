@@ -1,8 +1,8 @@
-r"""Plant and ARMA noise of the greatest joint likelihood, from the least output error.
+r"""Maximum-likelihood estimates of plant and ARMA noise, from the output-error optimum.
 
-Given the noise, the least squares of the innovations have the plant; given the plant, the output errors have the noise.
-Either step raises the likelihood, and where neither does any more its slope by all parameters is zero. In open loop
-the information on both is block-diagonal, so that a few rounds do.
+Given the noise, the plant follows by least squares of the innovations; given the plant, the noise follows from the
+output errors. Each step increases the likelihood, and at convergence its gradient by all parameters is zero. In open
+loop the information matrix is block-diagonal, so that a few rounds suffice.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from ctid_cli.estimation.measured_records import MeasuredRecords
 from ctid_cli.estimation.optimum.best_model import LONG, Begin, Optimum
 from ctid_cli.inference.innovations import NoiseFit, Orders, all_arma, fit_arma, steps_of
 
-#: The estimate has settled where a round lowers ``-2 ln L`` by less; most rounds.
+#: Decrease of ``-2 ln L`` per round that counts as convergence; largest number of rounds.
 SETTLED, MOST_ROUNDS = 1e-6, 40
 
 
 class JointOptimum(NamedTuple):
-    """The greatest likelihood that was found."""
+    """Plant and noise of the greatest likelihood found."""
 
     found: Optimum
     noise: NoiseFit
@@ -32,16 +32,16 @@ def joint_optimum(
     *,
     nested: bool,
 ) -> JointOptimum:
-    """Plant and noise of the greatest likelihood near an output-error optimum; orders that are not given by BIC.
+    """Return plant and noise of the greatest likelihood near an output-error optimum; orders by BIC unless given.
 
-    The least output error may have followed the noise: the plant is searched once more as the innovations under that
-    noise see it, from the starts of the output-error search, and if nested from the smaller plants too.
+    The output-error optimum may have fitted the noise: the plant is searched again by the innovations under that noise,
+    from the starts of the output-error search, and if nested from smaller plants too.
     """
     joint = _near(measured, found, orders)
     if not sum(joint.noise.orders):
         return joint
     white, size = measured.whitened_by(joint.noise.noise), found.start[0].size
-    # Poles that have run to infinity are not looked for again.
+    # Structures with poles at infinity are not searched again.
     alike = [start for start in starts if start[0].size == size]
     starts = [joint.found.start, *alike]
     nested = nested and sum(e.size for e in measured.outputs) <= LONG
@@ -52,14 +52,14 @@ def joint_optimum(
 
 
 def _near(measured: MeasuredRecords, found: Optimum, orders: Orders | None) -> JointOptimum:
-    """Plant and noise in the basin of an output-error optimum."""
+    """Return plant and noise in the basin of an output-error optimum."""
     steps = [steps_of(use) for use in measured.used()]
     if orders is not None:
         return _settled(measured, JointOptimum(found, fit_arma(_errors(measured, found), steps, orders)))
     fits: dict[Orders, NoiseFit] = {}
     tried: dict[Orders, JointOptimum] = {}
     while True:
-        # The output-error fit has taken a part of the noise with it: once more from the joint one.
+        # The output-error fit absorbs part of the noise: repeat with the errors of the joint fit.
         fits = all_arma(_errors(measured, found), steps, fits)
         chosen = min(fits.values(), key=lambda fit: fit.bic)
         if chosen.orders in tried:
@@ -73,7 +73,7 @@ def _errors(measured: MeasuredRecords, found: Optimum) -> list[Array]:
 
 
 def _settled(measured: MeasuredRecords, joint: JointOptimum) -> JointOptimum:
-    """Plant and noise in turn, until the likelihood rises no further."""
+    """Estimate plant and noise alternately until the likelihood converges."""
     (found, noise), steps = joint, [steps_of(use) for use in measured.used()]
     for _ in range(MOST_ROUNDS if sum(noise.orders) else 0):
         found = measured.whitened_by(noise.noise).local(found.start)

@@ -1,8 +1,9 @@
-"""Bounds of single parameters, of coefficients and of gain, time constant and damping of small models.
+"""Bounds of single parameters: coefficients, and gain, time constant and damping of small models.
 
-Where the least cost violates a bound, the estimate lies on it: what is bounded is held there, the rest is fitted anew.
-A coefficient, or the time constant of one pole, is then a known coefficient. A gain ``b_m/a_n`` and the damping
-``a_1/(2 sqrt(a_2))`` relate a coefficient to the last one of the denominator, along which the cost is minimised.
+If the least cost violates a bound, the estimate is at the bound: the bounded quantity is fixed there and the other
+parameters are refitted. A coefficient, or the time constant of one pole, is then a known coefficient. A gain
+``b_m/a_n`` and the damping ``a_1/(2 sqrt(a_2))`` relate a coefficient to the last one of the denominator, over which
+the cost is minimised.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,30 +21,30 @@ from ctid_cli.estimation.optimum.known import KnownCoefficients, null_space
 from ctid_cli.estimation.parameter_layout import Degrees, Layout
 from ctid_cli.text import listed
 
-#: Quantities of small models beside their coefficients.
+#: Quantities of small models in addition to their coefficients.
 DERIVED = ("gain", "time_constant", "damping")
-#: A bound is met up to this fraction of it.
+#: Relative tolerance of a bound.
 MET = 1e-9
-#: The last coefficient of a denominator is searched within this factor of where it was, to this relative accuracy.
+#: Search of the last coefficient of a denominator: factor of the range about its last value, and relative accuracy.
 REACH, ACCURACY = 50.0, 1e-7
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What a bound is on, as a function of coefficients by their names."""
+    """Bounded quantity as a function of coefficients by their names."""
 
     bound: Bound
-    #: Coefficients: of a gain b_m and a_n, of a time constant a_1, of a damping a_1 and a_2, else the bounded one.
+    #: Coefficients: b_m and a_n for a gain, a_1 for a time constant, a_1 and a_2 for a damping, else the bounded one.
     names: tuple[str, ...]
     kind: str
 
     @property
     def along(self) -> str | None:
-        """The last coefficient of the denominator, where another one is held relative to it."""
+        """Last coefficient of the denominator, if another one is fixed relative to it."""
         return self.names[1] if len(self.names) == 2 else None
 
     def value(self, values: Mapping[str, float]) -> float:
-        """Return what is bounded."""
+        """Return the value of the bounded quantity."""
         first, *last = (values[name] for name in self.names)
         if self.kind == "gain":
             return first / last[0]
@@ -52,7 +53,7 @@ class Quantity:
         return 1.0 / first if self.kind == "time_constant" else first
 
     def slopes(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the derivatives by the coefficients."""
+        """Return the derivatives with respect to the coefficients."""
         first, value = values[self.names[0]], self.value(values)
         if self.along is None:
             return {self.names[0]: -(value**2) if self.kind == "time_constant" else 1.0}
@@ -61,7 +62,7 @@ class Quantity:
         return dict(zip(self.names, shares, strict=True))
 
     def held(self, end: float, last: float) -> float:
-        """Return the first coefficient with which the quantity is at an end of its bound."""
+        """Return the first coefficient that puts the quantity at an end of its interval."""
         if self.kind == "gain":
             return end * last
         if self.kind == "damping":
@@ -69,14 +70,14 @@ class Quantity:
         return 1.0 / end if self.kind == "time_constant" else end
 
     def end(self, values: Mapping[str, float]) -> float | None:
-        """Return the end of the bound that is violated."""
+        """Return the violated end of the interval."""
         low, high, value = self.bound.low, self.bound.high, self.value(values)
         slack = MET * self.bound.scale
         return low if value < low - slack else high if value > high + slack else None
 
 
 def quantities_of(bounds: Sequence[Bound], degrees: Degrees) -> list[Quantity]:
-    """Return what bounds are on; an OptionError says which of them are not possible."""
+    """Return the bounded quantities; raise OptionError for impossible ones."""
     found, coefficients = list[Quantity](), degrees.names
     for bound in bounds:
         if bound.name in coefficients:
@@ -113,7 +114,7 @@ def _derived(bound: Bound, degrees: Degrees, k: int) -> Quantity:
 
 
 def _require_positive(bound: Bound) -> None:
-    """Refuse bounds that no stable model is within."""
+    """Refuse bounds that exclude all stable models."""
     if not bound.low > 0:
         raise OptionError(
             "bounds", f"the lower bound of {bound.name} must be above zero, as in every stable model; got {bound.low:g}"
@@ -121,7 +122,7 @@ def _require_positive(bound: Bound) -> None:
 
 
 class BoundedSearch:
-    """Searches of records within bounds."""
+    """Search of records within bounds."""
 
     def __init__(
         self, measured: MeasuredRecords, quantities: Sequence[Quantity], degrees: Degrees, known: Mapping[int, float]
@@ -131,9 +132,9 @@ class BoundedSearch:
         self.known = {self.names[place]: value for place, value in known.items()}
 
     def within(self, free: Optimum) -> tuple[Optimum, dict[Quantity, float]]:
-        """Return the least cost within the bounds, and those it lies at with their ends, from that without bounds.
+        """Return the least cost within the bounds, from that without bounds, and the active quantities with their ends.
 
-        The bound that is violated most, relatively, is added until none is; one that another makes needless is dropped.
+        The relatively most violated bound is added until none is violated; bounds that become inactive are dropped.
         """
         found, ends = free, dict[Quantity, float]()
         while violated := self._violated(found):
@@ -158,13 +159,13 @@ class BoundedSearch:
         return values
 
     def _violated(self, found: Optimum) -> dict[Quantity, float]:
-        """Return what is outside its bound, with the nearest end."""
+        """Return the quantities outside their bounds, with the nearest end."""
         values = self._values(found)
         each = {one: one.end(values) for one in self.quantities}
         return {one: end for one, end in each.items() if end is not None}
 
     def _least(self, start: Optimum, ends: Mapping[Quantity, float]) -> Optimum:
-        """Return the least cost with quantities at some ends of their bounds."""
+        """Return the least cost with quantities fixed at ends of their bounds."""
         held = self.known | {one.names[0]: one.held(end, 0.0) for one, end in ends.items() if one.along is None}
         related = [(one, end) for one, end in ends.items() if one.along is not None]
         along = {str(one.along) for one, _ in related} - held.keys()
@@ -201,14 +202,14 @@ class BoundedSearch:
         return other
 
     def _begin(self, measured: MeasuredRecords, start: Optimum) -> Begin:
-        """Return where a search with known coefficients begins."""
+        """Return the start of a search with known coefficients."""
         known = measured.known
         if not known.all_poles:
             return start.start[0], start.delays
         return known.poles if known.parts else np.append(1.0, known.denominator), start.delays
 
     def tangent(self, layout: Layout, theta: Array, ends: Mapping[Quantity, float], free: Array) -> Array:
-        """Return the directions among free ones along which nothing leaves its bound."""
+        """Return the free directions along which all quantities stay at their bounds."""
         values, slopes = dict(zip(layout.names, theta.tolist(), strict=True)), np.zeros((len(ends), layout.size))
         for row, one in zip(slopes, ends, strict=True):
             for name, slope in one.slopes(values).items():

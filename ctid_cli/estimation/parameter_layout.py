@@ -1,4 +1,4 @@
-"""Which numbers stand where in the parameter vector of measured records."""
+"""Layout of the parameter vector of measured records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,24 +15,24 @@ from ctid_cli.inference.sensitivities import Structure, SumStructure
 from ctid_cli.models.additive import AdditiveModel, Term
 from ctid_cli.models.several_inputs import AnyModel, MultiInputModel, fractions_of
 
-#: Parameters of the powers of time that the output has beside the response.
+#: Names of the parameters of the powers of time that are added to the response.
 TREND_NAMES = ("offset", "drift", "drift2", "drift3")
 
 
 @dataclass(frozen=True)
 class Degrees:
-    """Degrees of the transfer functions of all inputs, and which delays are parameters.
+    """Degrees of the transfer functions of all inputs, and flags for delays that are parameters.
 
     The parameters are the coefficients of all denominators, those of all numerators, and the delays.
     """
 
-    #: Poles, integrators included: of the common denominator, or of that of each input.
+    #: Number of poles, including integrators, of the common denominator, or of the denominator of each input.
     orders: tuple[int, ...]
     zeros: tuple[int, ...]
     delays: tuple[bool, ...]
-    #: Names of the inputs; one alone needs none.
+    #: Names of the inputs; not used for a single one.
     inputs: tuple[str, ...] = ("",)
-    #: Poles at the origin of each denominator: that many of its last coefficients are zero.
+    #: Number of poles at the origin of each denominator, which is the number of its last coefficients that are zero.
     integrators: tuple[int, ...] = (0,)
 
     @classmethod
@@ -42,7 +42,7 @@ class Degrees:
 
     @property
     def structure(self) -> Structure:
-        """The transfer function of the first input."""
+        """Structure of the transfer function of the first input."""
         return Structure(self.orders[0], self.zeros[0], self.delays[0])
 
     @property
@@ -52,7 +52,7 @@ class Degrees:
 
     @property
     def common(self) -> bool:
-        """Whether there is one denominator."""
+        """Whether all inputs have one denominator."""
         return len(self.orders) == 1
 
     @property
@@ -62,7 +62,7 @@ class Degrees:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """What the problem of the search has of them."""
+        """Corresponding arguments of the search problem."""
         if self.common:
             most = max(self.zeros)
             fewer = tuple(most - m for m in self.zeros)
@@ -73,12 +73,12 @@ class Degrees:
 
     @cached_property
     def a(self) -> list[slice]:
-        """Places of the coefficients of each denominator."""
+        """Slices of the coefficients of each denominator."""
         return _slices(0, self.orders)
 
     @cached_property
     def b(self) -> list[slice]:
-        """Places of the coefficients of each numerator."""
+        """Slices of the coefficients of each numerator."""
         return _slices(self.poles, [m + 1 for m in self.zeros])
 
     @property
@@ -87,7 +87,7 @@ class Degrees:
         return sum(m + 1 for m in self.zeros)
 
     def delay(self, k: int) -> int | None:
-        """Place of the delay of an input; None where it is no parameter."""
+        """Return the index of the delay of an input; None if it is not a parameter."""
         return self.b[-1].stop + sum(self.delays[:k]) if self.delays[k] else None
 
     @property
@@ -97,12 +97,12 @@ class Degrees:
 
     @property
     def prefixes(self) -> list[str]:
-        """What the names of the parameters of each input begin with."""
+        """Prefix of the parameter names of each input."""
         return [f"{name}_" for name in self.inputs] if self.several else [""]
 
     @property
     def block_prefixes(self) -> list[str]:
-        """What the names of the parameters of each denominator begin with."""
+        """Prefix of the parameter names of each denominator."""
         return [""] if self.common else self.prefixes
 
     @property
@@ -120,12 +120,12 @@ class Degrees:
 
     @property
     def denominators(self) -> list[int]:
-        """Places of the coefficients of all denominators but those that integrators make zero."""
+        """Indices of the coefficients of all denominators, without those that are zero due to integrators."""
         each = zip(self.a, self.integrators, strict=True)
         return [place for own, count in each for place in range(own.start, own.stop - count)]
 
     def given(self, known: KnownCoefficients) -> BoolArray:
-        """Return which coefficients are known, those that integrators make zero among them."""
+        """Return the mask of known coefficients, including those that are zero due to integrators."""
         found = np.ones(self.poles + self.numerators, dtype=bool)
         found[self.denominators], found[self.poles :] = False, False
         if known is not NOTHING:
@@ -160,7 +160,7 @@ class Degrees:
         return found, np.eye(self.poles + self.numerators)[places]
 
     def with_orders(self, model: AnyModel | AdditiveModel, delays: Sequence[bool]) -> "Degrees":
-        """Return the degrees for the denominators of a model, some of whose poles may be missing."""
+        """Return the degrees for the denominators of a model that may have fewer poles."""
         assert not isinstance(model, AdditiveModel)
         fractions = fractions_of(model)
         return replace(self, orders=tuple(each.order for each in fractions[: len(self.orders)]), delays=tuple(delays))
@@ -168,7 +168,7 @@ class Degrees:
 
 @dataclass(frozen=True)
 class SumDegrees:
-    """Degrees of a sum of submodels that one input drives; what it has in common with :class:`Degrees`."""
+    """Degrees of a sum of submodels of one input, with the interface of :class:`Degrees`."""
 
     structure: SumStructure
     inputs: ClassVar[tuple[str, ...]] = ("",)
@@ -181,7 +181,7 @@ class SumDegrees:
 
     @property
     def asked(self) -> dict[str, Any]:
-        """What the problem of the search has of them."""
+        """Corresponding arguments of the search problem."""
         return {"zeros": self.structure.zeros, "terms": self.structure.terms}
 
     @property
@@ -206,15 +206,15 @@ class SumDegrees:
 
     @property
     def denominators(self) -> list[int]:
-        """Places of the coefficients of all denominators."""
+        """Indices of the coefficients of all denominators."""
         return [int(place) for place in self.structure.denominators]
 
     def delay(self, k: int) -> int | None:
-        """Place of the delay; None where it is no parameter."""
+        """Return the index of the delay; None if it is not a parameter."""
         return self.size - 1 if self.structure.delay else None
 
     def given(self, known: KnownCoefficients) -> BoolArray:
-        """Return which coefficients are known."""
+        """Return the mask of known coefficients."""
         found = np.zeros(self.size - int(self.structure.delay), dtype=bool)
         if known is not NOTHING:
             found[self.structure.denominators] = np.isfinite(known.denominator)
@@ -235,19 +235,19 @@ class SumDegrees:
         return self.structure.fractions_of(theta)
 
     def with_orders(self, model: AnyModel | AdditiveModel, delays: Sequence[bool]) -> "SumDegrees":
-        """Return the same degrees, whose delay is a parameter or not."""
+        """Return a copy with the flag of the delay replaced."""
         return SumDegrees(replace(self.structure, delay=delays[0]))
 
 
 def _slices(first: int, sizes: Sequence[int]) -> list[slice]:
-    """Places of several parts in a row."""
+    """Return the slices of consecutive parts."""
     ends = first + np.cumsum([0, *sizes])
     return [slice(*pair) for pair in pairwise(ends.tolist())]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which numbers stand where in the parameter vector: coefficients, delays, then each experiment's own."""
+    """Layout of the parameter vector: coefficients, delays, then the parameters of each experiment."""
 
     degrees: Degrees | SumDegrees
     experiments: int = 1
@@ -257,7 +257,7 @@ class Layout:
 
     @property
     def own(self) -> int:
-        """Number of parameters that belong to one experiment."""
+        """Number of parameters of one experiment."""
         return self.degrees.poles * self.initial_state + len(self.trend)
 
     @property
@@ -267,7 +267,7 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names; those of an experiment end in its number where there are several."""
+        """Parameter names; with several experiments, theirs end in the number of the experiment."""
         names, degrees = self.degrees.names, self.degrees
         for k in range(self.experiments):
             tail = f"_{k + 1}" if self.experiments > 1 else ""
@@ -276,17 +276,17 @@ class Layout:
         return tuple(names)
 
     def theta(self, model: AnyModel | AdditiveModel) -> Array:
-        """The parameters of a model of these degrees, and zeros for what belongs to the experiments."""
+        """Return the parameters of a model of these degrees, and zeros for those of the experiments."""
         own = self.degrees.theta_of(model)  # type: ignore[arg-type]  # each has the models of its own kind
         return np.concatenate((own, np.zeros(self.experiments * self.own)))
 
     def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:
-        """Initial state and offset of one experiment."""
+        """Return the initial state and offset of one experiment."""
         first = self.first(experiment)
         own = theta[first : first + self.own]
         states = self.degrees.poles * self.initial_state
         return own[:states], float(own[states]) if self.trend[:1] == (0,) else 0.0
 
     def first(self, experiment: int) -> int:
-        """Where the parameters of an experiment begin."""
+        """Return the first index of the parameters of an experiment."""
         return self.degrees.size + experiment * self.own

@@ -1,4 +1,4 @@
-"""Search over the delay of measured records: behind filters from coarse to fine, or on every sample."""
+"""Search over the delay of measured records: on low-pass filtered records from coarse to fine, or on all samples."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,49 +16,48 @@ from ctid_cli.estimation.sampled_problem import CUTOFFS, least_squares_starts
 from ctid_cli.filtering.lowpass import Lowpass
 from ctid_cli.inference.sensitivities import Structure
 
-#: Local minima of the profile that are refined.
+#: Number of local minima of the profile that are refined.
 MINIMA = 3
-#: How hard to work at each delay of the grid: the fall of the cost that a step must promise, as a fraction of it, and
-#: most steps.
+#: Descent at each delay of the grid: predicted relative decrease of the cost that ends it, and largest number of steps.
 ROUGH = 3e-3, 10
-#: Most delays on the grid, whatever the bandwidth asks for.
+#: Largest number of delays on the grid, for any bandwidth.
 MOST_DELAYS = 2000
-#: Most parts into which a step of the grid is divided around its minima.
+#: Largest number of subdivisions of a grid step around its minima.
 FINEST = 32
-#: A search behind filters: ratio of the cut-off frequencies of its levels, how many delays the first level may have
-#: before a coarser one is put before it, how many levels at most, and order and effort of each.
+#: Search on filtered records: ratio of the cut-off frequencies of its levels, largest number of delays on the first
+#: level, above which a coarser one is added, largest number of levels, and order and steps of each.
 LEVEL_RATIO = 3.0
 MOST_FIRST_DELAYS = 30
 MOST_LEVELS = 4
 LEVEL_ORDER = 10
-#: Real equations inside the pass band of a level for every parameter, those of the transient included.
+#: Real equations in the pass band of a level per parameter, including those of the transient.
 EQUATIONS_PER_PARAMETER = 4
 LEVEL_EFFORT = Steps(max_iterations=6, tolerance=2e-2, rule=GUARDED, halvings=3)
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Cost over the grid of delays, minimised over all other parameters."""
+    """Cost over a grid of delays, minimised over all other parameters."""
 
     #: Grid [s], shape (K,).
     delays: Array
-    #: Mean squared output error [output unit^2]; infinite where the equations were singular, shape (K,).
+    #: Mean squared output error [output unit^2]; infinite for singular equations, shape (K,).
     costs: Array
     #: Frequency below which the output has 95 % of its power [rad/s]; the spacing is at most a quarter of its period.
     bandwidth: float
-    #: Samples that were searched: of long records a part.
+    #: Number of samples of the search, which is a part of long records.
     samples: int
-    #: Cut-off frequency [rad/s] of the low-pass filter behind which the grid was searched, and to whose output the
-    #: costs belong; the spacing is then a quarter of its period. None where every sample was searched.
+    #: Cut-off frequency [rad/s] of the low-pass filter of the record, from which the costs are computed; the spacing is
+    #: then a quarter of its period. None if all samples were searched.
     cutoff: float | None = None
 
 
-#: Minima from which to refine, none if nothing can be computed, and the profile; None at a known delay.
+#: Minima to be refined, empty if none can be computed, and the profile; None for a known delay.
 Found = tuple[list[Minimum], Profile | None]
 
 
 class RecordsCost:
-    """The cost of all samples of the records as a function of the delay."""
+    """Cost of all samples of the records as a function of the delay."""
 
     def __init__(self, measured: MeasuredRecords, bandwidth: float, cutoffs: Sequence[float]) -> None:
         self.measured = measured
@@ -68,14 +67,14 @@ class RecordsCost:
         self.coefficients = Structure(measured.structure.poles - self.integrators, measured.structure.zeros)
 
     def starts(self, delay: float) -> list[Array]:
-        """Denominators of least-squares starts; the output's mean is left to the offset."""
+        """Return denominators of least-squares starts; the mean of the output is part of the offset."""
         n, m = self.coefficients.poles, self.coefficients.zeros
         cutoffs, found = [cutoff * self.bandwidth for cutoff in self.cutoffs], []
         if not self.integrators:
             strictly_proper = Structure(n, min(m, n - 1))
             thetas = least_squares_starts(self.measured.centred, strictly_proper, delay, cutoffs)
             found = [theta[:n] for theta in thetas]
-        # Without any, a system of the right speed, whatever the data say: a start for Gauss-Newton.
+        # Without any, a system with the bandwidth of the output is the start for Gauss-Newton.
         found = found or [np.atleast_1d(np.poly(np.full(n, -0.5 * self.bandwidth)))[1:]]
         return [np.concatenate((a, np.zeros(m + 1), [delay])) for a in found]
 
@@ -85,7 +84,7 @@ class RecordsCost:
         return self.coefficients.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """Least cost at a delay over the denominators of several starts."""
+        """Return the least cost at a delay over the denominators of several starts."""
         measured, n = self.measured, self.coefficients.poles
         tried = np.vstack((starts, *(self.starts(delay) if own else ())))
         best = Minimum(np.zeros(self.size), np.inf)
@@ -99,18 +98,18 @@ class RecordsCost:
 
 
 def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: bool) -> Iterator[Found]:
-    """Look for the delay; what comes later is for where refining what came before led nowhere.
+    """Yield searches of the delay; later ones are used if refining the earlier ones fails.
 
-    Where smaller models lead to the optimum, the profile of a part of long records will do.
+    With ``nested``, the profile of a part of long records suffices, since smaller models lead to the optimum.
     """
     part = records.part() if nested else None
     measured = part or records
     bandwidth = svf_cutoff or measured.bandwidth
     cost = RecordsCost(measured, bandwidth, (1.0,) if measured.structure.delay else CUTOFFS)
     treatment = measured.treatment
-    # What filters see must be the response to the input alone, or to one that is known from the start of the window on.
+    # Filters require the response to the input only, or to an input that is known from the start of the window.
     at_rest = (treatment.initial_state == "rest" or part is not None) and treatment.offset not in ("estimate", "drift")
-    # With integrators they leave the mean out, and nothing is known at rest.
+    # With integrators the filtered costs omit the mean, and a state of rest is not required.
     if (
         (at_rest or (any(treatment.integrators) and not any(measured.layout.trend)))
         and len(measured.records) == 1
@@ -121,15 +120,15 @@ def search_delay(records: MeasuredRecords, svf_cutoff: float | None, nested: boo
 
 
 def _search_levels(cost: RecordsCost) -> Found:
-    """Search behind low-pass filters."""
+    """Search on low-pass filtered records."""
     measured, bandwidth = cost.measured, cost.bandwidth
     (bounds,) = each_bounds(measured.treatment.delay_bounds)
     record, cutoffs = measured.records[0], _cutoffs(bounds, bandwidth)
     present = record.t[record.valid]
-    # Two real equations for every frequency of the observed window that passes.
+    # Two real equations per frequency in the pass band.
     equations = cutoffs * (present[-1] - max(present[0], record.input.t[0])) / np.pi
     cutoffs = cutoffs[equations >= EQUATIONS_PER_PARAMETER * (cost.size + measured.structure.poles)]
-    # Near half the sampling frequency lines between the samples are no picture of the output.
+    # Near the Nyquist frequency linear interpolation does not represent the output.
     if not cutoffs.size or HIGHEST * bandwidth * float(np.median(np.diff(present))) > np.pi:
         return [], None
     costs = filtered_costs(
@@ -146,8 +145,8 @@ def _search_levels(cost: RecordsCost) -> Found:
     profile = Profile(delays, found, bandwidth, record.n_samples, float(cutoffs[0]))
     interval = measured.data[0].interval
     if interval > 0.0 and measured.plain:
-        # On a regular clock the cost has a kink at every interval, and local minima between them that a model too small
-        # for its system makes deep: every sample is asked about an eighth of a period around what the filters found.
+        # On a regular clock the cost has a kink at every interval, and local minima between them, which are deep for
+        # underparametrised models: all samples are used within an eighth of a period of the filtered minima.
         reach = max(interval, 0.25 * np.pi / bandwidth)
         parts = min(int(np.ceil(2.0 * reach / interval)), FINEST)
         minima = [finer for centre in minima for finer in _local_grid(cost, [centre], reach, parts, 1)]
@@ -155,7 +154,7 @@ def _search_levels(cost: RecordsCost) -> Found:
 
 
 def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> Array:
-    """Cut-off frequencies of the levels of a search [rad/s], lowest first."""
+    """Return the cut-off frequencies of the levels of a search [rad/s], lowest first."""
     cutoffs = [bandwidth]
     while (bounds[1] - bounds[0]) * cutoffs[0] / (0.5 * np.pi) > MOST_FIRST_DELAYS and len(cutoffs) < MOST_LEVELS:
         cutoffs.insert(0, cutoffs[0] / LEVEL_RATIO)
@@ -163,7 +162,7 @@ def _cutoffs(bounds: tuple[float, float], bandwidth: float) -> Array:
 
 
 def _search_samples(cost: RecordsCost) -> Found:
-    """Search on every sample."""
+    """Search on all samples."""
     measured = cost.measured
     ((low, high),) = each_bounds(measured.treatment.delay_bounds)
     delays = quarter_periods(low, high, cost.bandwidth, MOST_DELAYS) if low < high else np.array([low])
@@ -172,8 +171,8 @@ def _search_samples(cost: RecordsCost) -> Found:
     chosen = found.lowest(MINIMA)
     if not chosen or delays.size == 1:
         return chosen, None
-    # Held inputs that change on the sampling clock put a kink into the cost at every sampling interval, and local
-    # minima between the kinks: a fine grid around those of the coarse one resolves a quarter of an interval.
+    # With held inputs that change on the sampling clock the cost has a kink at every sampling interval, and local
+    # minima between the kinks: a fine grid around the coarse minima resolves a quarter of an interval.
     spacing = float(delays[1] - delays[0])
     interval = min(float(np.median(np.diff(record.t))) for record in measured.records)
     parts = int(np.clip(np.ceil(4.0 * spacing / interval), 4, FINEST))
@@ -182,7 +181,7 @@ def _search_samples(cost: RecordsCost) -> Found:
 
 
 def _local_grid(cost: RecordsCost, centres: Sequence[Minimum], reach: float, parts: int, most: int) -> list[Minimum]:
-    """The lowest minima on fine grids of all samples around given ones."""
+    """Return the lowest minima on fine grids around given ones, with all samples."""
     ((low, high),) = each_bounds(cost.measured.treatment.delay_bounds)
     fine: list[Minimum] = []
     for centre in centres:

@@ -1,4 +1,4 @@
-"""Useful redundancy: out of the local minima of one cost along the paths of others that share its global minimum."""
+"""Useful redundancy: escape from local minima by searches on other costs with the same global minimum."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,22 +9,22 @@ from typing import Generic, Literal, TypeAlias, TypeVar, get_args
 
 from ctid_cli.signals.checks import require_choice, require_integer, require_not_negative
 
-#: A point of the search: a number, an array, or whatever the costs and the local solver agree on.
+#: A point of the search: a number, an array, or any type accepted by the costs and the local solver.
 P = TypeVar("P")
 
-#: Runs a local solver on one member cost from a point, which it must not change, and returns the minima it found:
-#: usually one, several if it was run from several inner starts, none if it failed.
+#: Runs a local solver on one member cost from a point, without modifying it, and returns its minima: usually one,
+#: several for several inner starts, none if it failed.
 Path: TypeAlias = Callable[[P], Sequence[P]]
 
-#: How a round chooses the next incumbent.
+#: Rule by which a round chooses the next incumbent.
 Choice = Literal["first", "best"]
 
-#: The path of the start, to which no solver led.
+#: Path number of the start, which no solver found.
 START = -1
 
 
 class SearchStatus(Enum):
-    """Why a redundant search ended: what happened and, where it is needed, what to change."""
+    """Reason for the end of a redundant search and, if needed, a remedy."""
 
     EXHAUSTED = "No path improves the reference cost any further."
     SETTLED = "The last round changed the point by too little to go on."
@@ -35,13 +35,13 @@ class SearchStatus(Enum):
 
     @property
     def succeeded(self) -> bool:
-        """Whether the search came to its own end at a point of finite cost."""
+        """Whether the search ended regularly at a point of finite cost."""
         return self in (SearchStatus.EXHAUSTED, SearchStatus.SETTLED)
 
 
 @dataclass(frozen=True)
 class Visit(Generic[P]):
-    """One candidate whose reference cost was evaluated."""
+    """Candidate with its reference cost."""
 
     round: int
     path: int
@@ -52,20 +52,20 @@ class Visit(Generic[P]):
 
 @dataclass(frozen=True)
 class RedundantMinimum(Generic[P]):
-    """Where a redundant search ended, and how it got there.
+    """Result of a redundant search.
 
     Parameters
     ----------
     point : P
-        The last incumbent, the accepted point of least reference cost.
+        Last incumbent, the accepted point of least reference cost.
     cost : float
-        Reference cost there; ``inf`` if no finite one was found.
+        Reference cost of this point; ``inf`` if no finite one was found.
     rounds : int
-        Rounds carried out, the last one, in which nothing may have improved, included.
+        Number of rounds, including a last one without improvement.
     status : SearchStatus
-        Why the search ended.
+        Reason for the end of the search.
     visits : tuple of Visit
-        Every candidate in the order in which it was examined, the start first.
+        All candidates in the order of their evaluation, the start first.
     """
 
     point: P
@@ -76,12 +76,12 @@ class RedundantMinimum(Generic[P]):
 
     @property
     def trajectory(self) -> tuple[Visit[P], ...]:
-        """The incumbents in their order, the start first."""
+        """Successive incumbents, the start first."""
         return tuple(visit for visit in self.visits if visit.accepted)
 
     @property
     def switches(self) -> tuple[Visit[P], ...]:
-        """The incumbents found along another path than the incumbent before; the start, on no path, is none."""
+        """Incumbents found on another path than the previous incumbent, without the start."""
         return tuple(now for before, now in pairwise(self.trajectory) if before.path not in (START, now.path))
 
 
@@ -100,34 +100,34 @@ def minimise_redundantly(
     Parameters
     ----------
     start : P
-        Where to begin.
+        Initial point.
     reference : callable
         Reference cost J0, which ranks the candidates; often the mean of the member costs. A value that is not finite
-        counts as infinitely bad.
+        counts as infinite.
     paths : sequence of callable
-        One solver path for each member cost, see `local_paths`. J0 is not a member unless it is given here too. What
-        a path raises is not caught.
+        One solver path for each member cost, see `local_paths`. J0 is a member only if it is included here. Exceptions
+        of a path are not caught.
     choice : {"first", "best"}, default "first"
-        ``first`` stays on a path as long as it improves the incumbent and goes on to the next one, cyclically,
-        otherwise. ``best`` follows every path in each round and takes the candidate of least reference cost.
+        ``first`` repeats a path while it improves the incumbent, and otherwise proceeds to the next one, cyclically.
+        ``best`` follows every path in each round and takes the candidate of least reference cost.
     improvement : float, default 1e-3
-        Share of the reference cost, 0 to below 1, by which ``first`` demands a candidate to improve [-]; 0 is content
-        with any decrease, and so is ``best`` always.
+        Relative improvement of the reference cost, 0 to below 1, that ``first`` requires [-]; 0 accepts any decrease,
+        as ``best`` always does.
     settled : callable, optional
-        ``settled(previous, new)`` of two successive incumbents: whether the step between them is too small to go on.
-        Meant for ``best``; ``first`` has not tried all paths when it asks. None never stops for that reason.
+        ``settled(previous, new)`` of two successive incumbents: whether the step between them is small enough to stop.
+        Intended for ``best``; ``first`` has not tried all paths when it is called. None disables this criterion.
     max_rounds : int, default 100
         Largest number of rounds, in each of which every path is followed at most once from one incumbent.
 
     Returns
     -------
     RedundantMinimum
-        The point, its reference cost, why the search ended, and every candidate on the way.
+        The point, its reference cost, the reason for the end, and all candidates.
 
     Raises
     ------
     ValueError
-        If there is no path, or an option is out of range.
+        Without paths, or if an option is out of range.
 
     Notes
     -----
@@ -139,25 +139,24 @@ def minimise_redundantly(
 
     .. math:: \min_{i = 0 \dots M} J_0\big(\ell^{(r)}(\rho, J_i)\big) \le \gamma J_0(\rho)
 
-    for all :math:`\rho`: wherever one stands, at least one member leads to a lower :math:`J_0`. Since nothing is below
-    the global minimum, this can hold everywhere only if :math:`J_0` is zero there, and then a search that demands an
-    improvement of at most :math:`1 - \gamma` takes :math:`J_0` to zero at least geometrically, from anywhere.
+    for all :math:`\rho`: from every point at least one member leads to a lower :math:`J_0`. This can hold at the global
+    minimum only if :math:`J_0` is zero there; then a search that requires an improvement of at most
+    :math:`1 - \gamma` reduces :math:`J_0` to zero at least geometrically, from any point.
 
     *The algorithm* [3]_: from the incumbent :math:`\rho`, path i leads to :math:`\xi`. If
     :math:`J_0(\xi) \le (1 - \epsilon) J_0(\rho)`, the incumbent becomes :math:`\xi`, otherwise
-    :math:`i \leftarrow (i + 1) \bmod M`. Three things differ from Algorithm III as printed. That would cycle for ever
-    once every path fails; the search here ends after one full cycle without an improvement. After an improvement that
-    goes back to the first path; here the path stays. And an improvement is also a strict decrease, its share measured
-    by :math:`|J_0|`, since a factor alone would go on for ever at zero or below. Of several minima that a path returns
-    the one of least :math:`J_0` counts. ``best`` is the outer iteration of Algorithm IV there: a step needs M local
-    searches, and the order of the paths matters only where candidates tie.
+    :math:`i \leftarrow (i + 1) \bmod M`. There are three differences from the printed Algorithm III. That algorithm
+    cycles forever once every path fails; this search ends after one full cycle without an improvement. After an
+    improvement the algorithm returns to the first path; this search continues with the same path. An improvement must
+    also be a strict decrease, relative to :math:`|J_0|`, since a factor only would not terminate at zero or below. If a
+    path returns several minima, the one of least :math:`J_0` is used. ``best`` is the outer iteration of Algorithm IV:
+    a step needs M local searches, and the order of the paths matters only for ties.
 
-    *When it fails*: at a point from which no path leads lower, which is then returned as `SearchStatus.EXHAUSTED`.
-    That the family is redundant is an assumption which one run does not test: run it from many starts where the answer
-    is known. Members whose basins have different widths or places are useful, members alike are not. With noise the
-    members agree on the global minimum but roughly: end with a local search on the cost whose minimum is wanted. A
-    reference cost with a large constant part (noise) changes by small shares: subtract that part, or lower
-    `improvement`.
+    *Failure*: at a point from which no path reduces the cost, which is then returned as `SearchStatus.EXHAUSTED`.
+    Redundancy of the family is an assumption that one run does not test: run the search from many starts on a problem
+    with a known solution. Members are useful if their basins differ in width or position. With noise the members agree
+    on the global minimum only approximately: finish with a local search on the cost of interest. A reference cost with
+    a large constant part (noise) has small relative changes: subtract that part, or reduce `improvement`.
 
     References
     ----------
@@ -170,8 +169,8 @@ def minimise_redundantly(
 
     Examples
     --------
-    The frequency of a noisy sine. Over a long record the cost has a narrow global minimum among many local ones, over
-    a short one a wide and inaccurate one:
+    Frequency of a noisy sine. For a long record the cost has a narrow global minimum among many local ones, for a short
+    record a wide and inaccurate one:
 
     >>> import numpy as np
     >>> from scipy.optimize import minimize
@@ -234,7 +233,7 @@ def minimise_redundantly(
 
 
 def local_paths(costs: Sequence[Callable[[P], float]], solver: Callable[[Callable[[P], float], P], P]) -> list[Path[P]]:
-    """Solver paths of a family of costs, all with the same local solver."""
+    """Return solver paths of a family of costs, all with the same local solver."""
 
     def path_of(cost: Callable[[P], float]) -> Path[P]:
         return lambda point: [solver(cost, point)]
@@ -247,7 +246,7 @@ def _cost_or_infinity(cost: float) -> float:
 
 
 def _improves(cost: float, incumbent: float, share: float) -> bool:
-    """Whether a cost is below the incumbent's by more than nothing and at least by a share of it."""
+    """Return whether a cost is strictly below the incumbent's, and by at least a share of it."""
     if math.isinf(incumbent):
         return math.isfinite(cost)
     return cost < incumbent and cost <= incumbent - share * abs(incumbent)

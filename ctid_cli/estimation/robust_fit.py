@@ -1,8 +1,8 @@
-r"""The least loss of measured records with outliers.
+r"""Robust loss minimisation for measured records with outliers.
 
 With x the simulated outputs, a loss is minimised by fitting ``x + psi(r)`` instead of ``y = x + r``: the squared errors
-touch twice the loss from above, so that every fit lowers the loss, and where nothing moves any more
-``sum s psi(r) = 0`` [1]_. All starts, bounds and kinds of minima of least squares serve the loss too.
+majorise twice the loss, so that every fit reduces the loss, and at a fixed point ``sum s psi(r) = 0`` [1]_. Starts,
+bounds and classification of minima are those of least squares.
 
 References
 ----------
@@ -20,17 +20,17 @@ from ctid_cli.estimation.optimum.best_model import Begin, Optimum
 from ctid_cli.estimation.optimum.search import ROUNDING
 from ctid_cli.inference.robust_loss import Loss, RobustKind, scale_of
 
-#: Most fits in one descent, and most of them after which the scale is taken anew.
+#: Largest numbers of fits in one descent, and of fits with an updated scale.
 MOST_FITS, MOST_SCALES = 60, 20
-#: The scale has settled where it changes by less than this fraction, the descent where the loss falls by less.
+#: Relative change of the scale, and relative decrease of the loss, that count as convergence.
 SETTLED, DONE = 1e-4, 1e-11
-#: Most searches, and the fraction by which the next one must lower the loss.
+#: Largest number of searches, and relative decrease of the loss required from each.
 MOST_SEARCHES, WORTHWHILE = 5, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class RobustFit:
-    """A local minimum of the loss."""
+    """Local minimum of the loss."""
 
     found: Optimum
     losses: tuple[Loss, ...]
@@ -39,19 +39,19 @@ class RobustFit:
     errors: list[Array]
 
     def cost(self, losses: Sequence[Loss]) -> float:
-        """Twice the sum of losses of given scales."""
+        """Return twice the sum of losses with given scales."""
         return sum(loss.cost(r) for loss, r in zip(losses, self.errors, strict=True))
 
     def modified(self) -> list[Array]:
-        """Outputs whose least squares are taken next."""
+        """Return the modified outputs of the next least-squares fit."""
         each = zip(self.simulated, self.losses, self.errors, strict=True)
         return [x + loss.weight(r) * r for x, loss, r in each]
 
 
 def robust_fit(measured: MeasuredRecords, kind: RobustKind, starts: Sequence[Begin], nested: bool) -> RobustFit:
-    """Search for the least Huber loss, and from there for Tukey's.
+    """Search for the least Huber loss, and from there for the least Tukey loss.
 
-    The first search sees the outputs with their outliers bridged, the next ones those that the last fit has modified.
+    The first search uses outputs with interpolated outliers, the next ones the modified outputs of the last fit.
     """
     best = _descend(measured, measured.best(starts, nested), "huber")
     for _ in range(MOST_SEARCHES):
@@ -70,7 +70,7 @@ def robust_local(measured: MeasuredRecords, kind: RobustKind, near: Optimum) -> 
 
 
 def _of_kind(measured: MeasuredRecords, best: RobustFit, kind: RobustKind) -> RobustFit:
-    """Return the least loss of a kind from the least Huber loss."""
+    """Return the least loss of a kind, starting from the least Huber loss."""
     if kind == "huber":
         return best
     return _descend(measured, best.found, kind, tuple(replace(loss, kind=kind) for loss in best.losses))
@@ -79,7 +79,7 @@ def _of_kind(measured: MeasuredRecords, best: RobustFit, kind: RobustKind) -> Ro
 def _descend(
     measured: MeasuredRecords, found: Optimum, kind: RobustKind, losses: tuple[Loss, ...] | None = None
 ) -> RobustFit:
-    """Local minimum of the loss, at given scales or at those of the errors, which are fixed when they have settled."""
+    """Return the local minimum of the loss at given scales, or at those of the errors, fixed once converged."""
     here = _at(measured, found, kind, losses)
     settled = losses is not None
     for k in range(MOST_FITS):

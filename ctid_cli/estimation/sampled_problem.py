@@ -1,4 +1,4 @@
-"""The estimation problem of a single transfer function on the samples of one record, and its stable denominators."""
+"""Estimation problem of a single transfer function on the samples of one record, and its stable denominators."""
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
@@ -15,21 +15,21 @@ from ctid_cli.inference.input_response import output_bandwidth
 from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.signals.record import Record
 
-#: A root on the axis is moved off it by this fraction of the largest root: filters need strict stability.
+#: Distance by which a root is moved off the axis, relative to the largest root: filters require strict stability.
 OFF_THE_AXIS = 1e-6
-#: Cut-offs of the state-variable filter that are tried where none is given, as multiples of the output's bandwidth.
+#: Default cut-offs of the state-variable filter, as multiples of the output's bandwidth.
 CUTOFFS = (1.0, 0.2, 5.0, 0.04)
 
 
 def is_hurwitz(a: Array) -> bool:
     """Return whether every root of a monic polynomial lies in the open left half-plane (Routh's criterion)."""
     coefficients = a.tolist()
-    # All coefficients positive: necessary, for n <= 2 sufficient too; refuses NaN as well.
+    # Positive coefficients are necessary, and sufficient for n <= 2; the test also rejects NaN.
     if not all(c > 0.0 for c in coefficients):
         return False
     # The first two rows of Routh's array hold the even and the odd coefficients.
     upper, lower = coefficients[0::2], coefficients[1::2]
-    # Each new row replaces the older of its two predecessors; a first column of one sign means no unstable root.
+    # Each new row replaces the older of its two predecessors; without sign changes in the first column it is stable.
     while len(lower) > 0 and len(upper) > 1:
         ratio = upper[0] / lower[0]
         padded = [*lower, 0.0]
@@ -40,7 +40,7 @@ def is_hurwitz(a: Array) -> bool:
 
 
 def reflect_unstable(a: Array) -> Array:
-    """Return a monic polynomial with its right-half-plane roots mirrored into the left half-plane."""
+    """Return a monic polynomial with its right-half-plane roots reflected into the left half-plane."""
     if is_hurwitz(a):
         return a
     # In the polynomial's own unit of time, where its coefficients neither overflow nor vanish.
@@ -51,7 +51,7 @@ def reflect_unstable(a: Array) -> Array:
 
 
 def with_stable_denominator(theta: Array, poles: int) -> Array:
-    """Return a parameter vector with the denominator at its head reflected if it is unstable."""
+    """Return a parameter vector with its leading denominator reflected if it is unstable."""
     if not np.isfinite(theta).all():
         return theta
     a = np.concatenate(([1.0], theta[:poles]))
@@ -63,7 +63,7 @@ def with_stable_denominator(theta: Array, poles: int) -> Array:
 
 
 class SampledProblem(NamedTuple):
-    """Coefficients and delay: ``theta = (a_1 … a_n, b_0 … b_m, delay)``; the delay is held or free within bounds."""
+    """Coefficients and delay: ``theta = (a_1 … a_n, b_0 … b_m, delay)``; the delay is fixed or free within bounds."""
 
     data: FilterData
     poles: int
@@ -74,7 +74,7 @@ class SampledProblem(NamedTuple):
 
     @property
     def structure(self) -> Structure:
-        """The parameters that are estimated."""
+        """Structure of the estimated parameters."""
         return Structure(self.poles, self.zeros, self.free_delay)
 
     @property
@@ -88,11 +88,11 @@ class SampledProblem(NamedTuple):
         return self.data.count
 
     def split(self, theta: Array) -> tuple[Array, Array, float]:
-        """Denominator, numerator and delay [s] of a parameter vector."""
+        """Return denominator, numerator and delay [s] of a parameter vector."""
         return np.concatenate(([1.0], theta[: self.poles])), theta[self.poles : -1], float(theta[-1])
 
     def equations(self, theta: Array) -> Equations:
-        """Second moments of the iteration."""
+        """Return the second moments of the iteration."""
         n, m = self.poles, self.zeros
         delay = float(theta[-1])
         if not (self.low <= delay <= self.high and np.isfinite(theta).all()):
@@ -112,7 +112,7 @@ class SampledProblem(NamedTuple):
         return Equations(mixed, moments[psi, error] * signs, hessian, float(moments[error, error]), power)
 
     def rows(self, theta: Array) -> tuple[Array, Array]:
-        """Sensitivities of the simulated output, and the output error, at the used samples."""
+        """Return sensitivities of the simulated output, and the output error, at the used samples."""
         rows, structure = standard_rows(self.data, *self.split(theta)), self.structure
         return rows[:, structure.sensitivity_rows] * structure.signs, rows[:, structure.error_row]
 
@@ -121,31 +121,31 @@ class SampledProblem(NamedTuple):
         return with_stable_denominator(theta, self.poles)
 
 
-#: Rows of the sensitivities, the delay among them, in the second moments.
+#: Rows of the sensitivities, including the delay, in the second moments.
 _with_delay = lru_cache(partial(Structure, delay=True))
 
 
 def at_known_delay(data: FilterData, structure: Structure) -> SampledProblem:
-    """The coefficients at a delay that is held."""
+    """Return the problem of the coefficients at a fixed delay."""
     return SampledProblem(data, structure.poles, structure.zeros, False, 0.0, np.inf)
 
 
 def cutoffs_of(record: Record, given: float | None) -> tuple[float, ...]:
-    """Cut-offs of the state-variable filter to start from [rad/s]: the one given, or several around the bandwidth."""
+    """Return the cut-offs of the state-variable filter of starts [rad/s]: the given one, or several by bandwidth."""
     if given is not None:
         return (given,)
     return cutoffs_around(output_bandwidth(record))
 
 
 def cutoffs_around(bandwidth: float) -> tuple[float, ...]:
-    """Cut-offs to start from for a bandwidth [rad/s]."""
+    """Return the cut-offs of starts for a bandwidth [rad/s]."""
     return tuple(multiple * bandwidth for multiple in CUTOFFS)
 
 
 def least_squares_starts(
     data: FilterData, structure: Structure, delay: float, svf_cutoffs: Sequence[float], refit: bool = False
 ) -> list[Array]:
-    """The least-squares estimates of several cut-offs, singular ones left out."""
+    """Return the least-squares estimates of several cut-offs, without singular ones."""
     found = (least_squares_start(data, structure, delay, cutoff, refit) for cutoff in svf_cutoffs)
     return [theta for theta in found if theta is not None]
 
@@ -153,9 +153,9 @@ def least_squares_starts(
 def least_squares_start(
     data: FilterData, structure: Structure, delay: float, svf_cutoff: float, refit: bool = False
 ) -> Array | None:
-    """Least-squares estimate with the state-variable filter ``1/(p + w)^n``; ``refit`` fits the numerator once more.
+    """Return the least-squares estimate with the state-variable filter ``1/(p + w)^n``; None if it is singular.
 
-    The numerator is refitted to the output error, for the denominator of the estimate. None where it is singular.
+    ``refit`` refits the numerator to the output error for the denominator of the estimate.
     """
     n, m = structure.poles, structure.zeros
     filter_denominator = np.asarray(np.poly(np.full(n, -svf_cutoff)), dtype=np.float64)

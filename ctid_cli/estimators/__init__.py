@@ -1,1 +1,1 @@
-"""Estimators: one algorithm per file, their options are their fields."""
+"""Estimators: one algorithm per file, with the options as fields."""

@@ -1,4 +1,4 @@
-"""A sum of submodels of the least output error: delay searched, state and offset estimated, several records."""
+"""Output-error estimation of a sum of submodels: free delay, estimated state and offset, several records."""
 
 from __future__ import annotations
 
@@ -30,37 +30,37 @@ from ctid_cli.models.additive import AdditiveModel, Term, degrees_of, names_of
 from ctid_cli.signals.record import Record, as_records
 from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offset
 
-#: How starts were found.
+#: Methods by which starts were found.
 GROWN = "Submodels were found one after the other, the first over the whole range of the delay."
 GIVEN = f"The start was given. {GROWN}"
 
 
 @dataclass(frozen=True)
 class AdditiveOutputError(RecordsEstimator):
-    """The least output error of a sum of submodels, together with delay, initial state and offset.
+    """Output-error estimate of a sum of submodels, together with delay, initial state and offset.
 
     Parameters
     ----------
     terms : tuple of Term
         Degrees of the submodels.
     delay_bounds : tuple of float, default (0, 0)
-        Least and greatest delay [s]; two equal numbers are a known delay.
+        Least and greatest delay [s]; equal values fix the delay.
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record, as in ``delay_profile``.
     offset : {"none", "remove", "estimate", "drift"}, default "none"
         Offset of the output, as in ``delay_profile``.
     loss : {"squares", "huber", "tukey"}, default "squares"
-        What output errors count, as in ``delay_profile``.
+        Loss function of the output errors, as in ``delay_profile``.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for, as in ``delay_profile``.
+        Noise assumed for the standard errors, as in ``delay_profile``.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
     fixed : tuple of Fixed, optional
-        Parameters that are known, by their names ``g1_a1 ... g1_b0 ...``.
+        Known parameters, by their names ``g1_a1 ... g1_b0 ...``.
     input_before : float or "first", optional
         Constant input before the first sample, as in ``delay_profile``.
     noise_model : str, default "white"
-        Output noise that is estimated with the plant, as in ``delay_profile``.
+        Model of the output noise, estimated with the plant, as in ``delay_profile``.
 
     Raises
     ------
@@ -70,10 +70,10 @@ class AdditiveOutputError(RecordsEstimator):
     Notes
     -----
     The numerators are eliminated: the search is over the poles of the submodels and the delay, within the same set of
-    admissible poles as that of one transfer function. It starts at a given model, if there is one, and at sums that
-    grow: the best first submodel on a grid of frequencies, dampings and delays, beside it the best second one, and so
-    on, the lowest minima being refined at each step. Submodels of one structure are sorted by rising natural frequency,
-    unless parameters are known by their names.
+    admissible poles as for one transfer function. It starts from a given model, if any, and from sums that are extended
+    term by term: the best first submodel on a grid of frequencies, dampings and delays, then the best second one, and
+    so on, with the lowest minima refined at each step. Submodels of equal structure are sorted by natural frequency,
+    unless parameters are fixed by name.
     """
 
     kind: ClassVar[str] = "additive_output_error"
@@ -108,12 +108,12 @@ class AdditiveOutputError(RecordsEstimator):
 
     @property
     def poles(self) -> int:
-        """Number of poles, integrators included."""
+        """Number of poles, including integrators."""
         return degrees_of(self.terms)[0]
 
     @property
     def order(self) -> int:
-        """Number of poles, integrators included, as of one transfer function."""
+        """Number of poles, including integrators, as of one transfer function."""
         return self.poles
 
     @property
@@ -127,7 +127,7 @@ class AdditiveOutputError(RecordsEstimator):
         return sum(term.integrators for term in self.terms)
 
     def check_start(self, start: Start) -> None:
-        """Refuse a model with other submodels."""
+        """Raise DataError for a model with other submodels."""
         if start.model is not None:
             check_submodels(start.model, self.terms)
 
@@ -164,7 +164,7 @@ class AdditiveOutputError(RecordsEstimator):
         return self._of_submodels(measured, fit, method)._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     def _of_submodels(self, measured: MeasuredRecords, fit: MeasuredFit, method: str) -> SubmodelsFit:
-        """The fit with its submodels and the conditions at them."""
+        """Return the fit with its submodels and their consistency conditions."""
         size = sum(term.size for term in self.terms)
         additive = AdditiveModel.from_theta(fit.theta[:size], self.terms, fit.model.delay)
         consistency, interval = np.nan, measured.data[0].interval

@@ -34,14 +34,14 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
-#: Orders of the submodels that are tried to find the one that known parameters belong to.
+#: Largest number of orders of the submodels that are tried to match known parameters.
 MOST_ORDERS = 5040
 TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AdditiveFit(Fit):
-    """An estimated sum of submodels.
+    """Fit of a sum of submodels.
 
     Parameters
     ----------
@@ -50,12 +50,12 @@ class AdditiveFit(Fit):
     law, in_ignored_loop
         As in :class:`~ctid_cli.inference.fit.Fit`.
     additive : AdditiveModel
-        The estimate, its submodels by rising natural frequency. ``model`` is the same as one transfer function, and
+        Estimated sum, sorted by natural frequency. ``model`` is the equivalent single transfer function, and
         ``covariance`` that of the parameters of this sum.
     start : AdditiveModel
-        Where the iterations started.
+        Start of the iterations.
     start_method : str
-        How that start was found, in a sentence.
+        Origin of the start, as a sentence.
     loop_radius : float
         Largest magnitude of the poles of the sampled loop of the estimate with the controller [-]; NaN in open loop.
     """
@@ -67,11 +67,11 @@ class AdditiveFit(Fit):
 
     @property
     def parametrised(self) -> AdditiveModel:
-        """The model in the form that has the parameters."""
+        """Model in its parametrised form."""
         return self.additive
 
     def derived(self, level: float = 0.95) -> tuple[UncertainValue, ...]:
-        """Poles, natural frequencies, damping and static gains of the submodels.
+        """Return poles, natural frequencies, damping and static gains of the submodels.
 
         Parameters
         ----------
@@ -95,35 +95,35 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     Parameters
     ----------
     terms : tuple of Term
-        Degrees of the submodels; integrators in one of them at most.
+        Degrees of the submodels; at most one of them may have integrators.
     delay : float, default 0.0
         Known delay [s].
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` simulates the instruments in the noise-free loop of the model with the record's controller and
-        reference: needed for unbiased estimates where feedback brings coloured noise into the input. ``reference``
-        takes in their place what of the input follows the reference, where the controller is not known.
+        reference: needed for unbiased estimates if feedback brings coloured noise into the input. ``reference`` uses
+        the part of the input that is predicted from the reference, for an unknown controller.
     initial_state : {"rest", "estimated"}, default "rest"
         State at the first sample: at rest, or free responses to be estimated.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
-        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
-        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+        Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
+        (``robust``); ``bootstrap`` adds bootstrap-t intervals. ``auto`` is white if the residuals pass the Ljung-Box
+        test at the 5 % level, else robust, or none if the record is from a loop that the estimator ignores.
+        ``sandwich`` is an earlier name of ``robust``.
     max_iterations : int, default 100
         Largest number of iterations.
     tolerance : float, default 1e-8
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
     variant : {"relaxed", "plain", "guarded"}, default "relaxed"
-        ``plain`` takes full steps; ``relaxed`` shortens them where they do not settle; ``guarded`` never lets the
-        output-error cost rise, in open loop only.
+        ``plain`` takes full steps; ``relaxed`` shortens them if they do not converge; ``guarded``, in open loop only,
+        never increases the output-error cost.
     hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of what the other submodels leave of the output; changes the path, not the converged estimate.
-        Where the iteration does not converge it is run once more with the other one.
+        Interpolation of the output minus the other submodels; affects the iterations, not the converged estimate. If
+        the iteration does not converge, it is repeated with the other interpolation.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
     fixed : tuple of Fixed, optional
-        Parameters that are known, by their names: their rows and columns leave the equations. Submodels then keep the
-        order of ``terms``.
+        Known parameters, by their names, which are removed from the equations. Submodels then keep the order of
+        ``terms``.
 
     Raises
     ------
@@ -133,13 +133,13 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
     Notes
     -----
     ``beta+ = beta + [sum psi phi']^-1 sum psi eps`` with psi and phi as in :mod:`ctid_cli.filtering.submodels`. It is
-    the published iteration: there every submodel has a right-hand side ``sum psi y_f,i`` of its own and only the
-    diagonal blocks of the solution are kept; but ``y_f,i - phi_i' theta_i`` is the output error for every i, so all of
-    them change by the same vector. With one submodel it is SRIVC, in closed loop CLSRIVC.
+    equivalent to the published iteration, where every submodel has a separate right-hand side ``sum psi y_f,i`` and
+    only the diagonal blocks of the solution are kept: ``y_f,i - phi_i' theta_i`` is the output error for every i, so
+    that all submodels change by the same vector. With one submodel it is SRIVC, in closed loop CLSRIVC.
 
     In closed loop its solution is a root of ``sum psi eps``, not a minimum of the output-error cost.
 
-    It fails from a start far from the solution: natural frequencies wrong by more than about half.
+    It fails from a start far from the solution: with errors of natural frequencies above about 50 %.
 
     References
     ----------
@@ -186,7 +186,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         check_closed_loop(self.instruments, self.variant)
 
     def check_start(self, start: Start) -> None:
-        """Refuse a model with other submodels."""
+        """Raise DataError for a model with other submodels."""
         if start.model is not None:
             check_submodels(start.model, self.terms)
 
@@ -218,7 +218,7 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
         steps = Steps(self.max_iterations, self.tolerance, self.variant)
         if not problem.fixed:
             return estimate_submodels(replace(problem, terms=start.terms), start.theta, steps)
-        # From the start, and from what all parameters together would be.
+        # From the start, and from the estimate without fixed parameters.
         free = estimate_submodels(replace(problem, fixed={}), start.theta, steps).theta[: problem.size]
         near = [_nearest(theta, self.terms, problem.fixed) for theta in (free, start.theta)]
         found = [estimate_submodels(problem, theta, steps) for theta in near]
@@ -227,21 +227,21 @@ class AdditiveSrivc(Estimator["Submodels", AdditiveFit]):
 
 @dataclass(frozen=True, eq=False)
 class Submodels:
-    """A record laid out for a sum of submodels, and the start that it suggests."""
+    """Record prepared for a sum of submodels, and its automatic start."""
 
     record: Record
     problem: AdditiveProblem
 
     @cached_property
     def start(self) -> ModalStart:
-        """Found once, from the record alone."""
+        """Automatic start, computed once from the record."""
         return automatic_start(self.record, self.problem)
 
     def started(self, given: Start | None) -> ModalStart:
-        """The start, given or found.
+        """Return the given or the automatic start.
 
-        Its submodels rise in natural frequency, so that sums of submodels round the same in whatever order they were
-        given. Where parameters are known by name, submodels stay.
+        Its submodels are sorted by natural frequency, so that rounding does not depend on their order, unless
+        parameters are fixed by name.
         """
         found = self.start if given is None or given.model is None else ModalStart(given.model, "The start was given.")
         check_submodels(found.model, self.problem.terms)
@@ -249,7 +249,7 @@ class Submodels:
 
 
 def check_terms(terms: tuple[Term, ...]) -> None:
-    """Check that a sum has terms, and determines its parameters."""
+    """Check that a sum has terms and that its parameters are identifiable."""
     if not terms:
         raise OptionError("terms", "terms must list at least one submodel, for example {poles: 2, zeros: 0}")
     if sum(term.integrators > 0 for term in terms) > 1:
@@ -262,20 +262,20 @@ def check_terms(terms: tuple[Term, ...]) -> None:
 
 
 def check_submodels(start: AdditiveModel, terms: tuple[Term, ...]) -> None:
-    """Check that a start has the submodels of an estimator."""
+    """Raise DataError unless a start has the submodels of an estimator."""
     if start.terms != terms:
         wanted = f"not, in this order, {_terms_text(terms)}"
         raise DataError(f"the start has the submodels {_terms_text(start.terms)}, {wanted}")
 
 
 def _terms_text(terms: Sequence[Term]) -> str:
-    """Write the degrees of submodels as in a specification."""
+    """Return the degrees of submodels in the form of a specification."""
     parts = [{name: value for name, value in asdict(term).items() if value or name != "integrators"} for term in terms]
     return ", ".join(str(part).replace("'", "") for part in parts)
 
 
 def _nearest(theta: Array, terms: tuple[Term, ...], fixed: Mapping[int, float]) -> Array:
-    """Parameters with submodels of one structure exchanged so that the known ones are nearest to their values."""
+    """Return parameters with submodels of equal structure permuted so that fixed ones are nearest to their values."""
     parts = np.split(theta, np.cumsum([term.size for term in terms])[:-1])
     best, least = theta, np.inf
     for order in islice(permutations(range(len(terms))), MOST_ORDERS):

@@ -1,4 +1,4 @@
-"""Global estimation from measured records: a one-dimensional search over the delay, then the least output error."""
+"""Global estimation from measured records: one-dimensional search over the delay, then output-error minimisation."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -34,14 +34,14 @@ from ctid_cli.signals.treatment import InitialState, InputBefore, LossKind, Offs
 
 
 class Starts(NamedTuple):
-    """How many local searches were tried, and how many agree with the best of them."""
+    """Number of local searches, and number that agree with the best of them."""
 
     tried: int
     agree: int
 
 
 class Met(NamedTuple):
-    """A parameter at an end of its given bounds."""
+    """Parameter at a given bound."""
 
     name: str
     end: float
@@ -49,7 +49,7 @@ class Met(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFit(DeferredFields, Fit):
-    """A fit with what belongs to the records.
+    """Fit with data of its records.
 
     Parameters
     ----------
@@ -66,37 +66,37 @@ class MeasuredFit(DeferredFields, Fit):
     theta : ndarray, shape (p,)
         All free parameters, in the order of ``parameter_names``.
     initial_states : tuple of ndarray
-        Coefficients of C for each experiment; empty arrays where the state was not estimated.
+        Coefficients of C for each experiment; empty arrays if the state was not estimated.
     offsets : tuple of float
-        Output offset of each experiment [output unit]; what was subtracted, where means were removed.
+        Output offset of each experiment [output unit]; the subtracted mean if means were removed.
     input_offsets : tuple of float
-        Mean of the input that was subtracted [input unit]; 0 where none was.
+        Subtracted mean of the input [input unit]; 0 without.
     profile : Profile or None
-        The search over the delay; None where the delay is known.
+        Search over the delay; None for a known delay.
     residuals : tuple of ndarray
         Output errors at the used samples of each experiment [output unit].
     sensitivities : tuple of ndarray
         psi at the used samples of each experiment, shape (count, p).
     used : tuple of ndarray of bool
-        Which samples of each record were used, shape (N,).
+        Mask of the used samples of each record, shape (N,).
     starts : Starts or None
-        How many local searches there were, and how many of them came to the estimate.
+        Number of local searches, and number that reached the estimate.
     poles_at_infinity : int
-        How many of the poles asked for have run to infinity, so that the model has fewer.
+        Number of requested poles at infinity, by which the model has fewer poles.
     box : Box or None
-        The set of admissible models in which the estimate is the best.
+        Set of admissible models.
     weighting : Weighting or None
-        How much each sample counts, where the loss is not that of squares.
+        Weights of the samples, if the loss is not that of squares.
     held_poles : tuple of complex
-        Poles at a bound of that set [rad/s]; standard errors take them as known.
+        Poles at a bound of that set [rad/s], treated as known in the standard errors.
     tangent : ndarray, shape (p, f)
-        Directions in which the parameters could move: those of the identity unless poles or the delay are held.
+        Free directions of the parameters: columns of the identity unless poles or the delay are at a bound.
     known : tuple of str
-        Names of the parameters that were fixed.
+        Names of the fixed parameters.
     noise : NoiseEstimate or None
-        The noise model that was estimated with the plant; None of an output-error fit.
+        Noise model estimated with the plant; None for an output-error fit.
     bounds_met : tuple of Met
-        Parameters that the estimate has at an end of their given bounds, and these ends.
+        Parameters at a given bound, and these bounds.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("residuals", "sensitivities", "used")
@@ -122,21 +122,21 @@ class MeasuredFit(DeferredFields, Fit):
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
     ) -> Uncertainty:
-        """Standard errors and intervals for a kind of noise.
+        """Return standard errors and intervals for a kind of noise.
 
         Parameters
         ----------
         kind : {"auto", "white", "robust", "bootstrap"}, default "auto"
-            What the noise is taken for; ``auto`` is white unless the residuals are not.
+            Assumed noise; ``auto`` is white unless the residuals are not.
         draws : int, default 500
-            Simulated noise sequences of a bootstrap [-].
+            Number of simulated noise sequences of a bootstrap [-].
         progress : callable, optional
-            Told after each of them how many of how many are done.
+            Called after each sequence with the numbers of completed and of all sequences.
 
         Returns
         -------
         Uncertainty
-            Covariance, and how many standard errors intervals reach.
+            Covariance, and quantiles of the intervals.
         """
         linear = self.linear
         found = estimate_uncertainty(
@@ -145,19 +145,19 @@ class MeasuredFit(DeferredFields, Fit):
         return found.in_ignored_loop if self.in_ignored_loop and kind == "auto" else found
 
     def _with_uncertainty(self, kind: Covariance, draws: int) -> Self:
-        """The fit with errors for a kind of noise, singular where it converged to parameters that have none."""
+        """Return the fit with errors for a kind of noise; singular if it converged but has no covariance."""
         law = self.uncertainty(kind, draws)
         singular = self.status is Status.CONVERGED and not np.isfinite(law.free_covariance).all()
         return replace(self, covariance=law.covariance, law=law, status=Status.SINGULAR if singular else self.status)
 
     @property
     def signs_known(self) -> bool:
-        """Whether no coefficient of the denominator may be zero: it may be in a plant that is not stable."""
+        """Whether no coefficient of the denominator can be zero, which is true for stable plants."""
         return not (self.model.poles.real > 0).any()
 
     @property
     def linear(self) -> "MeasuredFit":
-        """The fit by least squares that has the same law: itself, or with pseudo-errors of its loss, or innovations."""
+        """Least-squares fit with the same distribution: itself, or with pseudo-errors of its loss, or innovations."""
         if self.noise is not None:
             return self._of_innovations
         if self.weighting is None:
@@ -169,7 +169,7 @@ class MeasuredFit(DeferredFields, Fit):
 
     @property
     def arma(self) -> ArmaNoise | None:
-        """The noise that was estimated with the plant."""
+        """Noise model estimated with the plant."""
         return None if self.noise is None else self.noise.noise
 
     @cached_property
@@ -181,16 +181,16 @@ class MeasuredFit(DeferredFields, Fit):
 
     @property
     def left_over(self) -> str:
-        """What the tests of residuals are of."""
+        """Name of the tested sequence."""
         return "residuals" if self.noise is None else "innovations"
 
     def prediction_fit(self, ahead: int) -> float:
-        """Fit of predictions of the outputs; without a noise model that of the simulated ones.
+        """Return the fit of predictions of the outputs; without a noise model that of simulated outputs.
 
         Parameters
         ----------
         ahead : int
-            How many samples old the latest output is that a prediction uses [-].
+            Prediction horizon in samples [-].
 
         Returns
         -------
@@ -212,16 +212,16 @@ class MeasuredFit(DeferredFields, Fit):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiInputFit(MeasuredFit):
-    """A fit to records with several inputs, whose model has a transfer function for each.
+    """Fit to records with several inputs, with one transfer function for each.
 
     Parameters
     ----------
     model : MultiInputModel
-        The transfer functions of the inputs.
+        Transfer functions of the inputs.
     parameter_names, covariance, status, cost, fit_percent, r2, count, iterations, condition_number, history, law
         As in :class:`MeasuredFit`.
     in_ignored_loop, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`MeasuredFit`; of the levels of the inputs those of all inputs of one record after the other.
+        As in :class:`MeasuredFit`; ``input_offsets`` has those of all inputs, record by record.
     poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`MeasuredFit`.
     """
@@ -230,7 +230,7 @@ class MultiInputFit(MeasuredFit):
 
     @property
     def coefficients(self) -> dict[str, float]:
-        """Coefficients and delays by name, delays that are known too."""
+        """Coefficients and delays by name, including known delays."""
         known = {f"{name}_delay": part.delay for name, part in self.model.parts.items()}
         return {n: v for n, v in self.parameters.items() if re.fullmatch(r"(.+_)?[ab]\d+", n)} | {
             n: self.parameters.get(n, v) for n, v in known.items()
@@ -252,7 +252,7 @@ class MultiInputFit(MeasuredFit):
         Raises
         ------
         DataError
-            If there is no such input.
+            If the input does not exist.
         """
         if name not in self.model.parts:
             raise DataError(f"there is no input {name!r}; there are {', '.join(self.model.parts)}")
@@ -260,13 +260,13 @@ class MultiInputFit(MeasuredFit):
         return InputFit.of(name, self.model.parts[name], self.parameter_names, law)
 
     def _estimated(self) -> Estimated:
-        """Refuse what asks for one transfer function."""
+        """Raise an error, since there is no single transfer function."""
         inputs = ", ".join(self.model.parts)
         raise UsageError(f"the model has the inputs {inputs}; take one of them, such as fit.of_input(NAME)")
 
 
 def _within(bounds: tuple[float, float] | None, delays: tuple[float, float]) -> tuple[float, float]:
-    """Return the range of a delay within bounds, if there are any."""
+    """Return the range of a delay restricted to optional bounds."""
     if bounds is None:
         return delays
     low, high = max(bounds[0], delays[0]), min(bounds[1], delays[1])
@@ -277,7 +277,7 @@ def _within(bounds: tuple[float, float] | None, delays: tuple[float, float]) -> 
 
 
 class FittedSamples(NamedTuple):
-    """What a fit says of each used sample of each record."""
+    """Signals of a fit at each used sample of each record."""
 
     residuals: tuple[Array, ...]
     sensitivities: tuple[Array, ...]
@@ -286,7 +286,7 @@ class FittedSamples(NamedTuple):
 
     @property
     def linear(self) -> "FittedSamples":
-        """Least squares of the same law: pseudo-errors, and samples that count for nothing as if they were missing."""
+        """Least squares with the same distribution: pseudo-errors, with samples of zero weight as missing."""
         if self.weighting is None:
             return self
         kept = [weights > 0.0 for weights in self.weighting.weights]
@@ -299,7 +299,7 @@ class FittedSamples(NamedTuple):
 
 
 class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
-    """What the estimators of records in open loop have in common."""
+    """Base class of the estimators of records in open loop."""
 
     initial_state: InitialState
     offset: Offset
@@ -316,7 +316,7 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
         *,
         nested: bool = False,
     ) -> MeasuredFit:
-        """Return the least output error from starts, robust or with a noise model as asked; without a covariance."""
+        """Return the optimum from starts for the given loss and noise model, without a covariance."""
         if self.loss != "squares":
             robust = robust_fit(measured, self.loss, starts, nested)
             return fitted(measured, robust.found, profile, robust)
@@ -327,22 +327,22 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
         return with_noise(measured, fit, found, self.noise_model, starts, nested=nested)
 
     def _simulated(self, fit: MeasuredFit, measured: MeasuredRecords) -> list[Array]:
-        """Return the outputs of a fit, less means that are removed, at the used samples of laid out records."""
+        """Return the outputs of a fit, without removed means, at the used samples of prepared records."""
         parts = sensitivities(measured.problem, measured.layout_of(fit.model), fit.theta, delays_of(fit.model))
         return [data.y_used - eps for data, (_, eps) in zip(measured.problem.records, parts, strict=True)]
 
-    # --- what a fit is judged by -----------------------------------------------------------------------
+    # --- diagnostics of a fit --------------------------------------------------------------------------
 
     def _acting(self, record: Record) -> Record:
-        """The record with what acts on the output from outside."""
+        """Return the record with its exogenous signal as input."""
         return record
 
     def _samples(self, fit: MeasuredFit, measured: Any) -> FittedSamples:
-        """What a fit says of each used sample, from its parameters."""
+        """Return the signals of a fit at each used sample, from its parameters."""
         return samples_at(measured, fit.model, fit.theta, None if fit.weighting is None else fit.weighting.losses)
 
     def _applied(self, fit: MeasuredFit, measured: Any) -> AppliedModel:
-        """The model on another record."""
+        """Return the model applied to another record."""
         inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else [""]
         if list(measured.degrees.inputs) != inputs:
             given = ", ".join(filter(None, measured.degrees.inputs)) or "one input"
@@ -355,20 +355,20 @@ class RecordsEstimator(Estimator[MeasuredRecords, MeasuredFit]):
 
 @dataclass(frozen=True)
 class InputModel:
-    """What the transfer function of one of several inputs has of its own; None is as the estimator has it for all.
+    """Options of one of several inputs; None takes the option of the estimator.
 
     Parameters
     ----------
     name : str
         Name of the input.
     poles : int, optional
-        Poles of a denominator of its own; where one input has these, none share a denominator.
+        Number of poles of a separate denominator; if any input has one, all denominators are separate.
     zeros : int, optional
-        Degree of its numerator.
+        Degree of the numerator.
     delay_bounds : tuple of float, optional
-        Least and greatest delay [s]; two equal numbers are a known delay.
+        Least and greatest delay [s]; equal values fix the delay.
     integrators : int, optional
-        Poles at the origin of a denominator of its own.
+        Poles at the origin of a separate denominator.
     """
 
     name: str
@@ -380,60 +380,60 @@ class InputModel:
 
 @dataclass(frozen=True)
 class DelayProfile(RecordsEstimator):
-    """Global search over the delay, refined on the output-error cost together with initial state and offset.
+    """Global search over the delay, refined by output-error minimisation with initial state and offset.
 
     Parameters
     ----------
     poles : int
         Degree of the denominator, 1 to 12.
     zeros : int
-        Degree of the numerator, below ``poles``; equal to ``poles`` only where the delay is known.
+        Degree of the numerator, below ``poles``; equal to ``poles`` only for a known delay.
     delay_bounds : tuple of float
-        Least and greatest delay [s]; two equal numbers are a known delay.
+        Least and greatest delay [s]; equal values fix the delay.
     initial_state : {"rest", "estimate", "periodic"}, default "rest"
         State before the record: at rest (zero input before the first sample), estimated with the model, or the steady
-        state of an input that repeats the record for ever.
+        state of a periodic input whose period is the record.
     offset : {"none", "remove", "estimate", "drift"}, default "none"
         Offset of the output: none, means of input and output subtracted first, or a constant estimated with the model;
-        ``drift`` estimates a slope besides [output unit/s], the offset being that at the first instant.
+        ``drift`` also estimates a slope [output unit/s], with the offset at the first instant.
     loss : {"squares", "huber", "tukey"}, default "squares"
-        What output errors count: their squares; their squares up to 1.345 standard deviations and their sizes beyond
-        (Huber); or nothing from 4.685 standard deviations on (Tukey's biweight), for records with outliers.
+        Loss function of the output errors: squares; quadratic up to 1.345 standard deviations and linear beyond
+        (Huber); or constant beyond 4.685 standard deviations (Tukey's biweight), for records with outliers.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the starts [rad/s]; by default from the bandwidth of the output.
     nested : bool, default False
-        Whether the smaller models that the structure contains are fitted too, and random starts drawn: slower, but the
-        cost then never rises with the number of poles or zeros. Else only the minima of the profile are refined.
+        Whether nested smaller models are fitted too, and random starts used: slower, but the cost then never increases
+        with the number of poles or zeros. Otherwise only the minima of the profile are refined.
     hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of the measured output between samples; does not change the estimate.
+        Interpolation of the measured output between samples; does not affect the estimate.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
-        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
-        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+        Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
+        (``robust``); ``bootstrap`` adds bootstrap-t intervals. ``auto`` is white if the residuals pass the Ljung-Box
+        test at the 5 % level, else robust, or none if the record is from a loop that the estimator ignores.
+        ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
     fixed : tuple of Fixed, optional
-        Parameters that are known, by their names ``a1 ... an, b0 ... bm``. The estimate is the least output error of
-        the admissible models that have them. A known delay is given in ``delay_bounds``.
+        Known parameters, by their names ``a1 ... an, b0 ... bm``. The estimate has the least output error of the
+        admissible models with these values. A known delay is given in ``delay_bounds``.
     integrators : int, default 0
-        Poles at the origin besides ``poles``, which may then be 0: the model is ``B/(p^l A)``, and the last l
-        coefficients of its denominator are known to be zero. An estimated offset is then that of the input too: powers
-        of time up to l, of which an estimated initial state has all but the last.
+        Poles at the origin in addition to ``poles``, which may then be 0: the model is ``B/(p^l A)``, and the last l
+        coefficients of its denominator are zero. An estimated offset then includes that of the input: powers of time up
+        to l, of which an estimated initial state contains all except the last.
     input_before : float or "first", optional
         Constant input before the first sample [input unit], with which the system is at rest, or "first" for the first
         value of each record; None is zero. It is subtracted from the input.
     noise_model : str, default "white"
         ``arma:P,Q``, or ``auto`` for the orders up to 3 of least BIC, estimates the output noise ``C(q)/D(q) e`` with
-        P coefficients of D and Q of C together with the plant, by maximum likelihood; all records share it.
+        P coefficients of D and Q of C together with the plant, by maximum likelihood; it is common to all records.
     inputs : tuple of InputModel, optional
-        What differs between the inputs of records that have several. They share the denominator unless these have poles
-        of their own, and poles, zeros, range of the delay and integrators unless these say otherwise. Parameters are
-        named ``u1_b0``, ``u1_delay`` and, of own denominators, ``u1_a1``, for an input u1.
+        Separate options of inputs of records with several. Without poles here, all inputs have a common denominator;
+        other options apply to all inputs unless given here. Parameters are named ``u1_b0``, ``u1_delay`` and, for
+        separate denominators, ``u1_a1``, for an input u1.
     bounds : tuple of Bound, optional
-        Bounds of coefficients, and of the gain, time constant or damping of a small model. Where the least cost is
-        outside, the estimate is the least with the parameter at the bound: its status says so, and the parameter has no
-        standard error.
+        Bounds of coefficients, and of the gain, time constant or damping of a small model. If the least cost violates
+        one, the estimate is the least with the parameter at the bound, with a corresponding status and without a
+        standard error of the parameter.
 
     Raises
     ------
@@ -442,23 +442,23 @@ class DelayProfile(RecordsEstimator):
 
     Notes
     -----
-    The cost, minimised over everything but the delay, is computed on a grid whose spacing is a quarter period of the
-    highest frequency that matters in the output (95 % of its power), so that no basin is missed. Where the filters of
-    ``search`` can be used, long grids are searched from coarse to fine: behind a filter of a third of that bandwidth
-    three times fewer delays do, and the next level looks around the best of them only. The best local minima are
-    refined jointly in all parameters on every sample, and the lowest is kept: no start has to be given.
+    The cost, minimised over all parameters except the delay, is computed on a grid with a spacing of a quarter period
+    of the highest significant frequency of the output (95 % of its power), so that no basin is missed. If possible,
+    long grids are searched from coarse to fine: a low-pass filter with a third of that bandwidth needs a third of the
+    delays, and the next level searches only around the best of them. The best local minima are refined jointly in all
+    parameters on all samples, and the lowest is kept: no start is required.
 
-    Without bounds the least cost need not exist: with an undamped pole a free initial state fits noise, ever better.
-    Where the state is estimated, poles have magnitudes of at least the reciprocal of the record's length, and pairs a
-    damping of at least .001; at rest these bounds are 1e-4 of that and 1e-5, under a periodic input 1e-2 of that and
-    1e-5. No pole is faster than ten over the sampling interval. The status says whether the estimate lies at such a
-    bound, and ``box`` has them.
+    Without bounds the least cost need not exist: with an undamped pole a free initial state can fit noise without
+    limit. With an estimated state, poles have magnitudes of at least the reciprocal of the record's length, and pairs a
+    damping of at least .001; at rest these bounds are 1e-4 of that and 1e-5, with a periodic input 1e-2 of that and
+    1e-5. No pole is faster than ten over the sampling interval. The status shows an estimate at such a bound, and
+    ``box`` contains the bounds.
 
-    Outliers ruin least squares. Both other losses are 95 % efficient where the noise is normal and has none. Huber's
-    bounds what an outlier can do, Tukey's forgets the gross ones, on which one-sided ones leave no mark; it starts
-    from the estimate by Huber's. The standard deviation is that of the median absolute error of each record. With
-    ``offset`` "remove" the means are those of the record without samples far from their neighbours; "estimate" leaves
-    them to the loss too.
+    Least squares is sensitive to outliers. Both other losses are 95 % efficient for normal noise without outliers.
+    Huber's loss bounds the influence of outliers, Tukey's rejects gross ones, so that one-sided outliers cause no bias;
+    it starts from Huber's estimate. The standard deviation is from the median absolute error of each record. With
+    ``offset`` "remove" the means exclude samples far from their neighbours; "estimate" applies the loss to the offset
+    too.
     """
 
     kind: ClassVar[str] = "delay_profile"
@@ -497,11 +497,11 @@ class DelayProfile(RecordsEstimator):
         if len(set(names)) < len(names):
             raise OptionError("inputs", f"each input must be given once; got {', '.join(names)}")
         for one in self.inputs or ():
-            # Each number by itself, as if it were that of the only input.
+            # Check the options of each input as those of a single input.
             self._alone(one)
         if not self.inputs:
             self._check_zeros(self.zeros, self.order, low == high)
-        # Names are made of degrees that make sense only; of several inputs once these are known.
+        # Parameter names require valid degrees; with several inputs, also the names of the inputs.
         if self.fixed and not self.inputs and not any("_" in one.name for one in self.fixed):
             self._known(("",))
         if self.bounds and (self.loss != "squares" or self.noise_model != "white"):
@@ -510,7 +510,7 @@ class DelayProfile(RecordsEstimator):
             self._quantities(("",))
 
     def _quantities(self, names: tuple[str, ...]) -> list[Quantity]:
-        """Return what is bounded, for inputs of some names."""
+        """Return the bounded quantities for given input names."""
         bounds = [one for one in self.bounds or () if not is_delay(one.name)]
         found = quantities_of(bounds, self._degrees(names, free=False))
         integrating = self.integrators or any(one.integrators for one in self.inputs or ())
@@ -522,7 +522,7 @@ class DelayProfile(RecordsEstimator):
         return found
 
     def _alone(self, one: InputModel) -> "DelayProfile":
-        """Return the estimator of one of several inputs by itself."""
+        """Return the single-input estimator for the options of one input."""
         own = {name: value for name, value in vars(one).items() if name != "name" and value is not None}
         try:
             return replace(self, inputs=None, fixed=None, bounds=None, **own)
@@ -530,7 +530,7 @@ class DelayProfile(RecordsEstimator):
             raise OptionError(error.field, f"input {one.name}: {error}") from None
 
     def _check_zeros(self, zeros: int, order: int, known: bool) -> None:
-        """Refuse numerators of too high a degree."""
+        """Raise OptionError for a numerator degree that is too high."""
         allowed = order if known else order - 1
         if zeros > allowed:
             reason = "" if known else " while the delay is estimated"
@@ -538,7 +538,7 @@ class DelayProfile(RecordsEstimator):
             raise OptionError("zeros", f"zeros must be at most {allowed}{reason}: {given}")
 
     def _each(self, names: Sequence[str]) -> list["DelayProfile"]:
-        """Return the estimator of each input by itself."""
+        """Return the single-input estimator of each input."""
         unknown = [one.name for one in self.inputs or () if one.name not in names]
         if unknown:
             raise OptionError(
@@ -548,7 +548,7 @@ class DelayProfile(RecordsEstimator):
         return [self.of_input(name) for name in names]
 
     def of_input(self, name: str) -> "DelayProfile":
-        """Return the estimator of one of several inputs by itself.
+        """Return the single-input estimator of one of several inputs.
 
         Parameters
         ----------
@@ -558,12 +558,12 @@ class DelayProfile(RecordsEstimator):
         Returns
         -------
         DelayProfile
-            Its options, without parameters that are fixed or bounded.
+            Its options, without fixed or bounded parameters.
         """
         return self._alone(next((one for one in self.inputs or () if one.name == name), InputModel(name)))
 
     def _known(self, names: tuple[str, ...]) -> dict[int, float]:
-        """Return the values of the fixed parameters by their places, for inputs of some names."""
+        """Return the values of the fixed parameters by their indices, for given input names."""
         degrees = self._degrees(names, free=False)
         known = places_of(self.fixed, degrees.names)
         check_stable(known, degrees)
@@ -571,11 +571,11 @@ class DelayProfile(RecordsEstimator):
 
     @property
     def common(self) -> bool:
-        """Whether several inputs share a denominator."""
+        """Whether several inputs have a common denominator."""
         return all(one.poles is None and one.integrators is None for one in self.inputs or ())
 
     def _degrees(self, names: tuple[str, ...], *, free: bool = True) -> Degrees:
-        """Return the degrees for inputs of some names; if not free, without integrators and delays."""
+        """Return the degrees for given input names; if not ``free``, without integrators and delays."""
         each = self._each(names)
         blocks = each[:1] if self.common else each
         return Degrees(
@@ -588,7 +588,7 @@ class DelayProfile(RecordsEstimator):
 
     @property
     def order(self) -> int:
-        """Number of poles, integrators included."""
+        """Number of poles, including integrators."""
         return self.poles + self.integrators
 
     def _lay_out(self, records: Record | Sequence[Record]) -> MeasuredRecords:
@@ -618,7 +618,7 @@ class DelayProfile(RecordsEstimator):
         if self.bounds:
             return self._within_bounds(measured)._with_uncertainty(self.covariance, self.bootstrap_draws)
         if measured.degrees.several:
-            # Several inputs are searched by themselves first.
+            # Each of several inputs is searched separately first.
             fit = self._least(measured, [], nested=True)
             return fit._with_uncertainty(self.covariance, self.bootstrap_draws)
         for minima, profile in search_delay(measured, self.svf_cutoff, self.nested):
@@ -645,9 +645,9 @@ class DelayProfile(RecordsEstimator):
         return replace(fit, tangent=tangent, status=status, bounds_met=met)
 
     def _refine(self, records: Sequence[Record], *near: Begin) -> MeasuredFit:
-        """Return the least output error in the basins of denominators, without their integrators, and delays.
+        """Return the optimum in the basins of denominators, without their integrators, and delays.
 
-        It has no covariance.
+        The result has no covariance.
         """
         measured = self._lay_out(records)
         found = measured.local(*near)
@@ -663,7 +663,7 @@ def fitted(
     profile: Profile | None,
     robust: RobustFit | None,
 ) -> MeasuredFit:
-    """The result of a refinement, but for its covariance."""
+    """Return the result of a refinement, without its covariance."""
     layout, theta = measured.parameters(found)
     model = measured.model(found)
     samples = samples_at(measured, model, theta, None if robust is None else robust.losses)
@@ -714,7 +714,7 @@ def with_noise(
     *,
     nested: bool = False,
 ) -> MeasuredFit:
-    """Plant and noise of the greatest likelihood, with an output-error fit beside them."""
+    """Return the maximum-likelihood fit of plant and noise, with an output-error fit for comparison."""
     joint = joint_optimum(measured, found, orders_of(noise_model), starts, nested=nested)
     fit = fitted(measured, replace(joint.found, tried=found.tried, agree=found.agree), beside.profile, None)
     law = beside.uncertainty("robust")
@@ -742,29 +742,29 @@ def with_noise(
 def samples_at(
     measured: MeasuredRecords, model: AnyModel, theta: Array, losses: Sequence[Loss] | None
 ) -> FittedSamples:
-    """The samples of the records at an estimate, whose losses are those of squares where none are given."""
+    """Return the signals of an estimate at the used samples; the default loss is that of squares."""
     layout = measured.layout_of(model)
     psi, errors = zip(*sensitivities(measured.problem, layout, theta, delays_of(model)), strict=True)
     used = measured.used()
     if losses is None:
         return FittedSamples(errors, psi, used, None)
-    # Outliers are bridged where sensitivities are computed; here they are what was measured.
+    # Sensitivities are computed with interpolated outliers; the errors here are from measured outputs.
     each = zip(measured.outputs, measured.problem.records, errors, strict=True)
     errors = tuple(y - (data.y_used - eps) for y, data, eps in each)
     return FittedSamples(errors, psi, used, weighted(losses, errors, layout.size))
 
 
 def _given(layout: Layout, measured: MeasuredRecords) -> BoolArray:
-    """Which parameters are known."""
+    """Return the mask of known parameters."""
     fixed = np.zeros(layout.size, dtype=bool)
-    # Poles that have run to infinity are missing among the first coefficients.
+    # Poles at infinity are missing among the first coefficients.
     given = measured.given[measured.degrees.poles - layout.degrees.poles :]
     fixed[: given.size] = given
     return fixed
 
 
 def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
-    """Directions along which no known parameter changes and neither a pole nor the delay leaves the admissible set."""
+    """Return the directions that preserve known parameters and keep poles and delays in the admissible set."""
     degrees, fixed = layout.degrees, fixed.copy()
     for k in found.delays_at_bound:
         fixed[degrees.delay(k)] = True
@@ -777,7 +777,7 @@ def _tangent(layout: Layout, found: Optimum, fixed: BoolArray) -> Array:
 
 
 def check_treatment(options: RecordsEstimator) -> None:
-    """Refuse what does not go together in the treatment of records."""
+    """Raise OptionError for incompatible options of the treatment of records."""
     if options.noise_model != "white" and options.loss != "squares":
         raise OptionError(
             "noise_model", f"noise_model goes with loss squares, not {options.loss}: outliers have no ARMA model"
@@ -804,7 +804,7 @@ def check_treatment(options: RecordsEstimator) -> None:
 
 
 def check_clocks(records: Sequence[Record]) -> None:
-    """Refuse clocks on which an ARMA noise has no meaning."""
+    """Refuse irregular clocks, on which an ARMA noise is undefined."""
     for record in records:
         if record.interval is None:
             raise DataError(
@@ -814,13 +814,13 @@ def check_clocks(records: Sequence[Record]) -> None:
 
 
 def check_positive(name: str, value: float) -> None:
-    """Refuse a coefficient of a denominator that no stable model has."""
+    """Refuse a denominator coefficient that is impossible for stable models."""
     if not value > 0:
         raise OptionError("fixed", f"fixed {name} must be above zero, as in every stable model; got {value:g}")
 
 
 def check_stable(known: Mapping[int, float], degrees: Degrees) -> None:
-    """Refuse denominators that no stable model has."""
+    """Refuse unstable denominators."""
     for place, value in known.items():
         if place < degrees.poles:
             check_positive(degrees.names[place], value)

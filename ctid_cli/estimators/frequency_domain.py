@@ -1,4 +1,4 @@
-"""One transfer function by least squares from a measured frequency response."""
+"""Least-squares estimation of a transfer function from a measured frequency response."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from ctid_cli.inference.sensitivities import Structure
 from ctid_cli.inference.uncertainty import DRAWS, Covariance, Progress, Uncertainty
 from ctid_cli.signals.frequency_data import FrequencyData
 
-#: Residuals that exceed the given standard errors by chance less often than this count as larger.
+#: p-value below which residuals count as larger than the given standard errors.
 MISFIT = 0.01
-#: Share of the weighted values' squares below which residuals are rounding.
+#: Share of the squared weighted values below which residuals are rounding.
 ROUNDING = 1e-14
-#: Options of a record in time.
+#: Options of records in the time domain.
 OF_RECORDS = ("initial_state", "offset", "loss", "input_before", "noise_model", "inputs")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrequencyDomainFit(MeasuredFit):
-    """A fit to a measured frequency response.
+    """Fit to a measured frequency response.
 
     Parameters
     ----------
@@ -40,12 +40,12 @@ class FrequencyDomainFit(MeasuredFit):
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; a sample is a weighted real or imaginary part,
         and means are not subtracted in ``fit_percent`` and ``r2``.
     history, theta, initial_states, offsets, input_offsets, profile, residuals, sensitivities, used, starts
-        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` has the real parts of all lines, then
-        the imaginary ones.
+        As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`; ``used`` refers to the real parts of all lines,
+        then the imaginary parts.
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     data : FrequencyData
-        The frequency response.
+        Frequency response.
     """
 
     data: FrequencyData = field(kw_only=True)
@@ -53,21 +53,21 @@ class FrequencyDomainFit(MeasuredFit):
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
     ) -> Uncertainty:
-        """Standard errors and intervals.
+        """Return standard errors and intervals.
 
         Parameters
         ----------
         kind : {"auto", "white", "robust"}, default "auto"
-            ``white`` takes the errors of lines as independent: by the standard errors of the data, or by the residuals
-            of each line where these are larger or the standard errors estimates themselves; ``robust`` takes those of
-            neighbouring lines as correlated, which ``auto`` does where the data say so or the residuals are.
+            ``white`` assumes independent errors of lines, from the standard errors of the data, or from the residuals
+            of each line if these are larger or the standard errors are estimates; ``robust`` assumes correlated errors
+            of neighbouring lines, as does ``auto`` if the data are marked so or the residuals are correlated.
         draws, progress
-            Not used: there is no bootstrap.
+            Unused: there is no bootstrap.
 
         Returns
         -------
         Uncertainty
-            Covariance, and how many standard errors intervals reach.
+            Covariance, and quantiles of the intervals.
         """
         psi, e = self.sensitivities[0] @ self.tangent, self.residuals[0]
         if kind == "robust" or (kind == "auto" and self.correlated):
@@ -79,8 +79,7 @@ class FrequencyDomainFit(MeasuredFit):
             return Uncertainty("white", self.tangent, np.full((psi.shape[1],) * 2, np.nan), e.size)
         if self.errors_known:
             return Uncertainty("white", self.tangent, inverse[0] * np.outer(inverse[1], inverse[1]), np.inf)
-        # With the squared residual of each part over its expectation any variance over frequency is allowed (HC2 of
-        # MacKinnon and White, 1985).
+        # Squared residuals over their expectation allow any variance over frequency (HC2, MacKinnon and White, 1985).
         scaled = psi * inverse[1]
         leverage = np.einsum("ki,ij,kj->k", scaled, inverse[0], scaled)
         weighed = scaled * (e / np.sqrt(np.maximum(1.0 - leverage, 1e-12)))[:, None]
@@ -88,30 +87,30 @@ class FrequencyDomainFit(MeasuredFit):
 
     @property
     def correlated(self) -> bool:
-        """Whether errors of neighbouring lines are correlated, by what the data say or by the residuals."""
+        """Whether errors of neighbouring lines are correlated, according to the data or the residuals."""
         return self.data.correlated or not self.white
 
     @property
     def white(self) -> bool:
-        """Whether residuals over frequency pass as uncorrelated; of exact values they are rounding."""
+        """Whether residuals over frequency pass as uncorrelated, or are rounding errors of exact values."""
         return self.r2 > 1.0 - ROUNDING or all_white(np.split(self.residuals[0], [self.data.frequencies.size]))
 
     @property
     def errors_known(self) -> bool:
-        """Whether the data have standard errors that the residuals agree with and that are no estimates."""
+        """Whether the data have known, not estimated, standard errors that agree with the residuals."""
         return self.misfit_p_value >= MISFIT and self.data.freedom == np.inf
 
     @property
     def excess(self) -> float:
-        """Variance of the residuals over that of the data's standard errors [-]."""
+        """Variance of the residuals relative to the standard errors of the data [-]."""
         return float(self.cost * self.count / max(self.count - self.tangent.shape[1], 1))
 
     @property
     def misfit_p_value(self) -> float:
-        """Probability of residuals as large as these by the data's standard errors; NaN where it is not known [-].
+        """p-value of the residuals under the standard errors of the data [-]; NaN if unknown.
 
-        Over an estimated variance of d degrees of freedom the squared error of a line has the F-distribution of 2 and
-        2 d of them.
+        Divided by an estimated variance with d degrees of freedom, the squared error of a line has the F-distribution
+        with 2 and 2 d degrees of freedom.
         """
         spare, d = max(self.count - self.tangent.shape[1], 1), self.data.freedom
         if self.data.standard_error is None or d <= 2.0:
@@ -122,12 +121,12 @@ class FrequencyDomainFit(MeasuredFit):
         return float(normal_tail((self.excess - d / (d - 1.0)) / np.sqrt(variance)))
 
     def leave_out(self, fill: Callable[[], Mapping[str, Any]]) -> None:
-        """Forget what belongs to single lines; it is computed from the data, which are kept."""
+        """Delete the values of single lines, which can be recomputed from the data."""
         measured = _laid_out(self, self.data)
         super().leave_out(lambda: samples_at(measured, self.model, self.theta, None)._asdict())
 
     def answers(self, frequencies: Array) -> ComplexArray:
-        """Values of the model as those of the data are: ``G(jw)``, or of samples.
+        """Return the response of the model in the form of the data: ``G(jw)``, or that of samples.
 
         Parameters
         ----------
@@ -149,7 +148,7 @@ class FrequencyDomainFit(MeasuredFit):
 
 
 def _laid_out(fit: FrequencyDomainFit, data: FrequencyData) -> MeasuredLines:
-    """Lay lines out for the structure of a fit."""
+    """Return the lines prepared for the structure of a fit."""
     integrators = int(np.count_nonzero(np.cumsum(fit.model.denominator[::-1]) == 0.0))
     zeros = sum(name.startswith("b") for name in fit.parameter_names) - 1
     structure = Structure(fit.model.order, zeros, "delay" in fit.parameter_names)
@@ -165,11 +164,11 @@ class FrequencyDomain(DelayProfile):
     poles, zeros, fixed, integrators, bounds
         As in :class:`~ctid_cli.estimators.delay_profile.DelayProfile`.
     delay_bounds : tuple of float, default (0.0, 0.0)
-        Least and greatest delay [s]; two equal numbers are a known delay.
+        Least and greatest delay [s]; equal values fix the delay.
     initial_state, offset, loss, input_before, noise_model, inputs
-        Of records in time: for a frequency response they keep their defaults.
+        For records in the time domain only: must keep their defaults.
     svf_cutoff, nested, hold_output, covariance, bootstrap_draws
-        Not used: smaller models are always fitted too, and standard errors are those of the lines.
+        Unused: smaller models are always fitted too, and standard errors are those of the lines.
 
     Raises
     ------
@@ -178,9 +177,9 @@ class FrequencyDomain(DelayProfile):
 
     Notes
     -----
-    Minimised is ``sum |W_k (G_k - B/A exp(-j w_k tau))|^2``, W the reciprocal of the standard error or the weight of
-    the data, with the sampled response of the model in the place of ``B/A`` for values of samples. Poles are searched
-    from 1e-4 of the least to 1e2 times the greatest frequency; of samples no faster than ten over the interval.
+    The cost is ``sum |W_k (G_k - B/A exp(-j w_k tau))|^2``, with W the reciprocal of the standard error or the weight
+    of the data, and with the sampled response of the model instead of ``B/A`` for sampled responses. Poles are searched
+    from 1e-4 of the least to 1e2 times the greatest frequency; for sampled responses at most ten over the interval.
 
     Examples
     --------
@@ -195,9 +194,9 @@ class FrequencyDomain(DelayProfile):
     delay_bounds: tuple[float, float] = (0.0, 0.0)
 
     def prepare(self, record: Any) -> Prepared[MeasuredRecords, MeasuredFit]:
-        """Check a frequency response and lay it out; a DataError says why nothing can be estimated.
+        """Check and prepare a frequency response; a DataError states why estimation is impossible.
 
-        A record is laid out for the model to be applied to it.
+        A record is prepared for applying a model to it.
         """
         if not isinstance(record, FrequencyData):
             return super().prepare(record)
@@ -221,7 +220,7 @@ class FrequencyDomain(DelayProfile):
 
 
 def fit_of(measured: MeasuredLines, optimum: Optimum) -> FrequencyDomainFit:
-    """Return the fit that an optimum is, with its standard errors."""
+    """Return the fit of an optimum with its standard errors."""
     return with_data(fitted(measured, optimum, None, None), measured)
 
 

@@ -1,4 +1,4 @@
-"""A fit to measured records with everything that tells whether to believe it."""
+"""Fit to measured records with its uncertainty and diagnostics."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -37,18 +37,18 @@ from ctid_cli.signals.checks import require_integer
 from ctid_cli.signals.record import Record, common_samples
 from ctid_cli.text import Shown
 
-#: Estimators of measured records, and records as each of them lays them out.
+#: Estimators of measured records, and their prepared records.
 Options = DelayProfile | Rivc | AdditiveOutputError | MeasuredSubmodels | LoopOutputError | FrequencyDomain
 LaidOut = MeasuredRecords | LaidOutSubmodels | LaidOutLoop
 #: Confidence level of intervals and tests.
 LEVEL = 0.95
-#: Delays about the estimate at which its cost is computed to be drawn, and how far: in half-widths of the interval.
+#: Plot of the cost: number of delays about the estimate, and half-range in half-widths of the interval.
 DRAWN_DELAYS, DRAWN_INTERVALS = 24, 2.5
 
 
 @dataclass(frozen=True, eq=False)
 class Validation(DeferredFields):
-    """The model on another record."""
+    """Result of a model on another record."""
 
     deferred: ClassVar[tuple[str, ...]] = ("record", "applied")
 
@@ -60,11 +60,11 @@ class Validation(DeferredFields):
     #: ``1 - ||y - x||^2 / ||y - mean y||^2`` [-].
     r2: float
     count: int
-    #: Treatment of state and offset, where it was chosen for this record.
+    #: Treatment of state and offset, if it was chosen for this record.
     options: DelayProfile | AdditiveOutputError | None = None
 
     def prediction_fit(self, noise: NoiseEstimate, ahead: int) -> float:
-        """Return ``100 (1 - ||y - p|| / ||y - mean y||)`` of predictions p from outputs that are some samples old."""
+        """Return ``100 (1 - ||y - p|| / ||y - mean y||)`` of predictions p with horizon ``ahead`` [samples]."""
         y = self.record.y[self.applied.used[0]]
         (errors,) = noise.prediction_errors(self.applied.residuals, self.applied.used, ahead)
         return fit_percent(y, y - errors)
@@ -77,15 +77,15 @@ class Identification(DeferredFields, FittedModel, Shown):
     Parameters
     ----------
     options : DelayProfile, AdditiveOutputError, MeasuredSubmodels, LoopOutputError or FrequencyDomain
-        What was asked for.
+        Estimator.
     fit : MeasuredFit, MultiInputFit, SubmodelsFit, LoopFit or FrequencyDomainFit
-        The estimate.
+        Estimate.
     answer : ResponseTest
-        Whether the outputs are seen to answer to the inputs at all; without it no parameter has a standard error.
+        Test of the response of the outputs to the inputs; without a response no parameter has a standard error.
     estimates : tuple of UncertainValue
-        The parameters with their uncertainty.
+        Parameters with their uncertainty.
     delay_interval : DelayInterval or None
-        Profile-likelihood interval of the delay, where the quadratic one is doubtful.
+        Profile-likelihood interval of the delay, if the quadratic one is doubtful.
     derived : tuple of UncertainValue
         Poles, time constants, frequencies, damping, static gain.
     tests : tuple of ResidualTests
@@ -95,13 +95,13 @@ class Identification(DeferredFields, FittedModel, Shown):
     yic, r_t_squared : float
         Young's criterion and coefficient of determination [-].
     warnings : tuple of str
-        What the user should know before using the model, one sentence or more each.
+        Limitations of the model, one or more sentences each.
     validation : Validation or None
-        The model on another record.
+        Result on another record.
     records : tuple of Record
-        What it was estimated from.
+        Records of the estimation.
     choices : tuple of str
-        What was chosen where nothing was given, and why, one sentence each.
+        Automatic choices and their reasons, one sentence each.
     """
 
     deferred: ClassVar[tuple[str, ...]] = ("records",)
@@ -131,26 +131,26 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name, those that are known included."""
+        """Values of the parameters by name, including known ones."""
         return {item.name: item.estimate for item in self.estimates}
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard errors of the parameters by name; NaN where there is none."""
+        """Standard errors of the parameters by name; NaN without one."""
         return {item.name: item.standard_error for item in self.estimates}
 
     def validate(self, record: Record) -> Validation:
-        """Judge the model on another record of the same system.
+        """Validate the model on another record of the same system.
 
         Parameters
         ----------
         record : Record
-            A record that the model was not estimated from.
+            Record that was not used for the estimation.
 
         Returns
         -------
         Validation
-            Its fit, with the treatment of state and offset that the model was estimated with.
+            Fit of the model, with the treatment of state and offset of the estimation.
 
         Raises
         ------
@@ -161,18 +161,18 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     @property
     def uncertainty(self) -> Uncertainty:
-        """Covariance that the standard errors are from, and how many of them intervals reach."""
+        """Covariance of the standard errors, and quantiles of the intervals."""
         assert self.fit.law is not None
         return self.fit.law
 
     @property
     def seen_in_validation(self) -> int:
-        """How many samples of the validation record the model was estimated from."""
+        """Number of samples of the validation record that were used for the estimation."""
         return 0 if self.validation is None else common_samples(self.validation.record, self.records)
 
     @property
     def errors_sentence(self) -> str:
-        """What the standard errors hold for, and how intervals follow from them."""
+        """Assumptions of the standard errors, and construction of the intervals, as a sentence."""
         found, what = self.uncertainty, self.fit.left_over
         if not self.answer.seen:
             return "There are no standard errors, as no answer to the input is seen."
@@ -197,25 +197,25 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     @property
     def driver(self) -> str:
-        """What residuals are tested against: the input, or the reference of a loop."""
+        """Signal against which residuals are tested: the input, or the reference of a loop."""
         return "reference" if any(test.driver == "reference" for test in self.tests) else "input"
 
     def predict(self, record: Record, ahead: int = 1) -> Array:
-        """Predict the output of a record from its input and from outputs that are some samples old.
+        """Predict the output of a record from its input and past outputs.
 
         Parameters
         ----------
         record : Record
-            A record of the same system, on a regular clock where the fit has a noise model.
+            Record of the same system, on a regular clock if the fit has a noise model.
         ahead : int, default 1
-            How many samples old the latest output is that a prediction uses [-].
+            Prediction horizon in samples [-].
 
         Returns
         -------
         ndarray, shape (N,)
-            Predictions [output unit]; NaN at samples that the fit does not use. They are the simulated output, with the
-            initial state and the offset that fit this record best, plus the prediction of the noise: zero without a
-            noise model, and the less the farther ahead.
+            Predictions [output unit]; NaN at unused samples. They are the simulated output, with the initial state and
+            the offset that fit this record best, plus the prediction of the noise, which is zero without a noise model
+            and decreases with the horizon.
 
         Raises
         ------
@@ -232,7 +232,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         return found
 
     def _estimated(self) -> Estimated:
-        """The model with what its reported errors and intervals are from."""
+        """Return the model with the source of its reported errors and intervals."""
         if isinstance(self.fit, MultiInputFit):
             return self.fit._estimated()
         law = self.uncertainty if self._determined else self.uncertainty.undefined
@@ -254,7 +254,7 @@ class Identification(DeferredFields, FittedModel, Shown):
         Raises
         ------
         DataError
-            If there is no such input, or the model has one input only.
+            If the input does not exist, or the model has only one input.
         """
         if not isinstance(self.fit, MultiInputFit):
             raise DataError("the model has one input; its responses are those of the fit")
@@ -263,7 +263,7 @@ class Identification(DeferredFields, FittedModel, Shown):
 
     @property
     def _determined(self) -> bool:
-        """Whether the record says anything about the parameters."""
+        """Whether the record contains information on the parameters."""
         return self.answer.seen and any(item.status == "free" for item in self.estimates)
 
 
@@ -275,20 +275,20 @@ def identify(
     bootstrap_draws: int = DRAWS,
     progress: Progress | None = None,
 ) -> Identification:
-    """Fit one model to the records and judge it, without warnings.
+    """Fit one model to the records and compute its diagnostics, without warnings.
 
     Standard errors are those for white residuals if no experiment's residuals fail the test of whiteness, and those for
-    coloured noise otherwise. Whether there is a model at all is tested against noise of the outputs' colour, the search
-    over poles and delays included.
+    coloured noise otherwise. The response is tested against noise with the spectrum of the outputs, with allowance for
+    the search over poles and delays.
     """
-    # Before the fit takes its time.
+    # Check the validation record before the fit, which takes longer.
     checked = None if validation is None else laid_out_validation(options, validation)
-    # Errors for coloured noise are computed once, below, where a bootstrap can tell how far it is.
+    # Errors for coloured noise are computed once, below, where a bootstrap can report its progress.
     prepared = replace(options, covariance="white").prepare(records)
     fit: MeasuredFit | SubmodelsFit | LoopFit = prepared.fit()
     uncertainty = fit.uncertainty(covariance, bootstrap_draws, progress)
     fit = replace(fit, covariance=uncertainty.covariance, law=uncertainty)
-    # What the estimate is by least squares near it: pseudo-errors where the loss is another.
+    # Equivalent least-squares problem near the estimate, with pseudo-errors for another loss.
     linear, laid_out = fit.linear, prepared.laid_out
     if isinstance(laid_out, MeasuredRecords):
         laid_out = laid_out.near(fit.residuals, fit.weighting, fit.arma)
@@ -322,7 +322,7 @@ def identify(
 
 
 class Told(NamedTuple):
-    """What is told of parameters."""
+    """Reported parameters."""
 
     estimates: tuple[UncertainValue, ...]
     delay_interval: DelayInterval | None
@@ -330,7 +330,7 @@ class Told(NamedTuple):
 
 
 def parameters_told(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid_out: Any) -> Told:
-    """Return parameters and derived quantities with their uncertainty, where a response is seen and they have one."""
+    """Return parameters and derived quantities, with their uncertainty if it exists and a response is detected."""
     biased, linear = uncertainty.kind == "biased", fit.linear
     free, hessian = free_directions(linear)
     singular = not condition_number(hessian) <= NEARLY_SINGULAR
@@ -353,7 +353,7 @@ def parameters_told(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool, laid
 
 
 def _of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertainty:
-    """What the data determine, which can be told even where no standard error can be given."""
+    """Return the uncertainty due to the data, which exists even without standard errors."""
     return fit.uncertainty("white") if uncertainty.kind == "biased" else uncertainty
 
 
@@ -361,9 +361,9 @@ def _of_data(fit: MeasuredFit, uncertainty: Uncertainty) -> Uncertainty:
 
 
 def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> tuple[ResidualTests, ...]:
-    """Tests of each experiment, at levels that make a false alarm as likely as with one.
+    """Return the tests of each experiment, at levels with the false-alarm probability of a single one.
 
-    With several inputs there is a test with each of them.
+    With several inputs each has a separate test.
     """
     found, delays = [], delays_of(fit.model)
     level = 1.0 - (1.0 - LEVEL) / (len(records) * len(delays))
@@ -378,7 +378,7 @@ def tests_of(options: Options, fit: MeasuredFit, records: Sequence[Record]) -> t
 
 
 def answer_of(options: Options, records: Sequence[Record], used: Sequence[BoolArray]) -> ResponseTest:
-    """Test the response of the output to its input; of several to any of them, by the least of their p-values."""
+    """Test the response of the output to its input; for several inputs by the least of their p-values."""
     names = list(records[0].held)
     if len(names) == 1:
         return response_test(records, used, options.delay_bounds, options.initial_state)
@@ -398,9 +398,10 @@ def delay_names(fit: MeasuredFit) -> list[str]:
 
 
 def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
-    """Parameters that the data say next to nothing about, so that no tidy number may stand beside them.
+    """Return the parameters that the data do not determine, for which no standard error is reported.
 
-    A coefficient or delay with ten times its own size for a standard error, and whatever moves along with it.
+    These are coefficients or delays with a standard error above ten times their size, and parameters correlated with
+    them.
     """
     names, errors = fit.parameter_names, np.sqrt(np.diag(covariance))
     looked_at = np.array([re.fullmatch(r"(.*_)?([ab]\d+|delay)", name) is not None for name in names])
@@ -415,7 +416,7 @@ def _undetermined(fit: MeasuredFit, covariance: Array) -> set[int]:
 
 
 def unsafe_intervals(found: Identification) -> list[str]:
-    """Parameters whose intervals reach as far as the output is not linear in them."""
+    """Return the parameters with intervals beyond the range in which the output is linear in them."""
     fit, options = found.fit, found.options
     shown = [item.name for item in found.estimates if np.isfinite(item.standard_error)]
     if not shown or getattr(options, "instruments", "open_loop") != "open_loop" or isinstance(fit, MultiInputFit):
@@ -428,7 +429,7 @@ def unsafe_intervals(found: Identification) -> list[str]:
 
 
 def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
-    """Indices of the parameters that are not held at a bound, and ``sum psi psi'`` along the free directions."""
+    """Return the indices of the parameters that are not at a bound, and ``sum psi psi'`` along the free directions."""
     hessian = sum((psi.T @ psi for psi in fit.sensitivities), np.zeros((fit.theta.size, fit.theta.size)))
     return np.flatnonzero(fit.tangent.any(axis=1)), fit.tangent.T @ hessian @ fit.tangent
 
@@ -439,7 +440,7 @@ def free_directions(fit: MeasuredFit) -> tuple[IndexArray, Array]:
 def _delay_interval(
     measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str
 ) -> DelayInterval | None:
-    """Profile-likelihood interval of a free delay, None where estimate plus or minus two errors is as good."""
+    """Return the profile-likelihood interval of a free delay; None if the quadratic interval is adequate."""
     profile, reach, error = _cost_of_delay(measured, fit, uncertainty, name)
     return profile.interval(reach) if profile.quadratic_is_doubtful(error) else None
 
@@ -447,11 +448,11 @@ def _delay_interval(
 def _cost_of_delay(
     measured: MeasuredRecords, fit: MeasuredFit, uncertainty: Uncertainty, name: str = "delay"
 ) -> tuple[CostOfDelay, float, float]:
-    """The cost about a delay, how many standard errors its interval reaches, and the standard error."""
+    """Return the cost about a delay, the quantile of its interval, and its standard error."""
     place, k = fit.parameter_names.index(name), delay_names(fit).index(name)
     held = not fit.tangent[place].any()
     if held:
-        # What the noise does to a delay is seen where it is free.
+        # The effect of the noise on a delay at a bound is that of a free one.
         fit = replace(fit, tangent=np.column_stack((fit.tangent, np.eye(fit.theta.size)[place])))
         uncertainty = fit.uncertainty("white" if uncertainty.kind == "white" else "robust")
     variance = float(uncertainty.covariance[place, place])
@@ -470,22 +471,22 @@ def _cost_of_delay(
 
 
 class DelayCosts(NamedTuple):
-    """The cost about the estimated delay, minimised over everything else."""
+    """Cost about the estimated delay, minimised over all other parameters."""
 
-    #: Shape (K,) [s], and shape (K,) [output unit^2].
+    #: Delays [s] and costs [output unit^2], each of shape (K,).
     delays: Array
     costs: Array
     least: float
-    #: The data do not reject delays of a cost below this.
+    #: Largest cost of delays that the data do not reject.
     allowed: float
 
     def percent_above(self, costs: Any) -> Any:
-        """Return by how much costs are above the least [%]."""
+        """Return costs relative to the least, minus one [%]."""
         return 100.0 * (costs / self.least - 1.0)
 
 
 def costs_about_delay(result: Identification) -> DelayCosts | None:
-    """The cost so close to the estimated delay that its minimum is seen; None where no interval of it is known."""
+    """Return the cost around its minimum at the estimated delay; None without an interval of the delay."""
     fit = result.fit.linear
     item = next(item for item in result.estimates if item.name == "delay")
     if "delay" not in fit.parameter_names or not (np.isfinite([item.low, item.high]).all() and fit.cost > 0):
@@ -511,7 +512,7 @@ def costs_about_delay(result: Identification) -> DelayCosts | None:
 def _estimates(
     fit: MeasuredFit, uncertainty: Uncertainty, unclear: set[str], intervals: Mapping[str, DelayInterval]
 ) -> tuple[UncertainValue, ...]:
-    """Parameters, numerator first, then denominator, delay, and what belongs to the experiments."""
+    """Return the parameters: numerator, denominator, delay, then those of the experiments."""
     found: dict[str, UncertainValue] = {}
     with np.errstate(invalid="ignore"):
         errors = np.sqrt(np.diag(uncertainty.covariance))
@@ -533,7 +534,7 @@ def _estimates(
     inputs = list(fit.model.parts) if isinstance(fit, MultiInputFit) else []
 
     def place(item: UncertainValue) -> tuple[int, int]:
-        # What belongs to an input stands together, what is common follows.
+        # Parameters are grouped by input, followed by common ones.
         own = next((k for k, name in enumerate(inputs) if item.name.startswith(f"{name}_")), len(inputs))
         kind = item.name.removeprefix(f"{inputs[own]}_") if own < len(inputs) else item.name
         return own, order.get(kind[0], 3)
@@ -542,7 +543,7 @@ def _estimates(
 
 
 def laid_out_validation(options: Options, validation: Record) -> LaidOut:
-    """A record that the model is to be judged on."""
+    """Return a prepared validation record."""
     try:
         return options.prepare(validation).laid_out
     except DataError as error:
@@ -550,9 +551,9 @@ def laid_out_validation(options: Options, validation: Record) -> LaidOut:
 
 
 def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[UncertainValue, ...]:
-    """Poles, time constants, frequencies, damping and gain; without errors where no response is seen."""
+    """Return poles, time constants, frequencies, damping and gain; without errors if no response is detected."""
     covariance = uncertainty.covariance if seen else np.full_like(uncertainty.covariance, np.nan)
-    # What is known has no variance.
+    # Known parameters have no variance.
     known = np.isin(fit.parameter_names, fit.known)
     covariance[known] = covariance[:, known] = 0.0
     if isinstance(fit, SubmodelsFit) and fit.additive is not None:
@@ -565,7 +566,7 @@ def _derived(fit: MeasuredFit, uncertainty: Uncertainty, seen: bool) -> tuple[Un
 
 
 def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncertainty) -> tuple[UncertainValue, ...]:
-    """Derived quantities of the transfer function of each input; those of a common denominator once."""
+    """Return derived quantities of the transfer function of each input; those of a common denominator once."""
     found: list[UncertainValue] = []
     for k, (name, model) in enumerate(fit.model.parts.items()):
         names = fit.of_input(name).parameter_names
@@ -585,14 +586,14 @@ def _derived_of_inputs(fit: MultiInputFit, covariance: Array, uncertainty: Uncer
 
 
 def models_of(found: Identification) -> dict[str, FittedModel]:
-    """Return the model with its responses, or that of each of several inputs by its name."""
+    """Return the model with its responses, or the models of several inputs by name."""
     if isinstance(found.fit, MultiInputFit):
         return {name: found.of_input(name) for name in found.fit.model.parts}
     return {"": found}
 
 
 def validated(applied: AppliedModel, record: Record) -> Validation:
-    """What a model says of another record, in numbers."""
+    """Return the measures of a model on another record."""
     y = record.y[applied.used[0]]
     simulated = y - applied.residuals[0]
     return Validation(record.name, record, applied, fit_percent(y, simulated), r_squared(y, simulated), y.size)

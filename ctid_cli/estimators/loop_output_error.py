@@ -1,4 +1,4 @@
-"""A transfer function in a loop with a known controller, by the output error of the simulated loop."""
+"""Output-error estimation of a transfer function in a simulated loop with a known controller."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from ctid_cli.signals.held import HeldSignal
 from ctid_cli.signals.record import Record, as_records, named
 from ctid_cli.signals.treatment import LossKind
 
-#: What a loop can be at the first sample, and what offsets it can have.
+#: Options of the initial state and of the offset of a loop.
 LoopState = Literal["rest", "estimate"]
 LoopOffset = Literal["none", "remove", "estimate"]
-#: Endings of which standard errors are given.
+#: Status values with standard errors.
 DETERMINED = (Status.CONVERGED, Status.DELAY_AT_BOUND)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoopFit(MeasuredFit):
-    """A fit to a record in its loop.
+    """Fit to a record in closed loop.
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ class LoopFit(MeasuredFit):
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
     ) -> Uncertainty:
-        """Standard errors and intervals for a kind of noise.
+        """Return standard errors and intervals for a kind of noise.
 
-        ``auto`` is ``robust``: the loop colours the noise. There are none where no minimum was reached.
+        ``auto`` is ``robust``, since the loop colours the noise. There are none if no minimum was reached.
         """
         found = MeasuredFit.uncertainty(self, "robust" if kind == "auto" else kind, draws, progress)
         return found if self.status in DETERMINED else found.undefined
@@ -73,44 +73,44 @@ class LoopFit(MeasuredFit):
 
 @dataclass(frozen=True, eq=False)
 class LaidOutLoop:
-    """A record in its loop laid out for estimation."""
+    """Record in closed loop, prepared for estimation."""
 
     record: Record
     problem: LoopProblem
-    #: Means that were subtracted.
+    #: Subtracted means.
     input_offset: float
     offset: float
 
     @property
     def records(self) -> list[Record]:
-        """The record, without the means that were subtracted."""
+        """Record without the subtracted means."""
         return [self.record]
 
 
 @dataclass(frozen=True)
 class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
-    """Output error of a simulated loop: reference and controller are known, the plant need not be stable.
+    """Output-error estimate in a simulated loop with known reference and controller; the plant may be unstable.
 
     Parameters
     ----------
     poles : int
         Degree of the denominator, 1 to 12.
     zeros : int
-        Degree of the numerator, below ``poles``; equal to ``poles`` only where the delay is known.
+        Degree of the numerator, below ``poles``; equal to ``poles`` only for a known delay.
     delay_bounds : tuple of float, default (0.0, 0.0)
-        Least and greatest delay [s]; two equal numbers are a known delay. With a controller in continuous time it must
-        be known to be zero.
+        Least and greatest delay [s]; equal values fix the delay. With a continuous-time controller it must be
+        known to be zero.
     initial_state : {"rest", "estimate"}, default "rest"
-        State of plant and controller, and inputs on their way, at the first sample.
+        State of plant and controller, including delayed inputs, at the first sample.
     offset : {"none", "remove", "estimate"}, default "none"
         Offset of the output: none, means of output, input and reference subtracted first, or a constant estimated with
         the model.
     integrators : int, default 0
-        Poles at the origin besides ``poles``, which may then be 0.
+        Poles at the origin in addition to ``poles``, which may then be 0.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for; ``auto`` is ``robust``, for the loop colours the noise.
+        Noise assumed for the standard errors; ``auto`` is ``robust``, since the loop colours the noise.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -119,10 +119,10 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     Notes
     -----
-    Minimises ``sum (y - T(theta) r)^2``, T being the simulated loop. The reference is independent of the noise, so that
-    the estimate is consistent for noise of any colour; with white output noise, instruments (CLSRIVC) or the direct
-    method use the input besides and are more accurate where the feedback is strong. Starts are two-stage least squares
-    with filtered references as instruments. It is no estimate if the record's controller is not the one that is given.
+    The cost is ``sum (y - T(theta) r)^2``, with T the simulated loop. The reference is independent of the noise, so
+    that the estimate is consistent for noise of any colour; with white output noise, instruments (CLSRIVC) or the
+    direct method also use the input and are more accurate with strong feedback. Starts are two-stage least squares with
+    filtered references as instruments. The estimate is invalid if the given controller is not that of the record.
 
     Examples
     --------
@@ -140,7 +140,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     kind: ClassVar[str] = "loop_output_error"
     loss: ClassVar[LossKind] = "squares"
-    #: As other estimators of records in loops have it.
+    #: Common interface of estimators of records in loops.
     instruments: ClassVar[str] = "closed_loop"
     fixed: ClassVar[tuple[Fixed, ...] | None] = None
 
@@ -165,12 +165,12 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
 
     @property
     def order(self) -> int:
-        """Number of poles, integrators included."""
+        """Number of poles, including integrators."""
         return self.poles + self.integrators
 
     @property
     def searched(self) -> bool:
-        """Whether the delay is a parameter."""
+        """Whether the delay is a free parameter."""
         return self.delay_bounds[0] < self.delay_bounds[1]
 
     def _lay_out(self, records: Record | Sequence[Record]) -> LaidOutLoop:
@@ -208,7 +208,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return self._described(laid_out, found)._with_uncertainty(self.covariance, self.bootstrap_draws)
 
     def _described(self, laid_out: LaidOutLoop, found: LoopEstimate) -> LoopFit:
-        """Return the fit, but for its covariance."""
+        """Return the fit without its covariance."""
         problem, theta = found.problem, found.result.theta
         own = self._own(problem, theta)
         names = Structure(self.order, self.zeros, self.searched).names
@@ -244,7 +244,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return replace(fit, **samples._asdict(), tangent=tangent, **fitness)
 
     def _own(self, problem: LoopProblem, theta: Array) -> Array:
-        """Return the best state and offset for parameters."""
+        """Return the least-squares state and offset for given parameters."""
         columns = problem.columns(theta, 0)
         if columns is None:
             raise DataError("the loop of this model with the controller has no finite output on this record")
@@ -257,7 +257,7 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         return np.concatenate((fit.model.denominator[1 : self.poles + 1], b, [fit.model.delay]))
 
     def _judged(self, fit: MeasuredFit, problem: LoopProblem) -> tuple[FittedSamples, Array]:
-        """Return what a fit says of each used sample, and the directions in which its parameters are free."""
+        """Return the signals of a fit at each used sample, and the free directions of its parameters."""
         theta = self._theta(fit)
         if self.searched and problem.cell is None:
             problem = replace(problem, cell=problem.cell_of(theta[-1]))
@@ -277,20 +277,20 @@ class LoopOutputError(Estimator[LaidOutLoop, LoopFit]):
         samples = FittedSamples((columns.left - columns.linear @ own,), (psi,), (problem.data.use,), None)
         return samples, tangent
 
-    # --- what a fit is judged by -----------------------------------------------------------------------
+    # --- diagnostics of a fit --------------------------------------------------------------------------
 
     def _acting(self, record: Record) -> Record:
-        """The record with what acts on the output from outside: the reference, for noise moves the input."""
+        """Return the record with the reference as input, since noise affects the measured input."""
         assert record.loop is not None
         reference = HeldSignal(record.t, record.loop.reference, record.loop.hold)
         return Record(record.t, record.y, reference, name=record.name)
 
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
-        """What a fit says of each used sample, from its parameters."""
+        """Return the signals of a fit at each used sample, from its parameters."""
         return self._judged(fit, laid_out.problem)[0]
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
-        """The model in the loop of another record, with its own best state and offset there."""
+        """Return the model in the loop of another record, with the best state and offset for it."""
         problem = laid_out.problem
         own = self._own(problem, self._theta(fit))
         states = own.size - int(problem.offset)

@@ -1,4 +1,4 @@
-"""A sum of submodels, or one transfer function in a loop, from a measured record, with all that a fit is judged by."""
+"""Sum of submodels, or one transfer function in a loop, from a measured record, with diagnostics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from ctid_cli.signals.treatment import LossKind, Offset
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SubmodelsFit(MeasuredFit):
-    """A fit of submodels to a measured record.
+    """Fit of submodels to a measured record.
 
     Parameters
     ----------
@@ -40,20 +40,20 @@ class SubmodelsFit(MeasuredFit):
     law, in_ignored_loop, poles_at_infinity, box, weighting, held_poles, tangent, known, noise, bounds_met
         As in :class:`~ctid_cli.estimators.delay_profile.MeasuredFit`.
     additive : AdditiveModel or None
-        The submodels; None where one transfer function was asked for.
+        Submodels; None for a single transfer function.
     start_method : str
-        How the start was found, in a sentence.
+        Origin of the start, as a sentence.
     loop_radius : float
         Largest magnitude of the poles of the sampled loop with the controller [-]; NaN in open loop.
     in_loop : bool
-        Whether instruments come from the loop: what is no solution then has no standard errors.
+        Whether instruments come from the loop; an unconverged estimate then has no standard errors.
     consistency : float
-        Margin of the condition for consistent estimates, right side over left side [-]; NaN where it is not defined.
+        Margin of the condition for consistent estimates, right side over left side [-]; NaN if undefined.
     sampling : float
         Sampling frequency over twice the greatest imaginary part of a pole [-]; NaN on an irregular clock.
     two_stage : float
-        Of an estimate with instruments from the reference: the largest difference to that of the two-stage method, in
-        standard errors of the latter [-]; NaN otherwise.
+        For instruments from the reference, the largest difference from the two-stage estimate, in standard errors of
+        the latter [-]; NaN otherwise.
     """
 
     additive: AdditiveModel | None = None
@@ -67,7 +67,7 @@ class SubmodelsFit(MeasuredFit):
 
     @property
     def conditions(self) -> Iterator[tuple[str, str]]:
-        """Conditions for consistent estimates (González et al. 2025) in sentences, at a converged estimate."""
+        """Yield the conditions for consistency (González et al. 2025) at a converged estimate, as sentences."""
         if not self.status.succeeded:
             return
         lines = (
@@ -88,33 +88,33 @@ class SubmodelsFit(MeasuredFit):
     def uncertainty(
         self, kind: Covariance = "auto", draws: int = DRAWS, progress: Progress | None = None
     ) -> Uncertainty:
-        """Standard errors and intervals for a kind of noise."""
+        """Return standard errors and intervals for a kind of noise."""
         found = MeasuredFit.uncertainty(self, kind, draws, progress)
         return found.undefined if self.in_loop and not self.status.succeeded else found
 
     @property
     def parametrised(self) -> TransferFunction | AdditiveModel:
-        """The model in the form that has the parameters."""
+        """Model in its parametrised form."""
         return self.model if self.additive is None else self.additive
 
 
 @dataclass(frozen=True, eq=False)
 class LaidOutSubmodels(Submodels):
-    """A measured record laid out for submodels."""
+    """Measured record prepared for submodels."""
 
-    #: Means that were subtracted.
+    #: Subtracted means.
     input_offset: float
     offset: float
 
     @property
     def records(self) -> list[Record]:
-        """The record, without the means that were subtracted."""
+        """Record without the subtracted means."""
         return [self.record]
 
 
 @dataclass(frozen=True)
 class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
-    """Refined instrumental variables for a sum of submodels, as :class:`AdditiveSrivc`, judged as measured records are.
+    """Refined instrumental variables for a sum of submodels, as :class:`AdditiveSrivc`, for measured records.
 
     Parameters
     ----------
@@ -123,20 +123,19 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     delay : float, default 0.0
         Known delay [s].
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
-        ``closed_loop`` for a record with the loop that it was taken in, ``reference`` where its controller is not
-        known.
+        ``closed_loop`` for a record with its loop, ``reference`` for an unknown controller.
     initial_state : {"rest", "estimate"}, default "rest"
         State before the record.
     offset : {"none", "remove"}, default "none"
         Whether the means of input and output are subtracted first.
     factored : bool, default True
-        Whether parameters are those of the submodels; else those of the monic transfer function of the only term.
+        Whether parameters are those of the submodels, or those of the monic transfer function of the only term.
     fixed : tuple of Fixed, optional
         Known parameters of the submodels.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
         As in :class:`AdditiveSrivc`.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -167,7 +166,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     @property
     def estimator(self) -> AdditiveSrivc:
-        """The iteration."""
+        """Estimator of the iteration."""
         return AdditiveSrivc(
             self.terms,
             self.delay,
@@ -178,7 +177,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     @property
     def poles(self) -> int:
-        """Number of poles, integrators included."""
+        """Number of poles, including integrators."""
         return degrees_of(self.terms)[0]
 
     @property
@@ -188,7 +187,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
     @property
     def delay_bounds(self) -> tuple[float, float]:
-        """The known delay, twice."""
+        """Known delay as equal bounds."""
         return self.delay, self.delay
 
     @property
@@ -246,11 +245,11 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return replace(fit, two_stage=self._two_stage_difference(fit, laid_out.record))
 
     def _two_stage_difference(self, fit: SubmodelsFit, record: Record) -> float:
-        """Largest difference of a parameter to the two-stage method, in standard errors; NaN where there is none.
+        """Return the largest difference of a parameter from the two-stage method, in standard errors, or NaN.
 
-        That estimates the plant as in open loop from what of the input follows the reference (P. M. J. Van den Hof and
-        R. J. P. Schrama, *An indirect method for transfer function estimation from closed loop data*, Automatica 29(6),
-        1993, https://doi.org/10.1016/0005-1098(93)90015-L).
+        That method estimates the plant as in open loop from the part of the input predicted from the reference
+        (P. M. J. Van den Hof and R. J. P. Schrama, *An indirect method for transfer function estimation from closed
+        loop data*, Automatica 29(6), 1993, https://doi.org/10.1016/0005-1098(93)90015-L).
         """
         if self.instruments != "reference" or not fit.status.succeeded:
             return float("nan")
@@ -259,17 +258,17 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         found = [abs(other.parameters[name] - own[name]) / errors[name] for name in own if errors.get(name, 0.0) > 0.0]
         return max(found) if other.status.succeeded and found else float("nan")
 
-    # --- what a fit is judged by -----------------------------------------------------------------------
+    # --- diagnostics of a fit --------------------------------------------------------------------------
 
     def _factors(self, fit: MeasuredFit) -> AdditiveModel:
-        """The submodels of an estimate; the only one of a transfer function."""
+        """Return the submodels of an estimate, a single one for a transfer function."""
         if isinstance(fit, SubmodelsFit) and fit.additive is not None:
             return fit.additive
         numerator = _padded(fit.model.numerator, self.zeros + 1)
         return AdditiveModel([Submodel(numerator, fit.model.denominator)], self.delay)
 
     def _acting(self, record: Record) -> Record:
-        """The record with what acts on the output from outside: in a loop the reference, for noise moves the input."""
+        """Return the record with its exogenous input: in a loop the reference, since noise affects the input."""
         if record.loop is None or not self.closed:
             return record
         return Record(record.t, record.y, HeldSignal(record.t, record.loop.reference), name=record.name)
@@ -277,9 +276,9 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
     def _rows(
         self, fit: MeasuredFit, laid_out: LaidOutSubmodels, state: Array | None = None, **changes: Any
     ) -> tuple[Array, Array, Array]:
-        """Sensitivities to the parameters, free responses, and output errors; of a changed problem, by default at rest.
+        """Return sensitivities, free responses and output errors of a changed problem, by default at rest.
 
-        Closed-loop instruments stand in the place of sensitivities.
+        Closed-loop instruments replace sensitivities.
         """
         model = self._factors(fit)
         problem = replace(laid_out.problem, terms=model.terms, **changes)
@@ -290,7 +289,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return rows[0][:, : problem.size], rows[0][:, problem.size :], rows[1]
 
     def _samples(self, fit: MeasuredFit, laid_out: Any) -> FittedSamples:
-        """What a fit says of each used sample, from its parameters; of a monic fraction by its coefficients."""
+        """Return the signals of a fit at each used sample; for a monic fraction by its coefficients."""
         psi, free, error = self._rows(fit, laid_out, fit.initial_states[0])
         if not self.factored:
             psi = psi @ np.linalg.inv(unfactored_jacobian(self._factors(fit), self.zeros))
@@ -298,7 +297,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
         return FittedSamples((error,), (np.column_stack((psi, free)),), (used,), None)
 
     def _applied(self, fit: MeasuredFit, laid_out: Any) -> AppliedModel:
-        """The model on another record, with its own best initial state there if that is estimated."""
+        """Return the model on another record, with the best initial state for it if that is estimated."""
         psi, free, error = self._rows(fit, laid_out, loop=OPEN_LOOP)
         state: Array = np.asarray(np.linalg.lstsq(free, error)[0], dtype=float)
         used = used_samples(laid_out.problem.data, laid_out.record)
@@ -307,7 +306,7 @@ class MeasuredSubmodels(Estimator[LaidOutSubmodels, SubmodelsFit]):
 
 
 def without_feedback(record: Record) -> Record:
-    """Return a record in a loop with the part of its input that follows the reference, as a record in open loop."""
+    """Return an open-loop record with the part of the input that is predicted from the reference of the loop."""
     assert record.loop is not None
     u = record.input.mean + following(record.loop.reference, record.input.values)
     return Record(record.t, record.y, HeldSignal(record.t, u, record.input.hold), name=record.name)
@@ -322,5 +321,5 @@ def sampling_margin(model: AdditiveModel, interval: float) -> float:
 
 
 def _padded(b: Array, size: int) -> Array:
-    """Numerator with its declared length."""
+    """Return the numerator padded to its declared length."""
     return np.concatenate((np.zeros(size - b.size), b))

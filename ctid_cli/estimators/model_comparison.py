@@ -1,4 +1,4 @@
-"""Estimated models on one record: what each leaves of the output, and what the residuals tell."""
+"""Comparison of estimated models on one record: fit and residual tests of each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ from ctid_cli.signals.treatment import InitialState, Offset
 
 @dataclass(frozen=True, eq=False)
 class ModelOnRecord:
-    """An estimated model on a record, the model fixed.
+    """Result of an estimated model on a record, without refitting.
 
     Parameters
     ----------
@@ -34,15 +34,15 @@ class ModelOnRecord:
     rms : float
         Root mean square of the residuals [output unit].
     count : int
-        Number of samples used, the same of all models that are compared.
+        Number of used samples, equal for all compared models.
     initial_state, offset : str
         Treatment of the state before the record and of a constant offset.
     t : ndarray, shape (count,)
         Instants of the used samples [s].
     measured, simulated, residuals : ndarray, shape (count,)
-        Output, that of the model, and the difference [output unit].
+        Measured output, model output, and their difference [output unit].
     tests : ResidualTests or None
-        Auto- and cross-correlation of the residuals with what they mean; None of too few samples.
+        Auto- and cross-correlation tests of the residuals; None for too few samples.
     """
 
     fit_percent: float
@@ -65,37 +65,35 @@ def compare(
     initial_state: InitialState | None = None,
     offset: Offset | None = None,
 ) -> tuple[ModelOnRecord, ...]:
-    """Compare several models on the same samples of one record, none of them fitted to it.
+    """Compare several models on the same samples of one record, without refitting.
 
     Parameters
     ----------
     fits : sequence of FittedModel
-        Fits, identifications, loaded ones among them.
+        Fits or identifications, including loaded ones.
     record : Record
-        A record of the same system, best one that no model was estimated from.
+        Record of the same system, preferably not used for estimation.
     initial_state : {"rest", "estimate", "periodic"}, optional
-        State before the record; by default for each model as in its own estimation, and at rest where that is not
-        known.
+        State before the record; by default for each model as in its estimation, or at rest if that is unknown.
     offset : {"none", "remove", "estimate"}, optional
         Constant offset of the output; by default as in the estimation of each model.
 
     Returns
     -------
     tuple of ModelOnRecord
-        One for each model, in their order.
+        Results in the order of the models.
 
     Raises
     ------
     DataError
         If the record is too short for a model's delay or initial state.
     UsageError
-        If there is no model.
+        Without models.
 
     Notes
     -----
-    A part of the residuals along the sensitivities of the output to the parameters counts neither for nor against their
-    independence of the input: on the record of the estimation there is none, and on another one the parameters'
-    uncertainty puts it there.
+    The test of independence ignores the part of the residuals along the sensitivities of the output to the parameters:
+    it is zero on the record of the estimation, and due to the parameters' uncertainty on another one.
 
     Examples
     --------
@@ -116,7 +114,7 @@ def compare(
 
 
 class _Applied(NamedTuple):
-    """A model with its residuals and their slopes by its parameters, at the samples that it has both of."""
+    """Model with its residuals and their derivatives by its parameters, at the samples with both."""
 
     initial_state: InitialState
     offset: Offset
@@ -126,7 +124,7 @@ class _Applied(NamedTuple):
 
 
 def _applied(fit: FittedModel, record: Record, initial_state: InitialState | None, offset: Offset | None) -> _Applied:
-    """Apply a model to a record, with the treatment that is asked for or that of its own estimation."""
+    """Apply a model to a record, with the given treatment or that of its estimation."""
     own: tuple[InitialState, Offset] = "rest", "none"
     if isinstance(fit, Identification):
         own = fit.options.initial_state, fit.options.offset
@@ -149,7 +147,7 @@ def _applied(fit: FittedModel, record: Record, initial_state: InitialState | Non
 
 
 def _on_record(fit: FittedModel, record: Record, applied: _Applied, common: BoolArray) -> ModelOnRecord:
-    """Return how well a model fits the samples that all models have."""
+    """Return the result of a model at the samples common to all models."""
     kept = common[applied.use]
     residuals, slopes, measured = applied.residuals[kept], applied.slopes[kept], record.y[common]
     tests = None
@@ -161,7 +159,7 @@ def _on_record(fit: FittedModel, record: Record, applied: _Applied, common: Bool
             )
             for signal, delay in zip(record.held.values(), _delays(fit), strict=True)
         ]
-        # Of several inputs that on which the residuals depend most.
+        # With several inputs, the one on which the residuals depend most.
         tests = min(each, key=lambda test: test.cross_p_value)
     return ModelOnRecord(
         fit_percent=fit_percent(measured, measured - residuals),
@@ -188,7 +186,7 @@ def _delays(fit: FittedModel) -> list[float]:
 def _treated(
     fit: FittedModel, parametric: Parametric | None, record: Record, state: InitialState, shift: Offset
 ) -> AppliedModel:
-    """The model with its best initial state and offset: as its own estimator has them, or as one fraction."""
+    """Return the model with its best initial state and offset, by its estimator or as one fraction."""
     if isinstance(fit, Identification):
         try:
             treated: dict[str, Any] = {"initial_state": state, "offset": shift}

@@ -1,7 +1,7 @@
 """Algorithm IV as printed: in every round one Gauss-Newton path on each filter's cost, all from the same delay.
 
-The reference beside the faster and more careful search of ``useful_redundancy``: written to be compared with the
-publication line by line. Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time
+Reference for the faster and more robust search of ``useful_redundancy``, which can be compared with the publication
+line by line. Equation numbers are those of Ha, Welsh and Alamir, "Useful redundancy in parameter and time
 delay estimation for continuous-time models" (arXiv:1703.09344).
 """
 
@@ -24,11 +24,11 @@ from ctid_cli.signals.record import Record
 
 
 class FilteredMember(SampledCost):
-    """The cost of one filter's data; what SRIVC finds from its own start at a delay is kept for that very delay."""
+    """Cost of one filter's data, with SRIVC estimates from least-squares starts cached by delay."""
 
     @cached_property
     def spread(self) -> float:
-        """Sum of squares of the filtered output less its mean [output unit^2]."""
+        """Sum of squares of the filtered output about its mean [output unit^2]."""
         y = self.problem.data.y_used
         return float(np.sum((y - y.mean()) ** 2))
 
@@ -37,7 +37,7 @@ class FilteredMember(SampledCost):
         return {}
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
-        """SRIVC at one delay, from given coefficients or by the whole of Algorithm I."""
+        """Run SRIVC at one delay, from given coefficients or by the complete Algorithm I."""
         if not own:
             return super().minimise(delay, starts, own)
         if delay not in self._known:
@@ -47,7 +47,7 @@ class FilteredMember(SampledCost):
 
 @dataclass(frozen=True, eq=False)
 class PrintedRounds:
-    """Step 2 of Algorithm IV on the costs of some filters."""
+    """Step 2 of Algorithm IV on the costs of several filters."""
 
     options: TdSrivc
     members: Sequence[FilteredMember]
@@ -55,12 +55,12 @@ class PrintedRounds:
     max_rounds: int
 
     def reference_cost(self, delay: float) -> float:
-        """J0 (45) at a delay, every filter with its own coefficients [%]."""
+        """Return J0 (45) at a delay, with separate coefficients for every filter [%]."""
         errors = [member.minimise(delay, np.empty((0, member.size)), True).squared_error for member in self.members]
         return float(percents(np.array(errors), np.array([member.spread for member in self.members])).mean())
 
     def run(self, delay: float) -> tuple[RedundantMinimum[float], list[FilterPath]]:
-        """From the incumbent along every path, and on from the end of least J0, lower than before or not."""
+        """Follow every path from the incumbent, and continue from the end of least J0, even if J0 increases."""
         visits = [Visit(0, START, delay, self.reference_cost(delay), True)]
         paths: list[FilterPath] = []
         incumbents, status = [delay], SearchStatus.MAX_ROUNDS
@@ -79,14 +79,14 @@ class PrintedRounds:
                 status = SearchStatus.SETTLED
                 break
             if delay in incumbents:
-                # From here on everything would repeat itself.
+                # The rounds would repeat from here on.
                 status = SearchStatus.EXHAUSTED
                 break
             incumbents.append(delay)
         return RedundantMinimum(delay, costs[least], number, status, tuple(visits)), paths
 
     def _followed(self, number: int, delay: float) -> list[FilterPath]:
-        """Algorithm II without its step 3 on the cost of each filter."""
+        """Run Algorithm II without its step 3 on the cost of each filter."""
         limits, paths = self.options._limits._replace(largest_step=self.max_delay_step), []
         for k, member in enumerate(self.members):
             descent = descend(member, delay, np.empty((0, member.size)), limits)
@@ -104,7 +104,7 @@ class PrintedSearch:
     unfiltered: PrintedRounds
 
     def run(self, delay: float) -> tuple[Fit, RedundantMinimum[float], list[FilterPath]]:
-        """Step 2 over all filters, then step 3: step 2 once more with ``L(p) = 1`` for the only filter."""
+        """Run step 2 over all filters, then step 3: step 2 with ``L(p) = 1`` as the only filter."""
         found, paths = self.filtered.run(delay)
         refined, last = self.unfiltered.run(found.point)
         problem = self.unfiltered.members[0].problem._replace(free_delay=True)
@@ -117,7 +117,7 @@ class PrintedSearch:
 def printed_search(
     options: TdSrivc, record: Record, filters: FilterSet, max_delay_step: float, max_rounds: int
 ) -> PrintedSearch:
-    """Filter a record through all filters, once for all initial delays."""
+    """Apply all filters to a record, once for all initial delays."""
     cutoff = options.svf_cutoff or filters.bandwidth
 
     def rounds(*lowpasses: Lowpass | None) -> PrintedRounds:

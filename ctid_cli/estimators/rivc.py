@@ -1,4 +1,4 @@
-"""Refined instrumental variables' model of plant and noise (RIVC), by maximum likelihood."""
+"""Maximum-likelihood estimation of the model of RIVC, plant and noise."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -23,7 +23,7 @@ class Rivc(DelayProfile):
     Notes
     -----
     All other options are those of :class:`~ctid_cli.estimators.delay_profile.DelayProfile`. The model is that of the
-    RIVC method, a continuous-time plant beside discrete-time noise [1]_, whose iteration approaches the same estimate.
+    RIVC method, a continuous-time plant with discrete-time noise [1]_, whose iteration approaches the same estimate.
 
     References
     ----------

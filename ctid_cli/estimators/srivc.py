@@ -32,7 +32,7 @@ from ctid_cli.models.factoring import unfactored, unfactored_jacobian
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
-#: How steps are accepted; ``auto`` depends on the instruments.
+#: Step rules; ``auto`` depends on the instruments.
 SrivcVariant = Literal["auto", "guarded", "plain", "relaxed"]
 
 
@@ -56,22 +56,22 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
     tolerance : float, default 1e-6
         Stop when a step changes the simulated output by less than this fraction of its rms value [-].
     variant : {"auto", "guarded", "plain", "relaxed"}, default "auto"
-        ``plain`` is the published iteration; ``guarded`` never lets the output-error cost rise; ``relaxed`` shortens
-        steps that do not settle. ``auto`` is ``guarded`` in open loop and ``relaxed`` in closed loop, where the
+        ``plain`` is the published iteration; ``guarded`` never increases the output-error cost; ``relaxed`` shortens
+        steps that do not converge. ``auto`` is ``guarded`` in open loop and ``relaxed`` in closed loop, where the
         solution is not the minimum of that cost.
     hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of the measured output between samples; changes the path, not the converged estimate.
+        Interpolation of the measured output between samples; affects the iterations, not the converged estimate.
     instruments : {"open_loop", "closed_loop", "reference"}, default "open_loop"
         ``closed_loop`` (CLSRIVC) simulates the instruments in the noise-free loop of the model with the record's
-        controller and reference: needed where feedback brings coloured noise into the input. ``reference`` takes in
-        their place what of the input follows the reference, where the controller is not known.
+        controller and reference: needed if feedback brings coloured noise into the input. ``reference`` uses the part
+        of the input that is predicted from the reference, for an unknown controller.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
-        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
-        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+        Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
+        (``robust``); ``bootstrap`` adds bootstrap-t intervals. ``auto`` is white if the residuals pass the Ljung-Box
+        test at the 5 % level, else robust, or none if the record is from a loop that the estimator ignores.
+        ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -82,8 +82,8 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
     -----
     ``theta+ = theta + [sum psi phi']^-1 sum psi eps`` from the least-squares start of
     :class:`~ctid_cli.estimators.svf.Svf`. The converged estimate is a stationary point of the output-error cost, hence
-    asymptotically efficient for white output noise. It fails where the start is useless: heavy noise with a
-    ``svf_cutoff`` far from the bandwidth, or a wrong delay.
+    asymptotically efficient for white output noise. It fails with a poor start: strong noise with a ``svf_cutoff`` far
+    from the bandwidth, or a wrong delay.
 
     References
     ----------
@@ -124,13 +124,13 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
 
     @property
     def step_rule(self) -> StepRule:
-        """How steps are accepted, ``auto`` resolved."""
+        """Step rule, with ``auto`` resolved."""
         if self.variant == "auto":
             return "guarded" if self.instruments == "open_loop" else "relaxed"
         return self.variant
 
     def check_start(self, start: Start) -> None:
-        """Refuse a model of another structure."""
+        """Raise DataError for a model of another structure."""
         if start.model is not None:
             given_coefficients(start.model, Structure(self.poles, self.zeros), self.delay)
 
@@ -140,7 +140,7 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)
         if self.step_rule == "relaxed" or self.instruments != "open_loop":
-            # In closed loop (CLSRIVC) and where steps are relaxed it is additive SRIVC with a single submodel.
+            # In closed loop (CLSRIVC) and with relaxed steps it is additive SRIVC with a single submodel.
             terms = (Term(self.poles, self.zeros),)
             return AdditiveProblem(data, terms, self.delay, loop), record
         return at_known_delay(data, structure), record
@@ -158,7 +158,7 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
             raise DataError(Status.SINGULAR.value)
         ranks = [(not fit.status.succeeded, np.nan_to_num(fit.cost, nan=np.inf)) for fit in fits]
         best = ranks.index(min(ranks))
-        # Errors for coloured noise take as long as a fit, and only those of the best are wanted.
+        # Errors for coloured noise take as long as a fit, and only those of the best fit are needed.
         return fits[best] if self.covariance == "white" else self._from(problem, starts[best], self.covariance)
 
     def _from(self, problem: SampledProblem | AdditiveProblem, theta: Array, covariance: Covariance) -> Fit:
@@ -180,7 +180,7 @@ class Srivc(Estimator["tuple[SampledProblem | AdditiveProblem, Record]", Fit]):
 
 
 def given_coefficients(model: AdditiveModel, structure: Structure, delay: float) -> Array:
-    """Initial parameters from a sum of submodels."""
+    """Return initial parameters from a sum of submodels."""
     whole = unfactored(model)
     if whole.order != structure.poles or whole.numerator.size > structure.zeros + 1:
         given = f"{whole.order} poles and {whole.numerator.size - 1} zeros"

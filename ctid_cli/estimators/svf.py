@@ -39,8 +39,8 @@ class Svf(Estimator[tuple[SampledProblem, float], Fit]):
 
     Notes
     -----
-    Linear least squares on ``p^n/F y = phi' theta``, F the filter's denominator. The regressors hold the noisy output,
-    so the estimate is biased unless there is no noise: no standard errors are given. It is a start for
+    Linear least squares on ``p^n/F y = phi' theta``, F the filter's denominator. The regressors contain the noisy
+    output, so that noise biases the estimate: no standard errors are given. It is a start for
     :class:`~ctid_cli.estimators.srivc.Srivc`.
 
     References
@@ -61,7 +61,7 @@ class Svf(Estimator[tuple[SampledProblem, float], Fit]):
         check_proper(self.poles, self.zeros)
 
     def _lay_out(self, record: Record) -> tuple[SampledProblem, float]:
-        """A filtered record, and the cut-off of the filter [rad/s]."""
+        """Return a filtered record, and the cut-off of the filter [rad/s]."""
         data = filter_data(record, self.delay, self.hold_output)
         structure = Structure(self.poles, self.zeros)
         check_record(record, data, structure.size)

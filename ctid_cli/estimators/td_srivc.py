@@ -40,9 +40,9 @@ from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record
 from ctid_cli.signals.treatment import OutputHold
 
-#: SRIVC iterations at each trial delay while searching.
+#: SRIVC iterations at each trial delay of the search.
 INNER_ITERATIONS = 20
-#: Tolerance of the guarded variant while it searches.
+#: Tolerance of the guarded variant during the search.
 SEARCH_TOLERANCE = 1e-3
 
 
@@ -59,27 +59,27 @@ class TdSrivc(Estimator["Searches", Fit]):
     delay_bounds : tuple of float
         Least and greatest delay [s]. Samples earlier than the greatest delay after the first input are not used.
     lowpass : Lowpass, optional
-        Search on low-pass-filtered data first, which widens the region of convergence; then refine on the data as
-        they are. None searches on the data as they are.
+        Search on low-pass-filtered data first, which widens the region of convergence; then refine on the unfiltered
+        data. None searches on the unfiltered data.
     svf_cutoff : float, optional
         Cut-off of the state-variable filter of the start [rad/s], near the bandwidth of the system. By default four
         multiples of the output's bandwidth, from .04 to 5, are tried at the initial delay.
     max_iterations : int, default 50
-        Largest number of Gauss-Newton iterations on the delay, in the search and in the refinement each.
+        Largest number of Gauss-Newton iterations on the delay, in each of search and refinement.
     tolerance : float, default 1e-6
-        Stop when the cost falls by less than this fraction; also the tolerance of SRIVC at each trial delay [-].
+        Stop when the cost decreases by less than this fraction; also the tolerance of SRIVC at each trial delay [-].
     variant : {"guarded", "plain"}, default "guarded"
-        ``plain`` is the published algorithm. ``guarded`` never lets the cost rise inside SRIVC and ends with joint
+        ``plain`` is the published algorithm. ``guarded`` never increases the cost inside SRIVC and ends with joint
         iterations on coefficients and delay.
     hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of the measured output between samples; changes the path, not the converged estimate.
+        Interpolation of the measured output between samples; affects the iterations, not the converged estimate.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
-        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
-        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+        Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
+        (``robust``); ``bootstrap`` adds bootstrap-t intervals. ``auto`` is white if the residuals pass the Ljung-Box
+        test at the 5 % level, else robust, or none if the record is from a loop that the estimator ignores.
+        ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
 
     Raises
     ------
@@ -89,13 +89,13 @@ class TdSrivc(Estimator["Searches", Fit]):
     Notes
     -----
     The cost as a function of the delay has many local minima, roughly one for each half period of the system's
-    dominant frequency. The search finds the one in whose basin it starts; a low-pass filter merges basins. With
+    dominant frequency. The search finds the minimum of its initial basin; a low-pass filter merges basins. With
     ``eps = y - B/A u(t - tau)``, ``d eps/d tau = p B/A u(t - tau)`` and psi the sensitivities to the coefficients,
 
     ``H = eps_tau' eps_tau - eps_tau' psi (psi' psi)^-1 psi' eps_tau``, step ``-(eps_tau' eps)/H``,
 
-    halved while it leaves the bounds or the cost does not fall. Having converged, ``guarded`` looks at all delays
-    within the bounds with the denominator that it found: where the cost is lower elsewhere, the status is ``LOCAL``.
+    halved while it leaves the bounds or the cost does not decrease. After convergence, ``guarded`` tries all delays
+    within the bounds with the estimated denominator: if the cost is lower elsewhere, the status is ``LOCAL``.
 
     References
     ----------
@@ -124,7 +124,7 @@ class TdSrivc(Estimator["Searches", Fit]):
         object.__setattr__(self, "delay_bounds", checked_bounds(self.delay_bounds))
 
     def check_start(self, start: Start) -> None:
-        """Refuse an initial delay outside the bounds."""
+        """Raise DataError for an initial delay outside the bounds."""
         initial_delay(start, self.delay_bounds)
 
     def _lay_out(self, record: Record) -> Searches:
@@ -140,7 +140,7 @@ class TdSrivc(Estimator["Searches", Fit]):
         return Searches(self._problem(filtered), problem, record)
 
     def _problem(self, record: Record) -> SampledProblem:
-        """Coefficients and delay together."""
+        """Return the joint problem of coefficients and delay."""
         data = filter_data(record, self.delay_bounds[1], self.hold_output)
         return SampledProblem(data, self.poles, self.zeros, True, *self.delay_bounds)
 
@@ -160,20 +160,20 @@ class TdSrivc(Estimator["Searches", Fit]):
         return replace(fit, status=Status.LOCAL) if local else fit
 
     def _cost(self, problem: SampledProblem, svf_cutoffs: tuple[float, ...] = ()) -> SampledCost:
-        """The cost as a function of the delay; SRIVC estimates the coefficients."""
+        """Return the cost as a function of the delay; SRIVC estimates the coefficients."""
         steps = Steps(INNER_ITERATIONS, self._limits.tolerance, self.variant)
         return SampledCost(problem._replace(free_delay=False), steps, svf_cutoffs)
 
     @property
     def _limits(self) -> Limits:
-        """What limits a search."""
+        """Limits of the search."""
         low, high = self.delay_bounds
-        # The guarded variant ends with joint iterations: its search only has to find the basin.
+        # The guarded variant ends with joint iterations, so that its search only needs to find the basin.
         tolerance = self.tolerance if self.variant == "plain" else max(self.tolerance, SEARCH_TOLERANCE)
         return Limits(low, high, self.max_iterations, tolerance, SMALLEST_STEP * (high - low))
 
     def _refine(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
-        """Go on from a delay and coefficients that a search on filtered data has found."""
+        """Continue from the delay and coefficients of a search on filtered data."""
         refined = descend(self._cost(problem), found.minimum.delay, found.minimum.theta[None], self._limits)
         history += history_of("refine", problem, refined.path)
         if refined.end is not None:
@@ -181,15 +181,15 @@ class TdSrivc(Estimator["Searches", Fit]):
         return self._finish(problem, found, history)
 
     def _finish(self, problem: SampledProblem, found: Descent, history: list[IterationRecord]) -> Fit:
-        """Polish with joint iterations on coefficients and delay, mind the bounds, and report."""
+        """Return the fit after joint iterations on coefficients and delay, with a check of the bounds."""
         theta, status, iterations = found.minimum.theta, found.end or Status.DIVERGED, found.iterations
         guarded, steps = self.variant == "guarded", Steps(self.max_iterations, self.tolerance, GUARDED)
         polished = iterate(problem, theta, steps) if guarded else None
         if polished is not None:
-            # From the right basin they converge in a few steps.
+            # In the right basin they converge in a few steps.
             history += history_of("joint", problem, polished.path)
             theta, iterations, status = polished.theta, iterations + polished.iterations, polished.status
-        # The delay is on a bound if that is where the cost leads.
+        # The delay is at a bound if the cost decreases beyond it.
         here = problem.equations(theta)
         bound = bound_in_the_way(here, float(theta[-1]), self.delay_bounds)
         if bound is not None:
@@ -204,7 +204,7 @@ class TdSrivc(Estimator["Searches", Fit]):
 
 @dataclass(frozen=True, eq=False)
 class Searches:
-    """Where to search first, on filtered samples if a filter is given, and where to finish."""
+    """Problems of the search, on filtered samples if a filter is given, and of the refinement."""
 
     first: SampledProblem
     last: SampledProblem
@@ -212,5 +212,5 @@ class Searches:
 
     @cached_property
     def bandwidth(self) -> float:
-        """Of the record [rad/s], found once for all starts."""
+        """Bandwidth of the record [rad/s], computed once for all starts."""
         return output_bandwidth(self.record)

@@ -1,4 +1,4 @@
-r"""Delay and coefficients by useful redundancy: Gauss-Newton paths on a set of low-pass-filtered costs."""
+r"""Estimation of delay and coefficients by useful redundancy: Gauss-Newton paths on low-pass-filtered costs."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from ctid_cli.inference.uncertainty import DRAWS, Covariance
 from ctid_cli.signals.record import Record, named
 from ctid_cli.signals.treatment import OutputHold
 
-#: How hard to work at each trial delay.
+#: Steps at each trial delay.
 EFFORT = Steps(6, 1e-2, GUARDED, 2)
-#: Points of the lattice by which one start of the refinement is shorter than the best delay behind the widest band.
+#: Lattice points by which one start of the refinement precedes the best delay of the filter of widest band.
 SHORTER = 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RedundantFit(Fit):
-    """A fit with the search that led to it.
+    """Fit with its search.
 
     Parameters
     ----------
@@ -50,9 +50,9 @@ class RedundantFit(Fit):
     search : RedundantMinimum or None
         Incumbents, candidates and switches: points are delays [s], costs are J0 [%].
     filters : FilterSet or None
-        The filters of the search.
+        Filters of the search.
     paths : tuple of FilterPath
-        Every solver path in the order in which they were followed.
+        All solver paths in the order of the search.
     """
 
     search: RedundantMinimum[float] | None = None
@@ -61,7 +61,7 @@ class RedundantFit(Fit):
 
     @property
     def switches(self) -> tuple[Visit[float], ...]:
-        """Where the search went on with another filter."""
+        """Incumbents at which the search changed to another filter."""
         return () if self.search is None else self.search.switches
 
 
@@ -78,7 +78,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     delay_bounds : tuple of float
         Least and greatest delay [s]. Samples earlier than the greatest delay after the first input are not used.
     bandwidth : float, optional
-        Bandwidth of the system [rad/s], its last -3 dB crossing; by default estimated from the record.
+        Bandwidth of the system [rad/s], its last -3 dB crossing; estimated from the record by default.
     filters : int, default 10
         Number of filters.
     beta : float, default 10.0
@@ -90,24 +90,24 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     max_iterations : int, default 10
         Largest number of Gauss-Newton iterations on each path.
     tolerance : float, default 1e-3
-        A path stops when its cost falls by less than this fraction, and the search when an incumbent moves by less
-        than this fraction of its delay, or of the shortest period if that is longer [-].
+        A path stops when its cost decreases by less than this fraction, and the search when an incumbent changes by
+        less than this fraction of its delay, or of the shortest period if that is longer [-].
     max_rounds : int, default 20
         Largest number of rounds over all filters.
     hold_output : {"foh", "zoh"}, default "foh"
-        Interpolation of the measured output between samples; changes the path, not the converged estimate.
+        Interpolation of the measured output between samples; affects the iterations, not the converged estimate.
     variant : {"guarded", "plain"}, default "guarded"
-        ``plain`` is the published algorithm, slower and less certain to converge.
+        ``plain`` is the published algorithm, which is slower and converges less reliably.
     covariance : {"auto", "white", "robust", "bootstrap"}, default "auto"
-        Noise that the standard errors hold for: white, or coloured with an autocorrelation estimated from the
-        residuals (``robust``), whose intervals ``bootstrap`` takes from a bootstrap-t. ``auto`` is white where the
-        residuals pass Ljung and Box's test at the level of 5 %, else robust; and gives none where they do not in a
-        loop that the estimator ignores. ``sandwich`` is an earlier name of ``robust``.
+        Noise assumed for the standard errors: white, or coloured with an autocorrelation estimated from the residuals
+        (``robust``); ``bootstrap`` adds bootstrap-t intervals. ``auto`` is white if the residuals pass the Ljung-Box
+        test at the 5 % level, else robust, or none if the record is from a loop that the estimator ignores.
+        ``sandwich`` is an earlier name of ``robust``.
     bootstrap_draws : int, default 500
-        Simulated noise sequences of a bootstrap [-].
+        Number of simulated noise sequences of a bootstrap [-].
     max_delay_step : float, optional
         Longest Gauss-Newton step of the delay [s]. By default a third of the range of the delay, in ``plain`` half the
-        shortest period: the publication has such a limit, but does not print it.
+        shortest period: the publication has such a limit without its value.
 
     Raises
     ------
@@ -120,24 +120,24 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
     a minimum of the filtered cost; the candidate of least J0 becomes the incumbent. J0 is the mean over the filters of
     ``100 ||y_k - x_k|| / ||y_k - mean y_k||``, each with its own coefficients at that delay (45).
 
-    ``guarded``: the incumbent is itself a candidate. Coefficients come from the filter next to it, first from the
-    widest band to the narrowest and then back, the cheaper kept; that of widest band starts from least squares. A path
-    starts from these coefficients, and a second time from least squares. A step that leaves the range is mirrored at
-    its end. Where every path fails and J0 is still above 25 %, each filter's path starts once more one of its periods
-    to either side. Estimates end on the unfiltered data: Gauss-Newton on the delay, then on all parameters together,
-    from the minimum of J0, from that of the filter of widest band within half the shortest period of it, and from a
-    fifth of a period less, the lowest cost kept.
+    ``guarded``: the incumbent is also a candidate. Coefficients start from those of the adjacent filter, first from the
+    widest band to the narrowest and then back, and the lower cost is kept; the filter of widest band starts from least
+    squares. A path starts from these coefficients, and again from least squares. A step out of the range is reflected
+    at its end. If every path fails and J0 is still above 25 %, each filter's path restarts one of its periods to either
+    side. Estimates are refined on the unfiltered data: Gauss-Newton on the delay, then on all parameters jointly, from
+    the minimum of J0, from that of the filter of widest band within half the shortest period of it, and from a fifth of
+    a period less, with the lowest cost kept.
 
-    ``plain``: to the letter. Each filter has one path a round and SRIVC, from least squares, for its coefficients. A
-    step is halved while it leaves the bounds or the cost of its filter does not fall. The end of least J0 is the next
-    incumbent, even where J0 was lower before, until it moves by less than ``tolerance`` of itself; then the same is
-    done once more without a filter. Three sentences of the reference are not taken at their word: footnote 6 limits
-    only increments of the delay, here decrements too; Algorithm II stops at an absolute change of its cost, which
-    depends on the unit of the output, here at a relative one; and where incumbents come back in turn the rounds have no
-    end, here they end where one does, or after ``max_rounds``.
+    ``plain``: exactly as published. Each filter has one path per round and SRIVC, from least squares, for its
+    coefficients. A step is halved while it leaves the bounds or the cost of its filter does not decrease. The end of
+    least J0 is the next incumbent, even if J0 was lower before, until its relative change is below ``tolerance``; then
+    this is repeated without a filter. There are three differences from the reference: footnote 6 limits only increments
+    of the delay, here decrements too; Algorithm II stops at an absolute change of its cost, which depends on the unit
+    of the output, here at a relative one; and cyclic incumbents never end the published rounds, here the rounds end
+    when an incumbent recurs, or after ``max_rounds``.
 
-    The search fails where no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` says for
-    which initial errors a set of filters can be trusted.
+    The search fails if no filter's path leads to a lower J0; :func:`~ctid_cli.filtering.check_filters` computes the
+    initial errors for which a set of filters is reliable.
 
     References
     ----------
@@ -186,7 +186,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
 
     @property
     def refinement(self) -> TdSrivc:
-        """The estimator that ends the estimation on unfiltered data."""
+        """Estimator of the final refinement on unfiltered data."""
         return TdSrivc(
             self.poles,
             self.zeros,
@@ -197,7 +197,7 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
         )
 
     def check_start(self, start: Start) -> None:
-        """Refuse an initial delay outside the bounds."""
+        """Raise DataError for an initial delay outside the bounds."""
         initial_delay(start, self.delay_bounds)
 
     def _lay_out(self, record: Record) -> RedundantSearch | PrintedSearch:
@@ -243,18 +243,18 @@ class UsefulRedundancy(Estimator["RedundantSearch | PrintedSearch", RedundantFit
 
 @dataclass(frozen=True, eq=False)
 class RedundantSearch:
-    """The search behind filters on one record and its end on unfiltered data, for any number of initial delays."""
+    """Search on one filtered record and refinement on unfiltered data, for any number of initial delays."""
 
     filters: FilterSet
     filtered: FilterSearch
     max_rounds: int
     refinement: TdSrivc
     unfiltered: SampledProblem
-    #: What was refined from which minimum of J0 [s].
+    #: Refined fits by the minimum of J0 [s].
     refined: dict[float, Fit] = field(default_factory=dict)
 
     def run(self, delay: float) -> tuple[Fit, RedundantMinimum[float], list[FilterPath]]:
-        """Search from an initial delay and refine what was found."""
+        """Search from an initial delay and refine the result."""
         found, paths = self.filtered.run(delay, self.max_rounds)
         if found.point not in self.refined:
             self.refined[found.point] = self._refine(found.point)
@@ -263,14 +263,14 @@ class RedundantSearch:
         return replace(fit, iterations=found.rounds + fit.iterations, history=history), found, paths
 
     def _refine(self, point: float) -> Fit:
-        """Go on from the minimum of J0, and from where the filter of widest band fits best within half a period."""
+        """Refine from the minimum of J0, and from that of the filter of widest band within half a period."""
         search = self.filtered
-        # J0 is flat around its minimum where noise, or a model with too long a delay, weighs on the narrow filters.
+        # J0 is flat around its minimum if noise, or too long a delay, dominates the costs of the narrow filters.
         nearby = point + search.period * np.linspace(-0.5, 0.5, 1 + round(1 / LATTICE))
         delays = np.unique(np.clip(nearby, *self.refinement.delay_bounds)).tolist()
         found = scan([search.costs[-1]] * len(delays), delays)
         least = int(np.argmin(found.squared_errors))
-        # Where the delay is too long a pole makes up for it by running to infinity, and does not come back.
+        # With too long a delay a pole compensates by moving to infinity, and does not return.
         starts = found.thetas[[least, max(least - SHORTER, 0)]]
         here = search.at(point)
         if np.isfinite(here.squared_errors[-1]):

@@ -1,9 +1,8 @@
-"""Frequencies of multi-sinusoidal signals in finite time, of whole records or sample by sample.
+"""Finite-time frequency estimation of multi-sinusoidal signals, for whole records or sample by sample.
 
-An estimator is a frozen dataclass of options. ``options.track(samples, interval)`` gives the frequencies at every
-sample of a record; ``online = options.start(interval)`` takes one sample after the other, ``online.update(sample)``,
-with the same numbers up to rounding. Every row carries flags that say why it must not be trusted, if so, and a sentence
-for each.
+An estimator is a frozen dataclass of options. ``options.track(samples, interval)`` returns the frequencies at every
+sample of a record; ``online = options.start(interval)`` and ``online.update(sample)`` process single samples, with
+equal results up to rounding. Every row has flags for reasons why it is unreliable, and a sentence for each flag.
 
 The recommended tracker is :class:`RestartingLeastSquares` with a prefilter. :class:`DremGradient`,
 :class:`DremFiniteTime` and :class:`DremWindow` mix the same regression into scalar ones.

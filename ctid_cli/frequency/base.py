@@ -1,4 +1,4 @@
-"""What every estimator of frequencies has in common: the option ``tones``, and a track of a whole record.
+"""Base class of frequency estimators: the option ``tones``, and the track of a whole record.
 
 A plugin is a frozen dataclass of options derived from :class:`FrequencyEstimator` whose method ``track`` returns a
 :class:`FrequencyTrack`.
@@ -20,9 +20,9 @@ from ctid_cli.frequency.flags import Flag
 from ctid_cli.signals.checks import require_integer, require_positive
 from ctid_cli.text import Shown
 
-#: More tones than this cannot be told apart in double precision.
+#: Largest number of tones that double precision can resolve.
 MOST_TONES = 8
-#: A sample larger than this counts as missing: its powers would overflow.
+#: Larger samples count as missing: their powers would overflow.
 LARGEST_SAMPLE = 1e30
 
 
@@ -33,12 +33,12 @@ class FrequencyTrack(Shown):
     Parameters
     ----------
     t : ndarray, shape (N,)
-        Instants since the first sample [s]. An estimator that gives one estimate for the whole record has one row, at
-        the last sample.
+        Instants since the first sample [s]. An estimator with one estimate for the whole record has one row, at the
+        last sample.
     frequencies : ndarray, shape (N, n)
-        Frequencies [rad/s], ascending in each row; NaN where there is no estimate.
+        Frequencies [rad/s], ascending in each row; NaN without an estimate.
     flags : ndarray of uint16, shape (N,)
-        Bit field of :class:`Flag`: why a row must not be trusted; 0 if it may.
+        Bit field of :class:`Flag`: reasons why a row is unreliable; 0 for a valid row.
     """
 
     t: Array
@@ -51,11 +51,11 @@ class FrequencyTrack(Shown):
 
     @property
     def valid(self) -> BoolArray:
-        """Rows without any flag, shape (N,)."""
+        """Mask of the rows without flags, shape (N,)."""
         return np.asarray(self.flags == 0)
 
     def reasons(self, row: int) -> tuple[str, ...]:
-        """Say why a row must not be trusted.
+        """Return the reasons why a row is unreliable.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class FrequencyTrack(Shown):
 
 @dataclass(frozen=True, kw_only=True)
 class FrequencyEstimator(ABC):
-    """Options of an estimator of frequencies.
+    """Options of a frequency estimator.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class FrequencyEstimator(ABC):
     """
 
     kind: ClassVar[str]
-    #: Whether one estimate stands for the whole record: its track has one row, at the last sample.
+    #: Whether there is one estimate for the whole record: the track then has one row, at the last sample.
     whole_record: ClassVar[bool] = False
     #: Whether the flag CHANGED is an alarm, so that false alarms are counted.
     raises_alarms: ClassVar[bool] = False
@@ -103,7 +103,7 @@ class FrequencyEstimator(ABC):
         Parameters
         ----------
         samples : array_like, shape (N,)
-            Signal on a regular clock [signal unit]; NaN where missing.
+            Regularly sampled signal [signal unit]; NaN if missing.
         interval : float
             Sampling interval [s].
 
@@ -117,11 +117,11 @@ class FrequencyEstimator(ABC):
         DataError
             If the samples are not a series of real numbers, or too few.
         ValueError
-            If the options do not fit to the sampling interval.
+            If the options are invalid for the sampling interval.
         """
 
     def check(self, count: int, interval: float) -> None:  # noqa: B027 - most estimators take any record
-        """Refuse records that the options do not fit to, before there are any.
+        """Raise DataError if the options are invalid for records of a given size.
 
         Parameters
         ----------
@@ -133,11 +133,11 @@ class FrequencyEstimator(ABC):
         Raises
         ------
         DataError
-            If the options do not fit, or the samples are too few; ``DataError(message, "h")`` blames the option h.
+            If the options are invalid, or the samples too few; ``DataError(message, "h")`` refers to the option h.
         """
 
     def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
-        """Say what is allowed but unwise on a signal: the name of an option, and a sentence about it.
+        """Yield warnings about options that are valid but unsuitable for a signal.
 
         Parameters
         ----------
@@ -149,19 +149,19 @@ class FrequencyEstimator(ABC):
         Yields
         ------
         tuple of str
-            The option and the sentence.
+            Name of the option, and a sentence.
         """
         yield from ()
 
     def keep_one_for_each(self, name: str, unit: str) -> None:
-        """Check an option that holds one positive number for each tone, and keep it as a tuple.
+        """Check an option with one positive number for each tone, and store it as a tuple.
 
         Parameters
         ----------
         name : str
-            The option.
+            Name of the option.
         unit : str
-            Its unit.
+            Unit of the option.
         """
         values = getattr(self, name)
         if values is None:
@@ -175,7 +175,7 @@ class FrequencyEstimator(ABC):
 
 
 def series_of(samples: ArrayLike) -> Array:
-    """Return one series of real numbers, with NaN for whatever counts as missing."""
+    """Return one series of real numbers, with NaN for missing samples."""
     values = np.asarray(samples)
     if values.ndim != 1 or values.dtype.kind not in "fiu":
         found = f"shape {values.shape} and type {values.dtype}"

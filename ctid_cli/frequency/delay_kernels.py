@@ -1,8 +1,8 @@
 r"""Compiled loops of the estimators on the delay regression.
 
-A kernel calls only kernels of this file and reads no constant and no type of another: Numba's cache on disk looks only
-at the file of a function, and is then never stale. Where a loop carries something from one sample to the next, it is
-kept in arrays that the loop changes in place, so that a record may be cut anywhere.
+Kernels use only kernels, constants and types of this file: Numba's disk cache depends only on the file of a function,
+so that it is never stale. The state between samples is in arrays that are modified in place, so that a record can be
+split anywhere.
 """
 
 from typing import NamedTuple
@@ -19,40 +19,40 @@ Flags = NDArray[np.uint16]
 STARTING, GAP, CHANGED, UNDETERMINED = 1, 2, 4, 8
 UNCERTAIN, COMPLEX_ROOTS, OUT_OF_BOUNDS, INCONSISTENT = 16, 32, 64, 128
 
-#: Roots must settle within this number of steps; simple ones need fewer than ten, nearly double ones thirty.
+#: Largest number of steps for roots to converge; simple ones need fewer than ten, nearly double ones thirty.
 ROOT_STEPS = 60
-#: Second moments summed over many samples carry relative errors of about this size.
+#: Approximate relative error of second moments summed over many samples.
 ROUNDING = 4e-15
-#: A squared residual below this multiple of that is not known from the moments.
+#: Smallest multiple of that error at which the moments determine a squared residual.
 DETERMINED = 10.0
-#: Added to the unit diagonal of scaled second moments where the best fit must exist even if it is not unique.
+#: Added to the unit diagonal of scaled second moments if the best fit must exist even if it is not unique.
 REGULARISATION = 1e-10
-#: An estimation younger than this number of periods, or beats of neighbours, is less certain than its misfit shows.
+#: Number of first periods, or beats of neighbours, in which an estimate is less certain than its misfit shows.
 FIRST_PERIODS = 2.0
-#: Frequencies are called certain while the error that the misfit of the equations can make stays below this fraction of
-#: the frequency itself and of the distance to its neighbours.
+#: Frequencies are certain if the possible error due to the misfit of the equations is below this fraction of the
+#: frequency and of the distance to its neighbours.
 CERTAIN_FRACTION = 0.1
-#: The frequencies are inconsistent if they leave more than this multiple of the smallest possible squared residual.
+#: The frequencies are inconsistent if their squared residual exceeds this multiple of the smallest possible one.
 WORSE_THAN_BEST = 10.0
-#: Residuals of new rows, averaged over this fraction of h, are compared with those of the estimate's own rows.
+#: Fraction of h over which residuals of new rows are averaged, to be compared with those of the rows of the estimate.
 DETECTOR_SPAN = 1.0 / 14.0
-#: The signal changed if they are so much larger (mean squares), and than rounding.
+#: Ratio of these mean squares that indicates a change of the signal, and lower limit due to rounding.
 ALARM_RATIO = 30.0
 ROUNDING_FLOOR = 1e-18
 
 
 class Clock(NamedTuple):
-    """The delay regression at a sampling interval."""
+    """Delay regression at a sampling interval."""
 
     #: Sampling interval [s].
     interval: float
-    #: The delay h in sampling intervals, and in seconds.
+    #: Delay h in sampling intervals, and in seconds.
     lag: int
     delay: float
-    #: A second delay, at which the frequencies are checked, likewise.
+    #: Second delay, at which the frequencies are checked, in sampling intervals, and in seconds.
     second_lag: int
     second_delay: float
-    #: Samples from one verdict to the next.
+    #: Samples between two checks.
     every: int
 
 
@@ -69,7 +69,7 @@ def add_row(row: Array, gram: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def residual_of(row: Array, theta: Array) -> float:
-    """Residual ``psi - phi' theta`` of a row ``[phi psi]``."""
+    """Return the residual ``psi - phi' theta`` of a row ``[phi psi]``."""
     residual = row[theta.size]
     for i in range(theta.size):
         residual -= theta[i] * row[i]
@@ -78,22 +78,22 @@ def residual_of(row: Array, theta: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def squared_residual(gram: Array, theta: Array) -> float:
-    """Sum of the squared residuals ``psi - phi' theta``; a negative one is rounding."""
+    """Return the sum of the squared residuals ``psi - phi' theta``; a negative one is rounding."""
     return max(residual_of(gram[-1] - theta @ gram[:-1], theta), 0.0)
 
 
 @njit(cache=True, nogil=True)
 def rounding_of(gram: Array, theta: Array) -> float:
-    """Rounding of the sum of the squared residuals: terms of the size ``|psi| + sum |theta_k phi_k|`` cancel in it."""
+    """Return the rounding error of the sum of squared residuals, with terms ``|psi| + sum |theta_k phi_k|``."""
     sizes = np.sqrt(np.diag(gram))
     return float(ROUNDING * (sizes[-1] + np.sum(np.abs(theta) * sizes[:-1])) ** 2)
 
 
 @njit(cache=True, nogil=True)
 def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
-    """Cholesky factor of the regressors' second moments, scaled to a unit diagonal, and the scales; if there is one."""
+    """Return success, the Cholesky factor of the second moments scaled to a unit diagonal, and the scales."""
     n = len(gram) - 1
-    # A unit diagonal makes the pivots below comparable with rounding, whatever the units of the columns.
+    # A unit diagonal makes the pivots below comparable with rounding, for any units of the columns.
     factor, scales = np.zeros((n, n)), np.sqrt(np.diag(gram)[:n])
     if not (np.isfinite(scales) & (scales > 0.0)).all():
         return False, factor, scales
@@ -107,7 +107,7 @@ def factorise(gram: Array, ridge: float) -> tuple[bool, Array, Array]:
             elif total + ridge > 4e-16 * n:
                 factor[i, i] = np.sqrt(total + ridge)
             else:
-                # What is left of a column that the others explain is rounding: not positive definite.
+                # The remainder of a linearly dependent column is rounding error: not positive definite.
                 return False, factor, scales
     return True, factor, scales
 
@@ -130,7 +130,7 @@ def substitute(factor: Array, scales: Array, values: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def least_squares(gram: Array, ridge: float, theta: Array) -> bool:
-    """Parameters with the smallest squared residual; False if the second moments do not determine them."""
+    """Compute the least-squares parameters; return False if the second moments do not determine them."""
     determined, factor, scales = factorise(gram, ridge)
     if determined:
         theta[:] = gram[theta.size, : theta.size]
@@ -142,15 +142,15 @@ def least_squares(gram: Array, ridge: float, theta: Array) -> bool:
 
 
 # ``prod(c - c_i) = c^n + theta_1 c^(n-1) + ... + theta_n`` has the roots ``c_i = cos(w_i h)``, real and within [-1, 1]
-# if theta belongs to sinusoids at all. Noise can move a pair of roots off the real axis, or a root out of the interval.
+# for sinusoids. Noise can move a pair of roots off the real axis, or a root out of the interval.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def real_roots(coefficients: Array, roots: Array) -> bool:
-    """Roots of a monic polynomial without its leading coefficient, all at once; False if some are complex.
+    """Compute all roots of a monic polynomial, given without leading coefficient; return False if some are complex.
 
-    Durand and Kerner's iteration takes every root for known to find the others. It begins with Chebyshev's points,
-    moved and stretched to the mean and the variance of the roots: with the roots themselves if there are one or two.
+    The Durand-Kerner iteration updates every root from the others. It starts at Chebyshev points with the mean and the
+    variance of the roots, which are the exact roots for degrees one and two.
     """
     n = roots.size
     mean = -coefficients[0] / n
@@ -169,7 +169,7 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
                 size = size * abs(roots[i]) + abs(coefficients[k])
                 if k != i:
                     others *= roots[i] - roots[k]
-            # A value below its own rounding says nothing of where the root is.
+            # A value below its rounding error does not locate the root.
             if not abs(value) <= 2e-16 * n * size:
                 settled = False
                 roots[i] -= value / others
@@ -180,7 +180,7 @@ def real_roots(coefficients: Array, roots: Array) -> bool:
 
 @njit(cache=True, nogil=True)
 def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
-    """Frequencies that belong to the parameters of the delay regression, ascending; flags what was wrong."""
+    """Compute ascending frequencies from the parameters of the delay regression; return flags."""
     flags, n = 0, theta.size
     if not np.isfinite(np.sum(theta)):
         omega[:] = np.nan
@@ -192,7 +192,7 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
         companion[0] = -theta
         companion[1:, : n - 1] = np.eye(n - 1)
         roots[:] = np.linalg.eigvals(companion).real
-    # The largest cosine is that of the lowest frequency, and order survives the bounds.
+    # The largest cosine belongs to the lowest frequency, and clipping preserves the order.
     if n > 2 or flags:
         roots[:] = np.sort(roots)[::-1]
     for i in range(n):
@@ -203,12 +203,12 @@ def decode(theta: Array, clock: Clock, roots: Array, omega: Array) -> int:
     return flags
 
 
-# --- how far frequencies can be trusted ----------------------------------------------------------------------------
+# --- reliability of frequencies ------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
 def spacings_of(omega: Array) -> Array:
-    """Distances of ascending frequencies to their nearest neighbours, or to zero."""
+    """Return the distances of ascending frequencies to their nearest neighbours, or to zero."""
     spacings = omega.copy()
     spacings[1:] -= omega[:-1]
     spacings[:-1] = np.minimum(spacings[:-1], spacings[1:])
@@ -217,7 +217,7 @@ def spacings_of(omega: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def lasts_a_period(omega: Array, elapsed: float) -> bool:
-    """Whether a time [s] holds a period of every frequency, and a beat of all neighbours."""
+    """Return whether a time [s] contains a period of every frequency, and a beat of all neighbours."""
     return bool(spacings_of(omega).min() * elapsed >= 2.0 * np.pi)
 
 
@@ -225,18 +225,18 @@ def lasts_a_period(omega: Array, elapsed: float) -> bool:
 def flag_uncertain(
     gram: Array, left: float, theta: Array, roots: Array, omega: Array, clock: Clock, span: float, elapsed: float
 ) -> int:
-    r"""Compare the error that the misfit of the equations can make with the frequencies and their distances.
+    r"""Compare the possible error due to the misfit of the equations with the frequencies and their distances.
 
-    Residuals e at the true parameters move a frequency with the sensitivities g by at most ``sqrt(g' G^-1 g e'e)``
-    (Cauchy-Schwarz), whatever the e: noise, a bias, another tone. The residual left by the estimate stands for
-    ``e'e``. As a difference of moments it is known up to rounding only: below that it is taken for ``left``, the sum of
-    residuals seen one by one, or for the rounding, whichever is less. Rounding of G moves a frequency by up to
-    ``|G^-1 g|`` times the rounding errors.
+    Residuals e at the true parameters shift a frequency with the sensitivities g by at most ``sqrt(g' G^-1 g e'e)``
+    (Cauchy-Schwarz), for any e: noise, a bias, another tone. The residual of the estimate replaces ``e'e``. As a
+    difference of moments it is limited by rounding: below that it is replaced by ``left``, the sum of single squared
+    residuals, or by the rounding error, whichever is less. Rounding of G shifts a frequency by up to ``|G^-1 g|`` times
+    the rounding errors.
 
-    Within a part of a period, or of the beat of two neighbours, a bias, a drift or another tone hardly differs from a
-    change of the frequencies, and hardly shows as a misfit. Measured errors grow like the fifth power of the missing
-    part: the possible error is multiplied by ``(period/span)^5``. The same holds for the first two periods: after them
-    a misfit has shown itself, even if the estimate rests on fewer samples.
+    Within a part of a period, or of the beat of two neighbours, a bias, a drift or another tone is similar to a change
+    of the frequencies, with a small misfit. Measured errors grow like the fifth power of the missing part: the possible
+    error is multiplied by ``(period/span)^5``. This also applies to the first two periods; later a misfit is reliable,
+    even if the estimate is from fewer samples.
     """
     determined, factor, scales = factorise(gram, 0.0)
     if not determined:
@@ -256,7 +256,7 @@ def flag_uncertain(
         periods = spacings[i] * min(span, elapsed / FIRST_PERIODS) / (2.0 * np.pi)
         if periods < 1.0:
             error /= max(periods, 1e-30) ** 5
-        # Rounding does not shrink with time, and is not enlarged by the lack of it. Equal roots leave NaN.
+        # Rounding does not depend on the time span. Equal roots give NaN.
         rounding = np.sqrt(ROUNDING * rounded) * np.sum(np.abs(direction) * scales)
         if not error + rounding <= CERTAIN_FRACTION * spacings[i]:
             return UNCERTAIN
@@ -265,10 +265,10 @@ def flag_uncertain(
 
 @njit(cache=True, nogil=True)
 def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float) -> int:
-    """Compare the residual that the frequencies leave at the second delay with the smallest possible one.
+    """Compare the residual of the frequencies at the second delay with the smallest possible one.
 
-    With the delay h alone, a frequency w and all its aliases ``2 pi k/h - w``, ``2 pi k/h + w`` are the same. At a
-    second delay, a whole number of sampling intervals that shares no divisor with the first, they are not.
+    The delay h cannot distinguish a frequency w from its aliases ``2 pi k/h - w``, ``2 pi k/h + w``. A second delay, a
+    whole number of sampling intervals without a common divisor with the first, can.
     """
     n = omega.size
     theta = np.zeros(n)
@@ -277,33 +277,33 @@ def flag_inconsistent(gram: Array, omega: Array, delay: float, negligible: float
         c = np.cos(omega[i] * delay)
         theta[1:] -= c * theta[:-1]
         theta[0] -= c
-    # Far below the regressand nothing is inconsistent, and the best fit need not be found.
+    # A residual far below the regressand is consistent, so that the best fit is not needed.
     residual = squared_residual(gram, theta)
     if residual <= negligible * gram[n, n] or not least_squares(gram, REGULARISATION, theta):
         return 0
     return INCONSISTENT if residual > WORSE_THAN_BEST * squared_residual(gram, theta) else 0
 
 
-# --- estimates judged by recent rows -------------------------------------------------------------------------------
+# --- checks of estimates by recent rows ----------------------------------------------------------------------------
 
 
-#: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
+#: Negligible residual of the frequencies at the second delay, as a fraction of the regressand's second moment.
 MIXED_NEGLIGIBLE = 1e-4
-#: An estimate is judged by the residuals of this multiple of n h.
+#: Time span of the residuals that check an estimate, as a multiple of n h.
 JUDGED_SPANS = 4
 NEWEST, USUAL, LEFT = range(3)
 SINCE_VERDICT, VERDICT, SINCE_DOUBT, SINCE_CHANGE = range(4)
 
 
 class Judged(NamedTuple):
-    """What is remembered of the estimates so far."""
+    """State of the checks of estimates."""
 
-    #: Samples after which nothing is left of a change.
+    #: Number of samples after which the effect of a change has ended.
     flush: int
     theta: Array
-    #: Newest mean squared residual, what it may be, and the sum of the last squared residuals.
+    #: Newest mean squared residual, its largest expected value, and the sum of the last squared residuals.
     levels: Array
-    #: Samples since the last verdict, the verdict (flags), samples since the last doubt and the last change.
+    #: Samples since the last check, its result (flags), samples since the last doubt and the last change.
     counters: IntArray
 
 
@@ -311,10 +311,10 @@ class Judged(NamedTuple):
 def judge_rows(
     theta: Array, rows: Array, grams: Array, counts: Array, clock: Clock, judged: Judged, omega: Array, flags: Flags
 ) -> None:
-    """Decode estimates that come with the moments of recent rows at both delays, and say which cannot be trusted.
+    """Decode estimates and flag unreliable ones by the moments of recent rows at both delays.
 
-    ``counts`` holds, for each estimate, its recent rows (an estimate without them is not judged), the samples that it
-    rests on and all samples so far; ``flags`` what is known.
+    ``counts`` contains, for each estimate, its number of recent rows (without any it is not checked), its number of
+    samples, and the number of all samples so far; ``flags`` are the known flags, which are extended.
     """
     n, before, levels, counters = theta.shape[1], judged.theta, judged.levels, judged.counters
     roots, interval = np.empty(n), clock.interval
@@ -328,13 +328,13 @@ def judge_rows(
         if weight == 0.0:
             continue
         started = flags[k] & STARTING == 0
-        # The residual of what was known before this row.
+        # Residual of the previous estimate at this row.
         square = residual_of(rows[k], before) ** 2
         before[:] = theta[k]
         if np.isfinite(square):
             levels[NEWEST] += smoothing * (square - levels[NEWEST])
             levels[LEFT] += square - forgotten * levels[LEFT]
-        # One unlike the others is doubted at once; otherwise a verdict is given now and then.
+        # A contradicted estimate is checked at once, others at regular intervals.
         contradicted = started and levels[NEWEST] > levels[USUAL]
         if counters[SINCE_VERDICT] == 0 or contradicted:
             gram, check = grams[k, 0].copy(), grams[k, 1].copy()
@@ -346,7 +346,7 @@ def judge_rows(
                     counters[SINCE_DOUBT] = 0
                 if contradicted:
                     counters[SINCE_CHANGE] = 0
-            # Rows from before a change must first have left the window.
+            # The window must not contain rows from before a change.
             elif counters[SINCE_CHANGE] < judged.flush or not lasts_a_period(
                 omega[k], counters[SINCE_DOUBT] * interval
             ):
@@ -363,16 +363,16 @@ def judge_rows(
 # --- least squares that restart when the signal changes ------------------------------------------------------------
 
 
-#: The estimate is computed anew with every row at first, then after this number of rows.
+#: Rows between two updates of the estimate, and number of first rows with an update at each.
 REFRESH = 10
 EAGER_ROWS = 40
-#: Rows for each tone before the first estimate.
+#: Rows per tone before the first estimate.
 FIRST_ROWS_PER_TONE = 2
-#: Older data are dropped if the whole fit leaves more than this multiple of the mean squared residual of newer ones.
+#: Older data are dropped if the mean squared residual of the whole fit exceeds this multiple of that of newer data.
 MIXED_RATIO = 6.0
-#: A fit that leaves no larger fraction of the regressand's second moment is exact, however short its data are.
+#: Squared residual of an exact fit, as a fraction of the regressand's second moment, for any length of the data.
 EXACT = 1e-13
-#: Fraction of the regressand's second moment that the frequencies may leave at the second delay.
+#: Negligible residual of the frequencies at the second delay, as a fraction of the regressand's second moment.
 NEGLIGIBLE = 1e-8
 OLDER, NEWER, CHECK = range(3)
 RESIDUAL, ALARM = 2, 3
@@ -380,14 +380,13 @@ ROWS, NEXT, FLUSH, LAST_VERDICT = range(4)
 
 
 class Restarting(NamedTuple):
-    """Settings of the tracker, counted in samples."""
+    """Settings of the tracker in samples."""
 
-    #: Rows before the detector may raise an alarm, before the first comparison of halves, and before an estimate can be
-    #: valid.
+    #: Rows before the first possible alarm, before the first comparison of halves, and before the first valid estimate.
     armed: int
     compared: int
     enough: int
-    #: Samples that the delays and the prefilter hold.
+    #: Memory of the delays and the prefilter [samples].
     flush: int
     memory: float
     #: Inverse of the lower factor of the noise covariance of a row; empty for plain least squares.
@@ -397,21 +396,21 @@ class Restarting(NamedTuple):
 class Fit(NamedTuple):
     """State of the tracker."""
 
-    #: Second moments of the rows before the last comparison of halves, of those since, and at the second delay.
+    #: Second moments of the rows before the last comparison of halves, of the rows since, and at the second delay.
     moments: Array
     theta: Array
     omega: Array
-    #: Rows older and newer than that comparison, less what was forgotten; newest mean squared residual, alarm level.
+    #: Rows before and after that comparison, minus forgotten ones; newest mean squared residual, alarm level.
     levels: Array
-    #: Rows since the restart, rows at the next comparison of halves, samples still to flush, verdict (flags).
+    #: Rows since the restart, rows at the next comparison of halves, remaining samples to flush, flags of the check.
     counters: IntArray
 
 
 @njit(cache=True, nogil=True)
 def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, age: float) -> tuple[int, bool]:
-    """Frequencies of a fit to a number of rows since a restart; flags, and whether the fit may judge new samples.
+    """Compute the frequencies of a fit to the rows since a restart; return flags, and whether it can test new samples.
 
-    It may if it is certain, or has been there for so long that its misfit is not that of a beginning.
+    It can if it is certain, or if it is too old for a starting misfit.
     """
     roots, filled = np.empty(theta.size), 2 * theta.size * clock.lag
     span, elapsed = (filled + rows) * clock.interval, (filled + age) * clock.interval
@@ -422,12 +421,12 @@ def judge(gram: Array, theta: Array, omega: Array, clock: Clock, rows: float, ag
 
 @njit(cache=True, nogil=True)
 def drop_mixed_rows(clock: Clock, compared: int, fit: Fit) -> bool:
-    """Drop the older half of the rows if the newer one fits so much better that the older is of another signal."""
+    """Drop the older half of the rows if a much better fit of the newer half shows a change of the signal."""
     moments, theta, omega, levels, counters = fit.moments, fit.theta.copy(), fit.omega.copy(), fit.levels, fit.counters
     newer, gram = moments[NEWER], moments[OLDER] + moments[NEWER]
     mixed = False
     if levels[OLDER] > 0.0 and least_squares(newer, 0.0, theta):
-        # A fit to so few rows that it says nothing must not condemn the others, unless it is exact.
+        # A fit to too few rows must not reject the others, unless it is exact.
         alone = squared_residual(newer, theta)
         judges = judge(newer, theta, omega, clock, levels[NEWER], levels[NEWER])[1]
         if (judges or alone <= EXACT * newer[-1, -1]) and least_squares(gram, 0.0, theta):
@@ -442,26 +441,26 @@ def drop_mixed_rows(clock: Clock, compared: int, fit: Fit) -> bool:
     levels[OLDER] += levels[NEWER]
     moments[NEWER] = 0.0
     levels[NEWER] = 0.0
-    # At doubling intervals: whatever is mixed is found at the latest when as much again has arrived.
+    # Doubling intervals: mixed data are detected at the latest when their length has doubled.
     counters[NEXT] = max(compared, 2 * counters[ROWS])
     return mixed
 
 
 @njit(cache=True, nogil=True)
 def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
-    """Estimate by least squares or total least squares, alarm level and verdict from all rows."""
+    """Update the (total) least-squares estimate, the alarm level and the flags from all rows."""
     n, theta, levels, counters = fit.theta.size, fit.theta, fit.levels, fit.counters
     gram, weight = fit.moments[OLDER] + fit.moments[NEWER], levels[OLDER] + levels[NEWER]
-    # Tones that the rows do not tell apart leave a singular matrix; the last estimate is then kept, marked.
+    # Tones that the rows do not resolve give a singular matrix; the last estimate is then kept with a flag.
     counters[LAST_VERDICT] = UNDETERMINED
     if not least_squares(gram, 0.0, theta):
         return
     if whitener.size > 0:
-        # In M G M' the noise is the same in all directions, M the inverse of its lower factor. v = M' u for the
-        # eigenvector u of the least eigenvalue, theta = -v_phi/v_psi.
+        # In M G M' the noise is isotropic, with M the inverse of its lower factor. v = M' u for the eigenvector u of
+        # the least eigenvalue, theta = -v_phi/v_psi.
         v = whitener.T @ np.ascontiguousarray(np.linalg.eigh(whitener @ gram @ whitener.T)[1][:, 0])
         theta[:] = -v[:n] / v[n:]
-    # Residuals of an exact fit are rounding; the lower limit keeps them from raising an alarm.
+    # The lower limit prevents alarms by residuals of an exact fit, which are rounding.
     levels[ALARM] = (ALARM_RATIO * squared_residual(gram, theta) + ROUNDING_FLOOR * gram[n, n]) / weight
     verdict, judges = judge(gram, theta, fit.omega, clock, weight, counters[ROWS])
     if not judges:
@@ -472,14 +471,14 @@ def refresh(clock: Clock, whitener: Array, fit: Fit) -> None:
 
 @njit(cache=True, nogil=True)
 def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, omega: Array, flags: Flags) -> None:
-    """Least squares with alarm, flush, restart and comparison with the newer data alone."""
+    """Run least squares with alarm, flush, restart and comparison with a fit to newer data only."""
     moments, theta, own_omega, levels, counters = fit
     smoothing = 1.0 / max(1, round(DETECTOR_SPAN * clock.lag))
     for k in range(len(omega)):
         row, found = rows[0, k], np.isfinite(rows[0, k, 0])
         flag = 0 if found or counters[ROWS] + counters[FLUSH] == 0 else GAP
         if counters[FLUSH] > 0:
-            # Samples from before the change are still in the delays: hold the estimate.
+            # The delays still contain samples from before the change: hold the estimate.
             counters[FLUSH] -= 1
             flag |= CHANGED
         elif found:
@@ -490,23 +489,23 @@ def restarting_fits(rows: Array, clock: Clock, settings: Restarting, fit: Fit, o
                 moments[:] = 0.0
                 levels[: RESIDUAL + 1] = 0.0
             elif counters[ROWS] >= settings.armed:
-                # The detector sees the row before the fit does.
+                # The detector uses the row before the fit does.
                 levels[RESIDUAL] += smoothing * (residual_of(row, theta) ** 2 - levels[RESIDUAL])
             counters[ROWS] += 1
             if levels[OLDER] + levels[NEWER] > settings.memory - 0.5:
-                # What exceeds the memory is forgotten exponentially.
+                # Data beyond the memory are forgotten exponentially.
                 keep = 1.0 - 1.0 / settings.memory
                 levels[: NEWER + 1] *= keep
                 moments *= keep
             levels[NEWER] += 1.0
             add_row(row, moments[NEWER])
             add_row(rows[1, k], moments[CHECK])
-            # A second change while the delays were flushed leaves rows of two signals.
+            # After a second change during the flush there are rows of two signals.
             dropped = counters[ROWS] >= counters[NEXT] and drop_mixed_rows(clock, settings.compared, fit)
             due = dropped or counters[ROWS] % REFRESH == 0 or counters[ROWS] <= EAGER_ROWS
             if due and counters[ROWS] >= FIRST_ROWS_PER_TONE * theta.size:
                 refresh(clock, settings.whitener, fit)
-            # The alarm comes last: an estimate that has just been refreshed is judged by its own level.
+            # The alarm is last, so that an updated estimate is compared with its own level.
             if levels[RESIDUAL] > levels[ALARM]:
                 counters[FLUSH], counters[ROWS] = settings.flush, 0
                 flag = CHANGED

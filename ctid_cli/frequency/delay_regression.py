@@ -1,9 +1,9 @@
-r"""The delay regression of a multi-sinusoidal signal, and what all estimators on it share.
+r"""Delay regression of a multi-sinusoidal signal, and base classes of its estimators.
 
 For ``y = sum A_i sin(w_i t + p_i)`` and a delay h, with ``c_i = cos(w_i h)`` and
 ``prod(c - c_i) = c^n + theta_1 c^(n-1) + ... + theta_n``, the operator ``prod(Z^2 + 1 - 2 c_i Z)`` annihilates y, where
-Z delays by h. Written out, ``psi = phi' theta`` with ``psi = -(Z^2 + 1)^n y`` and
-``phi_k = (2 Z)^k (Z^2 + 1)^(n-k) y``: a linear regression for theta that holds exactly from t = 2 n h on.
+Z delays by h. Expanded, ``psi = phi' theta`` with ``psi = -(Z^2 + 1)^n y`` and
+``phi_k = (2 Z)^k (Z^2 + 1)^(n-k) y``: a linear regression for theta that is exact from t = 2 n h on.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ from ctid_cli.frequency.base import FrequencyEstimator, FrequencyTrack, series_o
 from ctid_cli.frequency.delay_kernels import Clock
 from ctid_cli.signals.checks import Checked, require_not_negative, require_positive
 
-#: Longest delay in sampling intervals: the samples of twice n delays are kept.
+#: Longest delay in sampling intervals: the samples of 2 n delays are stored.
 LONGEST_DELAY = 10_000_000
-#: The second delay is near this fraction of the first, as far from every simple ratio as can be.
+#: Approximate fraction of the second delay to the first, as far as possible from simple ratios.
 GOLDEN_FRACTION = (np.sqrt(5.0) - 1.0) / 2.0
-#: A number without a common divisor lies within this distance of any place, for all delays that are allowed.
+#: Largest distance to a number without a common divisor, for all allowed delays.
 SEARCHED = 100
-#: Verdicts per delay h, and the greatest number of samples between two of them.
+#: Checks per delay h, and the greatest number of samples between two of them.
 VERDICTS_PER_DELAY = 64
 MOST_BETWEEN = 8
-#: A delay that rounding to whole sampling intervals changes by a larger fraction is worth a note.
+#: Relative change of a delay by rounding to whole sampling intervals above which there is a warning.
 NOTEWORTHY_ROUNDING = 0.01
-#: An estimate is valid after this many rows for each tone, and after this fraction of n h: before, the rows are too few
-#: or too much alike to show that they disagree.
+#: Rows per tone, and fraction of n h, after which an estimate can be valid: earlier rows are too few or too similar to
+#: reveal a disagreement.
 ROWS_PER_TONE = 4
 STARTING_SPAN = 0.25
-#: Samples of a record that are taken at a time: what is computed of them stays below 100 MB.
+#: Samples of a record that are processed at once, which limits the memory to 100 MB.
 BLOCK = 1 << 15
 
 
 @dataclass(frozen=True, kw_only=True)
 class DelayRegression(Checked, FrequencyEstimator):
-    """Options of all estimators on the delay regression.
+    """Common options of the estimators on the delay regression.
 
     Parameters
     ----------
     h : float
-        Delay of the regression [s], below pi over the highest frequency, as frequencies above pi/h are seen as lower
-        ones; rounded to whole sampling intervals.
+        Delay of the regression [s], below pi over the highest frequency, since frequencies above pi/h alias; rounded to
+        whole sampling intervals.
     prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none.
+        Length of a Hann low-pass filter of the signal [s]; 0 for none.
     difference : float, default 0.0
-        If positive, the signal this much earlier is subtracted [s], which removes a constant bias.
+        If positive, the signal delayed by this time is subtracted [s], which removes a constant bias.
 
     Raises
     ------
@@ -62,7 +62,7 @@ class DelayRegression(Checked, FrequencyEstimator):
         If an option is out of range.
     """
 
-    #: Further options that say for how long samples are kept [s].
+    #: Names of further options with a time for which samples are stored [s].
     _kept: ClassVar[tuple[str, ...]] = ()
 
     h: Annotated[float, require_positive, "s"]
@@ -71,15 +71,15 @@ class DelayRegression(Checked, FrequencyEstimator):
 
     @property
     def _stacked_over(self) -> float:
-        """Time that the rows of an estimate reach back [s]."""
+        """Time span of the rows of an estimate [s]."""
         return 0.0
 
     @abstractmethod
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
 
     def track(self, samples: ArrayLike, interval: float) -> FrequencyTrack:
-        """Estimate the frequencies at every sample of a record: see :meth:`FrequencyEstimator.track`."""
+        """Estimate the frequencies at every sample of a record, see :meth:`FrequencyEstimator.track`."""
         online, y = self.start(interval), series_of(samples)
         omega, flags = np.empty((y.size, self.tones)), np.zeros(y.size, np.uint16)
         for first in range(0, y.size, BLOCK):
@@ -88,9 +88,9 @@ class DelayRegression(Checked, FrequencyEstimator):
         return FrequencyTrack(interval * np.arange(y.size, dtype=float), omega, flags)
 
     def check(self, count: int, interval: float) -> None:
-        """Refuse delays that are longer than a record of ``count`` samples, and options that its clock cannot have."""
+        """Refuse delays longer than a record of ``count`` samples, and options that are invalid for its clock."""
         duration = interval * count
-        # First of all, since the estimation would keep all the samples of such a time.
+        # This check is first, since the estimation would store all samples of such a time.
         for name in ("prefilter", "difference", *self._kept):
             value = getattr(self, name)
             if value > duration:
@@ -102,7 +102,7 @@ class DelayRegression(Checked, FrequencyEstimator):
         self.start(interval)
 
     def warnings(self, interval: float, highest: float) -> Iterator[tuple[str, str]]:
-        """Say that a frequency has an alias at the delay, or that the clock does not have the delay."""
+        """Yield warnings about aliases of frequencies at the delay, and about a rounded delay."""
         if highest * self.h > np.pi:
             limit = f"with h = {self.h:g} s, frequencies above pi/h = {np.pi / self.h:.4g} rad/s"
             yield "h", f"{limit} are seen as lower ones, and the signal has {highest:g} rad/s"
@@ -118,10 +118,10 @@ class DelayRegression(Checked, FrequencyEstimator):
         return Clock(float(interval), lag, lag * interval, second, second * interval, every)
 
     def weights(self, interval: float) -> Array:
-        """Return the impulse response in front of the regression, shape (L + 1,).
+        """Return the impulse response of the prefilter, shape (L + 1,).
 
-        ``w_k = sin^2(pi (k + 1)/(L + 2))``, scaled to the sum 1: the Hann window without its two zeros. It keeps every
-        sinusoid, and an exact estimate exact.
+        ``w_k = sin^2(pi (k + 1)/(L + 2))``, scaled to the sum 1: the Hann window without its two zeros. Sinusoids
+        remain sinusoids, so that exact estimates remain exact.
         """
         order, shift = (
             whole_delay(name, getattr(self, name), interval) if getattr(self, name) > 0 else 0
@@ -132,11 +132,11 @@ class DelayRegression(Checked, FrequencyEstimator):
         return weights - np.roll(weights, shift) if shift else weights
 
     def rows_before_valid(self, clock: Clock) -> int:
-        """Return the rows that must have arrived before an estimate can be valid."""
+        """Return the number of rows before an estimate can be valid."""
         return max(ROWS_PER_TONE * self.tones, int(STARTING_SPAN * self.tones * clock.lag))
 
     def require_samples(self, memory: float, samples: float, interval: float) -> None:
-        """Refuse a memory [s] of fewer samples than an estimate needs."""
+        """Refuse a memory [s] with fewer samples than an estimate needs."""
         needed = ROWS_PER_TONE * self.tones
         if samples < needed:
             few = f"{samples:.3g} samples of {interval:g} s, fewer than the {needed} that {self.tones} tones need."
@@ -144,9 +144,9 @@ class DelayRegression(Checked, FrequencyEstimator):
 
 
 class Online(ABC):
-    """An estimation that takes one sample, or a block of samples, after the other.
+    """Online estimation from single samples, or blocks of samples.
 
-    Both pass through the same code: a block of one gives the numbers of a whole record, up to rounding.
+    Both use the same code: single samples give the results of a whole record, up to rounding.
     """
 
     def __init__(self, options: DelayRegression, interval: float, *, past: float = np.nan) -> None:
@@ -160,17 +160,17 @@ class Online(ABC):
 
     @abstractmethod
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
 
     def update(self, sample: float) -> FrequencyTrack:
-        """Take the next sample, NaN if it is missing; return the one row of the track at its instant."""
+        """Process the next sample, NaN if missing, and return the row of the track at its instant."""
         omega, flags = np.empty((1, self.options.tones)), np.zeros(1, np.uint16)
         self.advance(series_of([float(sample)]), omega, flags)
         self._seen += 1
         return FrequencyTrack(np.array([(self._seen - 1) * self.clock.interval]), omega, flags)
 
     def rows(self, samples: Array) -> Array:
-        """Return the rows ``[phi psi]`` at h and at the second delay, (2, N, n + 1); NaN where a sample is missing."""
+        """Return the rows ``[phi psi]`` at h and at the second delay, (2, N, n + 1); NaN for missing samples."""
         if self.weights.size > 1:
             samples = np.convolve(self._unfiltered.extended(samples), self.weights, "valid")
         past, delays = self._filtered.extended(samples), np.arange(2 * self.options.tones + 1)
@@ -182,13 +182,13 @@ class Online(ABC):
 
 
 class Tail:
-    """The newest rows of a stream: what a delay, a filter or a mixing needs of the past."""
+    """Newest rows of a stream, as required by a delay, a filter or a mixing."""
 
     def __init__(self, kept: Array) -> None:
         self._kept = kept
 
     def extended(self, new: Array) -> Array:
-        """Return the rows kept and the new ones, and keep the last of them."""
+        """Return the stored rows followed by new ones, and store the last of them."""
         whole = np.concatenate((self._kept, new))
         self._kept = whole[len(new) :].copy()
         return whole
@@ -205,7 +205,7 @@ def delay_table(tones: int) -> Array:
 
 
 def whole_delay(name: str, delay: float, interval: float) -> int:
-    """Return the sampling intervals nearest to a delay."""
+    """Return a delay rounded to whole sampling intervals."""
     require_positive("interval", interval, "s")
     if delay / interval > LONGEST_DELAY:
         longest = f"{LONGEST_DELAY:,} sampling intervals of {interval:g} s"
@@ -226,5 +226,5 @@ def second_lag(lag: int) -> int:
 
 
 def theta_of(omega: ArrayLike, delay: float) -> Array:
-    """Return the parameters of the regression that belong to given frequencies."""
+    """Return the parameters of the regression for given frequencies."""
     return np.asarray(np.poly(np.cos(np.asarray(omega, dtype=float) * delay))[1:])

@@ -1,6 +1,6 @@
 r"""Frequencies by dynamic regressor extension and mixing (DREM) of the delay regression.
 
-The regression is stacked at n instants, d apart, and multiplied by the adjugate of the regressor matrix:
+The regression is stacked at n instants with the spacing d, and multiplied by the adjugate of the regressor matrix:
 ``Psi_k = Delta theta_k`` with one determinant Delta for all k, a scalar regression for each parameter.
 """
 
@@ -24,14 +24,14 @@ from ctid_cli.signals.checks import require_integer, require_positive
 
 @dataclass(frozen=True, kw_only=True)
 class MixingOptions(DelayRegression):
-    """Options of all estimators on the mixed regressions.
+    """Common options of the estimators on the mixed regressions.
 
     Parameters
     ----------
     d : float
-        Distance of the stacked rows [s]; rounded to whole sampling intervals.
+        Spacing of the stacked rows [s]; rounded to whole sampling intervals.
     first_row : int, default 1
-        Number of the first stacked row; 1 as published, 0 is exact one d earlier.
+        Number of the first stacked row; 1 as published; 0 gives exact estimates one d earlier.
     """
 
     _kept: ClassVar[tuple[str, ...]] = ("d",)
@@ -55,21 +55,20 @@ class DremGradient(MixingOptions):
     epsilon : float, default 1.0
         Normalisation of the mixed regression [-].
     gamma : float or tuple of float, default 1.0
-        Adaptation gain, one for all parameters or one for each.
+        Adaptation gain, common or separate for each parameter.
     initial_frequencies : tuple of float, optional
-        Frequencies to begin with [rad/s]; by default spread over zero to pi/h. Above it they alias, which only moves
-        the beginning.
+        Initial frequencies [rad/s]; by default spread over zero to pi/h. Higher ones alias, which only changes the
+        start.
     power : int or "literal", default 1
         Power of ``epsilon`` in the mixed regression; "literal" for the number of tones.
     gated : bool, default True
-        Whether the estimation waits until the delays are filled; False fills them with zeros, which enter the estimate.
+        Whether estimation waits until the delays are filled; False fills them with zeros, which affect the estimate.
 
     Notes
     -----
-    ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)``, solved exactly over each sampling interval with Delta and
-    Psi_k held, so that no gain is too large. The rate of convergence is ``gamma_k`` times the mean of ``Delta^2``. The
-    recursion is that of :class:`DremFiniteTime`, which gives the same estimate
-    without the part of the initial value.
+    ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)``, solved exactly over each sampling interval with constant Delta
+    and Psi_k, so that no gain is too large. The rate of convergence is ``gamma_k`` times the mean of ``Delta^2``. The
+    recursion is that of :class:`DremFiniteTime`, whose estimate excludes the part of the initial value.
 
     References
     ----------
@@ -97,7 +96,7 @@ class DremGradient(MixingOptions):
             require_integer("power", self.power, 1)
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         return OnlineGradient(self, interval)
 
 
@@ -110,21 +109,21 @@ class DremFiniteTime(DremGradient):
     Parameters
     ----------
     initial_frequencies : tuple of float, optional
-        Frequencies shown before there is an estimate [rad/s]; by default spread over zero to pi/h. Above it they alias.
+        Frequencies before the first estimate [rad/s]; by default spread over zero to pi/h. Higher ones alias.
 
     Notes
     -----
-    With ``Delta = eps^p det Phi`` and ``Psi = eps^p adj(Phi) Psi_f`` held over each interval Ts, the gradient estimate
+    With ``Delta = eps^p det Phi`` and ``Psi = eps^p adj(Phi) Psi_f`` constant over each interval Ts, the estimate
     ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` is ``theta_k(t) = z_k + (1 - q_k) theta_k(0)`` with
     ``z_k += m_k (Psi_k/Delta - z_k)``, ``q_k += m_k (1 - q_k)``, ``m_k = 1 - exp(-gamma_k Delta^2 Ts)``. The
     finite-time estimate ``z_k/q_k`` is the published ``(theta_k - theta_k(0) W_k)/(1 - W_k)`` with ``W_k = 1 - q_k``,
-    free of the cancellation in its numerator. Without noise it is exact from ``t = 2 n h + (first_row + n - 1) d`` on;
-    after a change of the signal it forgets the past only as fast as the gradient estimate does. Noise biases it, since
-    the regressors hold the noisy signal: a prefilter in front reduces the bias, a smaller gain does not.
+    without the cancellation in its numerator. Without noise it is exact from ``t = 2 n h + (first_row + n - 1) d`` on;
+    after a change of the signal it forgets the past only as fast as the gradient estimate. Noise biases it, since the
+    regressors contain the noisy signal: a prefilter reduces the bias, a smaller gain does not.
 
-    An estimate is valid if the regressions of the last ``4 n h`` bear it out: their residuals bound the error of each
-    frequency that they can show; and if the frequencies explain the signal at a second delay. A row that contradicts
-    the estimate invalidates it until all these rows are newer.
+    An estimate is valid if the residuals of the regressions of the last ``4 n h`` sufficiently bound the error of each
+    frequency, and if the frequencies explain the signal at a second delay. A row that contradicts the estimate
+    invalidates it until all these rows are newer.
 
     References
     ----------
@@ -161,11 +160,10 @@ class DremWindow(MixingOptions):
     Notes
     -----
     ``theta_k(t) = sum Delta Psi_k / sum Delta^2`` over the last ``memory`` seconds. It is the limit for small gains of
-    ``(theta_k(t) - theta_k(t - T) W)/(1 - W)``, ``W = exp(-gamma int_(t-T)^t Delta^2)``, the finite-time estimate that
-    starts anew at every instant; there is no gain to choose. Exact, without noise, from
-    ``2 n h + (first_row + n - 1) d`` on, and again that much and one ``memory`` after a change. The sums are those of
-    the samples in the window alone: a block of old samples is summed backwards once, and the newer ones forwards, so no
-    rounding error accumulates.
+    ``(theta_k(t) - theta_k(t - T) W)/(1 - W)``, ``W = exp(-gamma int_(t-T)^t Delta^2)``, the finite-time estimate with
+    a restart at every instant; there is no gain. Without noise it is exact from ``2 n h + (first_row + n - 1) d`` on,
+    and after a change from that time plus one ``memory`` on. The sums contain only the samples in the window: a block
+    of old samples is summed backwards once, and the newer ones forwards, so that no rounding error accumulates.
 
     References
     ----------
@@ -180,14 +178,14 @@ class DremWindow(MixingOptions):
     memory: Annotated[float, require_positive, "s"]
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         window = whole_delay("memory", self.memory, interval)
         self.require_samples(self.memory, window, interval)
         return OnlineMixing(self, interval, window)
 
 
 class OnlineMixing(Online):
-    """Estimation from mixed regressions with a window of rows to judge it by: by least squares over the window itself.
+    """Estimation from mixed regressions by least squares over a window, with checks by the rows of the window.
 
     The window's sums are ``[Delta Psi, Delta^2, mixed rows, rows, second moments at h and at the second delay]``.
     """
@@ -208,19 +206,19 @@ class OnlineMixing(Online):
         self._judged = Judged(filled + window, np.full(n, np.nan), np.zeros(3), np.array([0, 0, 1 << 50, 1 << 50]))
 
     def estimates(self, mixed: Array, sums: Array, used: Array) -> tuple[Array, Array]:
-        """Return theta by least squares over the window, NaN where Delta vanishes, and the mixed rows in the window."""
+        """Return theta by least squares over the window, NaN if Delta is zero, and the mixed rows in the window."""
         n = self.options.tones
         with np.errstate(invalid="ignore"):
             return sums[:, :n] / sums[:, n : n + 1], sums[:, n + 1]
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
         rows, n = self.rows(samples), omega.shape[1]
         history, count = self._mixed_rows.extended(rows[0]), samples.size
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             mixed = self.scale * mix([history[len(history) - count - age : len(history) - age] for age in self._ages])
             squares = mixed[:, n:] * mixed
-        # A regression whose square is too large for a number is not used.
+        # Regressions with an overflowing square are not used.
         found = np.asarray(np.isfinite(squares).all(axis=1))
         mixed[~found] = squares[~found] = np.nan
         products = [(own[:, :, None] * own[:, None, :]).reshape(count, -1) for own in rows]
@@ -240,7 +238,7 @@ class OnlineMixing(Online):
 
 
 class OnlineGradient(OnlineMixing):
-    """The gradient or finite-time estimate, sample by sample."""
+    """Online gradient or finite-time estimation."""
 
     def __init__(self, options: DremGradient, interval: float) -> None:
         n, lag = options.tones, whole_delay("h", options.h, interval)
@@ -260,17 +258,17 @@ class OnlineGradient(OnlineMixing):
 
 @njit(cache=True, nogil=True)
 def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool, steps: Array, theta: Array) -> None:
-    """Exact solution of ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` over each interval, Delta and Psi held.
+    """Solve ``theta_k' = gamma_k Delta (Psi_k - Delta theta_k)`` exactly over intervals with constant Delta and Psi.
 
-    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN
-    change nothing.
+    ``theta = z + (1 - q) theta(0)``, with z and q in ``steps``; the finite-time estimate is ``z/q``. Rows with NaN are
+    ignored.
     """
     z, q = steps
     for k in range(len(mixed)):
         delta = mixed[k, -1]
         for i in range(gains.size):
             if np.isfinite(delta):
-                # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 where Delta vanishes.
+                # m = 1 - exp(-x), the share of the new row; gain = gamma m/x without 0/0 for zero Delta.
                 x = gains[i] * delta * delta
                 m = -np.expm1(-x)
                 gain = gains[i] * (m / x if x > 1e-8 else 1.0 - 0.5 * x)
@@ -283,9 +281,9 @@ def gradient_steps(mixed: Array, gains: Array, initial: Array, finite_time: bool
 def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Array) -> None:
     """Sum entries over a sliding window.
 
-    A block of old entries is summed backwards once, and the newer ones forwards; nothing is ever subtracted, so no
-    rounding error of an entry outlives it. ``window`` holds plain entries before ``place`` and, from there on, each
-    summed with all that follow it.
+    A block of old entries is summed backwards once, and the newer ones forwards, without subtractions, so that rounding
+    errors do not outlast the entries. ``window`` contains single entries before ``place`` and, from there on, sums of
+    each entry with all following ones.
     """
     last = len(window) - 1
     for k in range(len(entries)):
@@ -293,7 +291,7 @@ def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Ar
         newer += entries[k]
         sums[k] = newer
         if place[0] < last:
-            # The next place holds the sum of all older entries that are still in the window.
+            # The next place contains the sum of all older entries in the window.
             sums[k] += window[place[0] + 1]
             place[0] += 1
             continue
@@ -306,7 +304,7 @@ def slide(entries: Array, window: Array, newer: Array, place: IntArray, sums: Ar
 def mix(rows: Sequence[Array]) -> Array:
     """Return ``[adj(Phi) Psi, det Phi]`` of n stacked rows ``[phi psi]``, each of shape (N, n + 1).
 
-    Laplace expansion along the last row: every minor of the first rows is computed once, and finite though singular.
+    Laplace expansion along the last row computes every minor of the first rows once, also for singular matrices.
     """
     n = len(rows)
     minors: dict[tuple[int, ...], Array] = {(): np.ones(len(rows[0]))}
@@ -319,6 +317,6 @@ def mix(rows: Sequence[Array]) -> Array:
             )
             for chosen in combinations(range(n + 1), size + 1)
         }
-    # Minors without phi_1, ..., phi_n, psi. Column psi moves from the last place to place k by n - 1 - k exchanges.
+    # Minors without phi_1, ..., phi_n, psi. Column psi moves from the last place to place k in n - 1 - k exchanges.
     signs = [*((-1.0) ** (n - 1 - k) for k in range(n)), 1.0]
     return np.asarray(np.column_stack(list(minors.values())[::-1]) * signs)

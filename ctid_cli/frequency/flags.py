@@ -1,4 +1,4 @@
-"""Why an estimate must not be trusted, one bit for each reason."""
+"""Reasons why an estimate is invalid, one bit for each."""
 
 from enum import IntFlag
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 class Flag(IntFlag):
-    """Reasons for which an estimate is marked invalid; an estimate is valid exactly if it has none.
+    """Reasons why an estimate is invalid; an estimate without flags is valid.
 
     Notes
     -----
@@ -31,11 +31,11 @@ class Flag(IntFlag):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One sentence for each flag that is set: what happened, and what to change."""
+        """One sentence for each flag that is set, with cause and remedy."""
         return tuple(MEANINGS[flag] for flag in Flag if flag in self)
 
 
-#: What each flag tells the user.
+#: Message of each flag.
 MEANINGS: dict[Flag, str] = {
     Flag.STARTING: "Too few samples have arrived since the start or since the last restart.",
     Flag.GAP: "A sample that the estimate needs at this instant is missing or not finite.",
@@ -60,7 +60,7 @@ MEANINGS: dict[Flag, str] = {
 
 
 def flag_names(flags: NDArray[np.uint16]) -> NDArray[Any]:
-    """Return the names of the flags that are set in each of some bit fields, of the same shape."""
+    """Return the names of the flags that are set in each bit field, of the same shape."""
     values, places = np.unique(flags, return_inverse=True)
     names = [" ".join(str(flag.name).lower() for flag in Flag if value & flag) for value in values.tolist()]
     return np.array(names, dtype=object)[places].reshape(flags.shape)

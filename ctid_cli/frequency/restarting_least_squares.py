@@ -15,12 +15,12 @@ from ctid_cli.signals.checks import require_positive
 
 Solution = Literal["least_squares", "total_least_squares"]
 
-#: The data that the detector needs before it may raise an alarm: a number of h, and of lengths of the prefilter.
+#: Time before the first possible alarm, in units of h and in lengths of the prefilter.
 ARMING_SPAN = 1.43
 ARMING_PREFILTERS = 2
-#: The halves of the data are first compared after this number of lengths of the prefilter.
+#: Time before the first comparison of the halves of the data, in lengths of the prefilter.
 MIXED_PREFILTERS = 8
-#: Memory if none is given, in units of h.
+#: Default memory, in units of h.
 DEFAULT_MEMORY = 100.0
 
 
@@ -33,25 +33,25 @@ class RestartingLeastSquares(DelayRegression):
     Parameters
     ----------
     h : float
-        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals. The best
-        one is 0.7 to 0.8 times pi over the highest frequency.
+        Delay of the regression [s], below pi over the highest frequency; rounded to whole sampling intervals. The
+        optimum is 0.7 to 0.8 times pi over the highest frequency.
     memory : float, optional
         Data older than this are forgotten exponentially [s]; by default 100 h. A slow drift, or a step too small
-        to be seen in the noise, is followed with a lag of this size and raises no alarm.
+        to be detected in the noise, is tracked with a lag of this size and without an alarm.
     solution : {"least_squares", "total_least_squares"}, default "least_squares"
         Total least squares allows for white noise in the regressors too: no bias without a prefilter.
     prefilter : float, default 0.0
-        Length of a Hann low-pass in front of the regression [s]; 0 for none. Least squares is biased by noise without
-        one; about 1.5 h is a good length.
+        Length of a Hann low-pass filter of the signal [s]; 0 for none. Without it, noise biases least squares; about
+        1.5 h is a good length.
 
     Notes
     -----
     ``G = sum [phi psi]' [phi psi]`` and ``theta = G_phiphi^-1 G_phipsi``: without noise exact as soon as the regressors
     are independent, 2 n h and the length L of the prefilter after the start. The squared residual
-    ``psi - phi' theta`` of new samples, averaged over h/14, is compared with that of the fit; 30 times as much is an
-    alarm. The estimate is then held, marked invalid, for ``L + 2 n h``, until no sample from before the change is left
-    in the delays, and starts anew: finite time again after every change. Should the data be mixed nevertheless (a
-    second change while the delays were flushed), fits to the newer part alone, compared at doubling intervals, show it.
+    ``psi - phi' theta`` of new samples, averaged over h/14, is compared with that of the fit; a ratio of 30 is an
+    alarm. The estimate is then held, marked invalid, for ``L + 2 n h``, until the delays contain no samples from before
+    the change, and is restarted, so that it converges in finite time after every change. Data mixed by a second change
+    during this time are detected by fits to the newer part only, at doubling intervals.
 
     Total least squares minimises ``v' G v / v' C v``, ``v = (-theta, 1)``, where C is the covariance of the rows of
     filtered white noise.
@@ -76,12 +76,12 @@ class RestartingLeastSquares(DelayRegression):
     solution: Solution = "least_squares"
 
     def start(self, interval: float) -> Online:
-        """Begin an estimation before its first sample, with the sampling interval [s]."""
+        """Start an online estimation with the sampling interval [s]."""
         return OnlineRestarting(self, interval)
 
 
 class OnlineRestarting(Online):
-    """The restarting fit, sample by sample."""
+    """Online estimation with restarts."""
 
     def __init__(self, options: RestartingLeastSquares, interval: float) -> None:
         super().__init__(options, interval)
@@ -106,7 +106,7 @@ class OnlineRestarting(Online):
         self._fit = Fit(np.zeros((3, n + 1, n + 1)), theta, omega, np.zeros(4), np.zeros(4, np.int64))
 
     def advance(self, samples: Array, omega: Array, flags: NDArray[np.uint16]) -> None:
-        """Take samples, and write the frequencies and the flags at their instants."""
+        """Process samples, and write the frequencies and the flags at their instants."""
         restarting_fits(self.rows(samples), self.clock, self._settings, self._fit, omega, flags)
 
 

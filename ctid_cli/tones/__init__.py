@@ -1,1 +1,1 @@
-"""Tones of recorded signals over time: how many there are, and what is known of each at every instant."""
+"""Number, frequencies and amplitudes of the tones of recorded signals over time, with standard errors."""

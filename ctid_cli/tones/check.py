@@ -1,4 +1,4 @@
-"""What windows say of the tones at many instants, and which of that is refuted by what is left of them."""
+"""Readings of the tones of all windows at given instants, and their tests against the residuals."""
 
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from ctid_cli.tones.window_fit import WindowTones
 
 
 class Readings(NamedTuple):
-    """One entry for each instant and tone that some window shows there."""
+    """Estimates at given instants: one entry for each instant, window and tone."""
 
-    #: Which of the instants.
+    #: Index of the instant.
     row: IndexArray
     #: Frequency and its standard error [rad/sample].
     omega: Array
@@ -24,26 +24,26 @@ class Readings(NamedTuple):
     #: Logarithmic growth of the amplitude [1/sample] and rate of change of the frequency [rad/sample^2].
     growth: Array
     rate: Array
-    #: Length of the window, and where its middle is [samples].
+    #: Length and middle of the window [samples].
     window: IndexArray
     middle: Array
-    #: Whether the window tells the tone from its neighbours, and whether the tone is there beyond doubt.
+    #: Whether the window resolves the tone from its neighbours, and whether its amplitude is significant.
     resolved: BoolArray
     significant: BoolArray
-    #: Distance of the lines of a comb that the tone belongs to, 0 if to none, and the band of that [rad/sample].
+    #: Line spacing of the tone's comb, 0 if it belongs to none, and limits of the comb's band [rad/sample].
     gap: Array
     low: Array
     high: Array
-    #: Which tone of its window it is.
+    #: Index of the tone in its window.
     tone: IndexArray
 
     def at(self, which: IndexArray) -> "Readings":
-        """Return some of the readings."""
+        """Return a subset of the readings."""
         return Readings(**{name: getattr(self, name)[which] for name in self._fields})
 
 
 def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
-    """Read windows of one length at all places [samples] that lie in them, the windows nearest to a place first."""
+    """Evaluate windows of one length at all places [samples] inside them, the windows nearest to a place first."""
     half = 0.5 * length
     low = np.searchsorted(tones.middle, places - half, side="right")
     count = np.searchsorted(tones.middle, places + half, side="right") - low
@@ -60,8 +60,8 @@ def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
     x = places[row] - tones.middle[window]
     growth, rate = of(tones.growth), of(tones.rate)
     omega, error = _frequency(tones, length, window, tone, x)
-    # The amplitude at the end of a window depends on its growth; where it has vanished, an exponential that is none
-    # would seem surer than the noise allows.
+    # The amplitude at the end of a window depends on its growth; if it has decayed, the error is not scaled down, or a
+    # decay that is not exponential would get an error below that of the noise.
     grown = np.exp(np.clip(growth * x, -20.0, 20.0))
     amplitude = of(tones.amplitude) * grown
     relative = of(tones.amplitude_error) / of(tones.amplitude)
@@ -79,7 +79,7 @@ def readings_of(tones: WindowTones, length: int, places: Array) -> Readings:
 
 
 def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexArray, x: Array) -> tuple[Array, Array]:
-    """Return frequencies at a distance from the middles, and standard errors with what no test would have found."""
+    """Return frequencies at a distance from the middles, and standard errors that include undetectable changes."""
 
     def of(values: Array) -> Array:
         return np.asarray(values[window, tone])
@@ -88,7 +88,7 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
     omega_error, rate, growth, bend = of(tones.omega_error), of(tones.rate), of(tones.growth), of(tones.bend)
     omega = of(tones.omega) + rate * x
     error = _error_at(x, omega_error, of(tones.omega_with_rate), of(tones.rate_error))
-    # A phase c P3(u) that was left out changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is that at the middle.
+    # An unmodelled phase c P3(u) changes the frequency at u by (7.5 u^2 - 1.5) c; `bend` is its value at the middle.
     share, curved = 1.0 - 5.0 * (x / half) ** 2, np.abs(bend) / of(tones.bend_error)
     error = np.where(curved > c.QUIET, np.hypot(error, 0.5 * share * bend), error)
     bent = curved > c.BENT
@@ -102,14 +102,14 @@ def _frequency(tones: WindowTones, length: int, window: IndexArray, tone: IndexA
 
 
 def _error_at(x: Array, error: Array, covariance: Array, slope_error: Array) -> Array:
-    """Return the standard error of a value at a distance from where it and its slope are estimated together."""
+    """Return the standard error of a value at distance x from the point at which it and its slope are estimated."""
     return np.asarray(np.sqrt(np.maximum(error**2 + 2.0 * covariance * x + (slope_error * x) ** 2, 0.0)))
 
 
 def _leaked(tones: WindowTones, length: int) -> Array:
-    """Return the energy that what is left of windows has at each of their tones, in units of the noise, shape (R, n).
+    """Return the energy of the residual lines and changes at each tone, in units of the noise, shape (R, n).
 
-    That is infinite for a line within the tone's own width.
+    It is infinite for a line within the width of the tone.
     """
     bins = length / (2.0 * np.pi)
     away = np.abs(tones.omega - tones.line[:, None]) * bins
@@ -124,7 +124,7 @@ def _leaked(tones: WindowTones, length: int) -> Array:
 
 
 def _raised(tones: WindowTones, length: int) -> Array:
-    """Return the factor by which what is left of windows raises the errors of their frequencies, shape (R, n)."""
+    """Return the factor by which the residuals of windows increase the errors of frequencies, shape (R, n)."""
     own = c.STEP**2 * np.where(tones.change_chance < c.DOUBTFUL, tones.change_energy, 0.0)
     changed = tones.change_chance < c.LEVEL
     own[changed] = c.KINKED**2 * tones.change_energy[changed]
@@ -138,7 +138,7 @@ def _energy(tones: WindowTones) -> Array:
 
 
 def _sound(tones: WindowTones, length: int) -> BoolArray:
-    """Return which tones nothing that is left of their window disturbs, shape (R, n)."""
+    """Return which tones are not disturbed by the residual of their window, shape (R, n)."""
     sound = np.isfinite(tones.omega_error) & tones.converged[:, None] & (_raised(tones, length) < c.MOST_RAISED)
     full = np.isfinite(tones.omega).all(axis=1, keepdims=True)
     line = np.where(tones.line_chance < c.LEVEL, tones.line_energy, 0.0)[:, None]
@@ -146,14 +146,14 @@ def _sound(tones: WindowTones, length: int) -> BoolArray:
 
 
 def explained(tones: WindowTones, length: int) -> bool:
-    """Return whether nothing is left of any window that a shorter one could explain."""
+    """Return whether no window has a residual that shorter windows could explain."""
     resolved = _distance(tones) * length / (2.0 * np.pi) >= c.RESOLVED
     clean = _sound(tones, length) & resolved & (tones.change_chance >= c.DOUBTFUL)
     return bool((clean | np.isnan(tones.omega)).all())
 
 
 def _distance(tones: WindowTones) -> Array:
-    """Return the distance of each tone from the nearest other one of its window [rad/sample], shape (R, n)."""
+    """Return the distance from each tone to its nearest neighbour in the window [rad/sample], shape (R, n)."""
     order = np.argsort(tones.omega, axis=1)
     steps = np.diff(np.take_along_axis(tones.omega, order, axis=1), axis=1, prepend=-np.inf, append=np.inf)
     steps = np.where(np.isnan(steps), np.inf, steps)
@@ -163,10 +163,10 @@ def _distance(tones: WindowTones) -> Array:
 
 
 def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
-    """Return distances and bands of the combs that tones belong to, each of shape (R, n), zero where there is none.
+    """Return the line spacings and bands of the combs of tones, each of shape (R, n), zero without a comb.
 
-    Amplitude or frequency that changes periodically makes lines at equal distances, each of them as steady as a tone.
-    Distances that are a large share of the frequencies are those of harmonics.
+    Periodic modulation of amplitude or frequency gives equally spaced lines, each as steady as a tone. Spacings that
+    are a large share of the frequencies are those of harmonics.
     """
     gap, low, high = np.zeros((3, *tones.omega.shape))
     if tones.omega.shape[1] < c.COMB:
@@ -179,7 +179,7 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
     for row, k in np.argwhere(equal):
         if gap[row, order[row, k + 1]] > 0.0:
             continue
-        # All lines at multiples of the distance belong to the comb, unless too many are missing between them.
+        # All lines at multiples of the spacing belong to the comb, unless too many are missing between them.
         base = steps[row, k]
         away = (omega[row] - omega[row, k + 1]) / base
         lines = np.sort(np.round(away[np.abs(away - np.round(away)) <= c.UNEQUAL * np.maximum(1.0, np.abs(away))]))
@@ -195,7 +195,7 @@ def _combs(tones: WindowTones) -> tuple[Array, Array, Array]:
 
 
 def moving(r: Readings, bounds: IndexArray) -> BoolArray:
-    """Return which readings are lines that one moving tone makes, as shorter windows show."""
+    """Return which readings are lines of one modulated tone, according to shorter windows."""
     refuted = np.zeros(r.row.size, np.bool_)
     for k in np.flatnonzero(r.gap > 0.0):
         row = slice(bounds[r.row[k]], bounds[r.row[k] + 1])

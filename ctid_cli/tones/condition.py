@@ -1,4 +1,4 @@
-"""A recorded signal made ready: checks, spikes, and fewer samples where its tones are low."""
+"""Conditioning of a recorded signal: checks, removal of spikes, and decimation if its tones are low."""
 
 from typing import NamedTuple
 
@@ -11,22 +11,22 @@ from ctid_cli.tones import constants as c
 
 
 class Conditioned(NamedTuple):
-    """Samples that the tones are looked for in, and what was done to the record."""
+    """Conditioned samples, and the operations applied to the record."""
 
-    #: Samples divided by ``scale``, NaN where missing, shape (M,).
+    #: Samples divided by ``scale``, NaN if missing, shape (M,).
     samples: Array
-    #: Sampling interval [s], and the instant of the first of these samples [s since the first of the record].
+    #: Sampling interval [s], and instant of the first conditioned sample [s since the first of the record].
     interval: float
     begins: float
     scale: float
-    #: Impulse response of the low-pass, and one of how many samples is kept.
+    #: Impulse response of the low-pass filter, and decimation factor.
     weights: Array
     factor: int
     #: Sentences for the user.
     reasons: tuple[str, ...]
 
     def gain(self, turn: Array) -> Array:
-        """Return the factor by which the filter changes amplitudes at some phases from sample to sample [rad]."""
+        """Return the gain of the filter at frequencies [rad/sample]."""
         if self.weights.size == 1:
             return np.ones_like(turn)
         response = np.abs(rfft(self.weights, 2 * c.RESPONSE_PADDING * self.weights.size))
@@ -34,7 +34,7 @@ class Conditioned(NamedTuple):
 
 
 def condition(samples: Array, interval: float) -> Conditioned:
-    """Check a record, take its spikes as missing, and thin it as far as its highest line allows."""
+    """Check a record, mark its spikes as missing, and decimate it as far as its highest line allows."""
     refuse_unusable(samples)
     spikes = find_spikes(samples)
     reasons = []
@@ -43,7 +43,7 @@ def condition(samples: Array, interval: float) -> Conditioned:
         told = f"Spikes, {c.SPIKE_TIMES:g} times as high as all around them, are taken as missing"
         reasons.append(f"{told}: {spikes.sum()}.")
     scale = float(np.nanmax(np.abs(samples)))
-    # Rounding leaves no noise by which errors could be told.
+    # Dither: a rounded signal has no noise from which errors could be estimated.
     samples = samples / scale + c.DITHER * np.random.default_rng(0).standard_normal(samples.size)
     most = samples.size // c.FEWEST_KEPT
     top = highest_line(samples) if most > 1 else np.pi
@@ -62,19 +62,19 @@ def condition(samples: Array, interval: float) -> Conditioned:
 
 
 def low_pass(factor: int) -> Array:
-    """Return the impulse response of the filter before one of so many samples is kept, an odd number of taps."""
+    """Return the impulse response of the decimation filter, with an odd number of taps."""
     from scipy.signal import firwin, kaiserord  # slow to import
 
-    # What would fold into the kept band is stopped.
+    # The stop band covers the frequencies that alias into the kept band.
     taps, beta = kaiserord(c.STOP_BAND, 2.0 * (1.0 - c.KEPT_BAND) / factor)
     return np.asarray(firwin(taps | 1, 1.0 / factor, window=("kaiser", beta)))
 
 
 def thinned_by(samples: Array, weights: Array, factor: int) -> Array:
-    """Return every so many-th sample of a filtered record, where the filter does not reach beyond it."""
+    """Return the decimated samples of a filtered record, where the filter does not extend beyond it."""
     from scipy.signal import upfirdn  # slow to import
 
-    # Later by so many samples, the first output that the whole filter has entered is one of those kept.
+    # This shift makes the first output of the complete filter one of the kept samples.
     later = -(weights.size - 1) % factor
     first = (weights.size - 1 + later) // factor
     thinned = upfirdn(np.pad(weights, (later, 0)), samples, down=factor)
@@ -95,12 +95,12 @@ def refuse_unusable(samples: Array) -> None:
 
 
 def find_spikes(samples: Array) -> BoolArray:
-    """Return where a record, which may have missing samples, has values no sum of a few tones can have."""
+    """Return the mask of spikes: values that no sum of a few tones can have; samples may be missing."""
     there = np.isfinite(samples)
     if not there.any():
         return there
     size = np.where(there, np.abs(samples - np.median(samples[there])), 0.0)
-    # The largest of some blocks; of those on one side of a spike, the next one or the one after lies within its reach.
+    # Block maxima; on each side of a spike, the next block or the one after it lies within the range compared.
     half, reach = c.SPIKE_AROUND // 2, c.SPIKE_WIDTH + c.SPIKE_AROUND
     blocks = np.pad(size, (0, -size.size % half)).reshape(-1, half).max(axis=1)
     around = np.pad(blocks, 2)
@@ -116,7 +116,7 @@ def find_spikes(samples: Array) -> BoolArray:
 
 
 def bridge_gaps(samples: Array, longest: int) -> Array:
-    """Fill gaps of at most so many samples by straight lines."""
+    """Interpolate gaps of at most ``longest`` samples linearly."""
     missing = ~np.isfinite(samples)
     if longest < 1 or not missing.any():
         return samples
@@ -130,10 +130,10 @@ def bridge_gaps(samples: Array, longest: int) -> Array:
 
 
 def highest_line(samples: Array) -> float:
-    """Return the phase per sample [rad] of the highest line of a record, in segments of several lengths.
+    """Return the highest line frequency of a record [rad/sample], from segments of several lengths.
 
-    A line is an ordinate of a tapered periodogram that white noise exceeds in one of a thousand records, so far is it
-    above the median around it. Long segments show the weakest lines, short ones those that move or do not last.
+    A line is an ordinate of a tapered periodogram with a ratio to the local median that white noise exceeds in one of
+    a thousand records. Long segments detect weak lines, short ones varying or transient lines.
     """
     values = np.nan_to_num(samples - np.nanmean(samples))
     top, length = 0.0, values.size

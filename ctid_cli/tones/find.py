@@ -1,4 +1,4 @@
-"""Lines in what tones leave of their windows: the colour of the noise, its level, and the strongest ordinates."""
+"""Detection of lines in the residuals of windows: noise spectrum, noise floor and strongest ordinates."""
 
 from typing import NamedTuple
 
@@ -10,41 +10,41 @@ from ctid_cli.tones import constants as c
 
 
 class Left(NamedTuple):
-    """What is left of windows of one length, whitened."""
+    """Whitened residuals of windows of one length."""
 
-    #: Whitened residuals of mean square 1 where they are noise; zero where a sample is missing, shape (R, L).
+    #: Whitened residuals, of mean square 1 if they are noise; zero for missing samples, shape (R, L).
     white: Array
     #: Prediction-error filter of each window, shape (R, p + 1).
     filters: Array
     #: Mean square of the innovations, shape (R,).
     innovations: Array
-    #: Phase per sample of the largest ordinate before any whitening [rad], and its ratio to the floor, shape (R,).
+    #: Frequency of the largest ordinate before whitening [rad/sample], and its ratio to the noise floor, shape (R,).
     peak: Array
     peak_height: Array
 
     def noise(self, turn: Array) -> Array:
-        """Return the mean square of white noise as strong as that at some phases per sample [rad], shape (R, n)."""
+        """Return the mean square of white noise with the local density at frequencies [rad/sample], shape (R, n)."""
         lags = np.arange(self.filters.shape[1])
         response = (self.filters[:, None, :] * np.exp(-1j * turn[:, :, None] * lags)).sum(axis=2)
         return np.asarray(self.innovations[:, None] / np.abs(response) ** 2)
 
 
 class Lines(NamedTuple):
-    """The strongest line that is left of each window."""
+    """Strongest line in the residual of each window."""
 
-    #: Chance of noise to show one as strong, shape (R,).
+    #: p-value under noise alone, shape (R,).
     chance: Array
-    #: Its phase per sample [rad], its ratio to the floor, and the energy that the largest ordinate would take away, in
-    #: units of the noise, shape (R,).
+    #: Frequency [rad/sample], ratio to the noise floor, and energy of the largest ordinate in units of the noise,
+    #: shape (R,).
     omega: Array
     height: Array
     energy: Array
 
 
 def whiten(residuals: Array, fitted: IndexArray) -> Left:
-    """Whiten rows of residuals, of which ``fitted`` parameters each were estimated, by autoregressive models.
+    """Whiten rows of residuals of fits with ``fitted`` parameters by autoregressive models.
 
-    The models are those of the noise: ordinates far above the floor are cut from the spectrum before they are made.
+    The models describe the noise only: ordinates far above the noise floor are clipped before they are estimated.
     """
     rows, length = residuals.shape
     there = np.isfinite(residuals)
@@ -56,7 +56,7 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
     height = power[each, peak] / np.maximum(floor[each, peak], c.SMALLEST_FLOOR)
     order = min(c.WHITENING_ORDER, max(1, length // c.SAMPLES_PER_ORDER))
     cosines = np.cos(np.outer(np.arange(order + 1), np.linspace(0.0, np.pi, power.shape[1])))
-    # The first and the last ordinate are there once, all others twice.
+    # In the two-sided spectrum the first and the last ordinate occur once, all others twice.
     weighted = cosines.copy()
     weighted[:, 1:-1] *= 2.0
     filters = prediction_errors(np.minimum(power, c.CUT * floor) @ weighted.T)
@@ -76,19 +76,19 @@ def whiten(residuals: Array, fitted: IndexArray) -> Left:
 
 
 def periodogram(values: Array) -> Array:
-    """Return the squares of the padded transform of rows, whose length is even."""
+    """Return the squared magnitudes of the zero-padded transforms of rows; the padded length is even."""
     size = next_fast_len(c.PADDING * values.shape[1], real=True)
     transform = rfft(values, size + size % 2, axis=1)
     return np.asarray(transform.real**2 + transform.imag**2)
 
 
 def floor_bins(length: int) -> int:
-    """Return the number of bins in one running median of the ordinates of a window."""
+    """Return the width of the running median of the ordinates of a window [bins]."""
     return min(c.FLOOR_BINS, length // 4) // 2 * 2 + 1
 
 
 def running_floor(power: Array, length: int) -> Array:
-    """Return running medians of rows of ordinates, as means of exponential variables; straight lines between some."""
+    """Return running medians of rows of ordinates, scaled to means of exponential variables, interpolated linearly."""
     half = floor_bins(length) // 2
     hop = max(1, half // 2)
     bins = power[:, :: c.PADDING]
@@ -112,24 +112,24 @@ def prediction_errors(covariances: Array) -> Array:
 
 
 class Spectrum(NamedTuple):
-    """Ordinates of what is left of windows, whitened."""
+    """Periodograms of whitened residuals."""
 
-    #: Squares of the padded transform, and their ratio to the floor, shape (R, K).
+    #: Squared magnitudes of the padded transform, and their ratio to the noise floor, shape (R, K).
     ordinates: Array
     ratio: Array
-    #: Samples of the window, how well the floor is known, and the phase per sample from one ordinate to the next [rad].
+    #: Samples of the window, effective number of ordinates of the noise floor, and frequency step [rad/sample].
     length: int
     known: float
     turn: float
 
     def chance(self, height: Array) -> Array:
-        """Return the chance of noise to show a ratio as high anywhere; the floor is uncertain too."""
+        """Return the p-value of the largest ratio under noise, allowing for the uncertain noise floor."""
         one = (1.0 + height / self.known) ** -self.known
         return np.asarray(-np.expm1(c.INDEPENDENT * self.length * np.log1p(-np.minimum(one, 1.0 - 1e-16))))
 
 
 def spectrum_of(white: Array) -> Spectrum:
-    """Return the ordinates of whitened rows."""
+    """Return the periodograms of whitened rows."""
     length = white.shape[1]
     ordinates = periodogram(white)
     ratio = ordinates / np.maximum(running_floor(ordinates, length), c.SMALLEST_FLOOR)
@@ -140,10 +140,10 @@ def spectrum_of(white: Array) -> Spectrum:
 
 
 def strongest_lines(left: Left, spectrum: Spectrum) -> Lines:
-    """Find the strongest lines of each row, in the ratio of the periodogram to its running median."""
+    """Find the strongest line of each row by the ratio of the periodogram to its running median."""
     place = spectrum.ratio.argmax(axis=1)
     height = spectrum.ratio[np.arange(place.size), place]
-    # The models of the noise have taken the skirts of a very strong line for its colour.
+    # The noise models have absorbed the skirts of a very strong line.
     plain = left.peak_height > c.LINE_HEIGHT
     return Lines(
         np.where(plain, 0.0, spectrum.chance(height)),
@@ -154,10 +154,11 @@ def strongest_lines(left: Left, spectrum: Spectrum) -> Lines:
 
 
 def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Array:
-    """Return lines that are no part of the tones of windows, the strongest first [rad/sample], shape (R, K).
+    """Return lines that do not belong to the tones of windows, the strongest first [rad/sample], shape (R, K).
 
-    NaN where there is none. ``tones`` are those a window has [rad/sample], and ``change`` the energy that a change of
-    each would explain, (R, n). What is left within the width of a tone, or explained better by its change, is no line.
+    Missing ones are NaN. ``tones`` are the frequencies in the window [rad/sample], ``change`` the energies that a
+    change of each would explain, (R, n). A peak within the width of a tone, or explained better by its change, is not
+    a line.
     """
     bin_ = 2.0 * np.pi / spectrum.length
     ratio = spectrum.ratio.copy()
@@ -184,7 +185,7 @@ def new_lines(left: Left, spectrum: Spectrum, tones: Array, change: Array) -> Ar
 
 
 def _clear(ratio: Array, places: Array, reach: int) -> None:
-    """Set ordinates around some places to zero, shape (R, n); NaN where there is none."""
+    """Set the ordinates around ``places``, shape (R, n), to zero; NaN places are ignored."""
     row, column = np.nonzero(np.isfinite(places))
     near = np.round(places[row, column]).astype(int)[:, None] + np.arange(-reach, reach + 1)
     ratio[row[:, None], np.clip(near, 0, ratio.shape[1] - 1)] = 0.0

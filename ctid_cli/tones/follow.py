@@ -1,4 +1,4 @@
-"""Tones over time: of each instant the longest sound windows, followed from each instant to the next."""
+"""Tracking of tones over time: readings of the longest undisturbed windows, connected from row to row."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ from ctid_cli.tones.window_fit import WindowTones, fit_steady, fit_tones, neares
 def readings_at(
     samples: Array, places: Array, longest: int, tell: Callable[[int, int], None] | None = None
 ) -> Readings:
-    """Return the tones of a signal at some places [samples], ascending: of each that of its longest sound window."""
+    """Return the tones of a signal at ascending places [samples], each from its longest undisturbed window."""
     if longest == samples.size and (steady := fit_steady(samples)) is not None:
         found = readings_of(steady, longest, places)
         if explained(steady, longest) and not (found.gap > 0.0).any():
@@ -29,7 +29,7 @@ def readings_at(
             tell(done, len(lengths))
         tones = fit_tones(samples, length, first, c.MOST_LINES, tones)
         parts.append(readings_of(tones, length, places))
-    # The longest windows first, and of those of one length the one whose middle is nearest.
+    # The longest windows first; at equal length, the one with the nearest middle.
     found = Readings(*(np.concatenate(each) for each in zip(*parts[::-1], strict=True)))
     found = found.at(np.argsort(found.row, kind="stable"))
     bounds = np.searchsorted(found.row, np.arange(places.size + 1))
@@ -41,9 +41,9 @@ def readings_at(
 
 
 def _windows(lengths: list[int], count: int, places: Array) -> list[IndexArray]:
-    """Return the first samples of the windows of each length that are read at any place, or where others start.
+    """Return the first samples of the windows of each length that contain a place or provide starts for longer ones.
 
-    Where places are far apart, most of the short windows lie between them.
+    If places are far apart, most of the short windows lie between them and are omitted.
     """
     chosen: list[IndexArray] = []
     longer: Array = np.empty(0)
@@ -61,14 +61,14 @@ def paths_of(found: Readings, places: Array) -> list[IndexArray]:
     step = float(np.median(np.diff(places))) if places.size > 1 else 1.0
     paths = _joined(_followed(found, places, step), found, places.size)
     paths = [path for path in paths if _described(found, path, places, step)]
-    # What lasts counts more than what is loud for a moment.
+    # Sorted by duration times amplitude, so that long tones precede short loud ones.
     return _merged(sorted(paths, key=lambda path: -path.size * float(np.median(found.amplitude[path]))), found)
 
 
 def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
-    """Join paths within one bin of their windows: the rows of the stronger one count.
+    """Merge paths within one bin of their windows: the rows of the stronger one take precedence.
 
-    Those that are mostly there at once are compared then, others by their medians.
+    Paths that mostly coincide in time are compared at common rows, others by their medians.
     """
     merged: list[IndexArray] = []
     for path in paths:
@@ -89,12 +89,12 @@ def _merged(paths: list[IndexArray], found: Readings) -> list[IndexArray]:
 
 
 def _centre(found: Readings, path: IndexArray) -> float:
-    """Return the median frequency of the surer half of the readings of a path [rad/sample]."""
+    """Return the median frequency of the more accurate half of the readings of a path [rad/sample]."""
     return float(np.median(found.omega[path][found.error[path] <= np.median(found.error[path])]))
 
 
 def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
-    """Pair readings of adjacent rows so that the sum of their misfits is least."""
+    """Connect readings of adjacent rows with the least sum of misfits."""
     ended: list[list[int]] = []
     open_: list[list[int]] = []
     bounds = np.searchsorted(found.row, np.arange(places.size + 1))
@@ -116,7 +116,7 @@ def _followed(found: Readings, places: Array, step: float) -> list[IndexArray]:
 
 
 def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array) -> Array:
-    """Return how far readings are off what tones would be by now, as a share of what is allowed, (tones, readings)."""
+    """Return deviations of readings from extrapolated tones, relative to the tolerance, (tones, readings)."""
     passed = places[found.row[here]][None, :] - places[found.row[before]][:, None]
     moved = 0.5 * (found.rate[before][:, None] + found.rate[here][None, :]) * passed
     off = np.abs(found.omega[here][None, :] - found.omega[before][:, None] - moved)
@@ -126,7 +126,7 @@ def _misfit(found: Readings, before: IndexArray, here: IndexArray, places: Array
 
 
 def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexArray]:
-    """Put the pieces of one tone together, the nearest pieces first."""
+    """Join the segments of one tone, the closest segments first."""
     ends = np.array([(found.row[p[0]], found.row[p[-1]]) for p in paths]).reshape(-1, 2)
     omega = np.array([(found.omega[p[0]], found.omega[p[-1]]) for p in paths]).reshape(-1, 2)
     pause = ends[None, :, 0] - ends[:, None, 1]
@@ -153,13 +153,13 @@ def _joined(paths: list[IndexArray], found: Readings, rows: int) -> list[IndexAr
 
 
 def _described(found: Readings, path: IndexArray, places: Array, step: float) -> bool:
-    """Return whether a tone lasts for one of its windows, and is worth its parameters and the place of its window.
+    """Return whether a tone lasts for one of its windows and reduces the minimum description length.
 
-    That is the minimum description length of a tone of a signal.
+    The cost of a tone includes its parameters and the position of its window.
     """
     sure = found.resolved[path] & found.significant[path] & (found.error[path] < c.COARSE * found.omega[path])
     window = found.window[path]
-    # The noise beneath a line is uncertain too, as it is for the test that finds lines.
+    # The noise level near a line is uncertain, as in the test that finds lines.
     known = c.MEDIAN_EFFICIENCY * np.minimum(float(floor_bins(4 * c.FLOOR_BINS)), 0.5 * window)
     gain = known * np.log1p(0.5 * (found.amplitude[path] / found.amplitude_error[path]) ** 2 / known)
     worth = gain > 0.5 * PARAMETERS * np.log(window) + np.log(np.maximum(1.0, places[-1] / window))

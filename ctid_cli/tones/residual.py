@@ -1,4 +1,4 @@
-"""What the tones of a track leave of its record."""
+"""Residual of a record after subtraction of the tones of its track."""
 
 from typing import NamedTuple
 
@@ -13,15 +13,15 @@ from ctid_cli.tones.track import Track
 
 
 class LeftOver(NamedTuple):
-    """A signal without its mean, what tones leave of it, and the amplitude spectra of both."""
+    """A signal without its mean, its residual, and the amplitude spectra of both."""
 
     signal: Array
     residual: Array
-    #: Where not all tones are known, or the sample is missing or a spike, shape (N,).
+    #: True where a tone is unknown, or the sample is missing or a spike, shape (N,).
     unknown: BoolArray
     #: Samples in a segment of the spectra.
     size: int
-    #: Amplitude of a steady tone that would stand so high, medians over segments [signal unit].
+    #: Spectra scaled to the amplitude of a steady tone, medians over segments [signal unit].
     signal_spectrum: Array
     residual_spectrum: Array
     #: Sampling interval [s].
@@ -39,13 +39,13 @@ class LeftOver(NamedTuple):
 
     @property
     def root_mean_squares(self) -> tuple[float, float]:
-        """Return those of the signal and of what the tones leave, where all tones are known [signal unit]."""
+        """RMS of the signal and of the residual where all tones are known [signal unit]."""
         signal, residual = (np.sqrt(np.mean(each[~self.unknown] ** 2)) for each in (self.signal, self.residual))
         return float(signal), float(residual)
 
     @property
     def percent_of_power(self) -> float:
-        """Share of the power of the signal that the tones leave [%]."""
+        """Share of the power of the signal in the residual [%]."""
         signal, residual = self.root_mean_squares
         return 100.0 * (residual / signal) ** 2 if signal else 0.0
 
@@ -61,7 +61,7 @@ def without_spikes(samples: Array) -> Array:
 
 
 def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
-    """Return what the tones of a track leave; None where their rows are nowhere known for a segment."""
+    """Return the residual of a track; None if no segment has known rows throughout."""
     samples = without_spikes(samples)
     centred = samples - float(np.mean(samples[np.isfinite(samples)]))
     left = centred - synthesised(track, interval * np.arange(samples.size, dtype=np.float64))
@@ -80,15 +80,15 @@ def left_over(samples: Array, interval: float, track: Track) -> LeftOver | None:
 
 
 def synthesised(track: Track, t: Array) -> Array:
-    """Return the sum of the tones of a track at some instants [s], shape (N,); NaN where a tone or its row is unknown.
+    """Return the sum of the tones of a track at instants [s], shape (N,); NaN where a tone or its row is unknown.
 
-    Each row describes sinusoids whose phase is known at its instant; between two rows the signal goes over from those
-    of one to those of the other. Before the first row and after the last, each is followed for half of its window.
+    Each row describes sinusoids with a known phase at its instant; between two rows the signal is cross-faded. Before
+    the first row and after the last, each tone is extrapolated for half of its window.
     """
     if not track.t.size:
         return np.full(t.size, np.nan)
     absent = ((track.flags & int(Flag.ABSENT)) != 0) & ~np.isfinite(track.omega)
-    # Where a tone is absent its numbers do not matter.
+    # The numbers of an absent tone are not used.
     omega, amplitudes, phase = (np.where(absent, 0.0, each) for each in (track.omega, track.amplitudes, track.phase))
     growth, rate = np.nan_to_num(track.growth), np.nan_to_num(track.rate)
     window = track.window[np.isfinite(track.window)]
@@ -117,6 +117,6 @@ def median_spectrum(values: Array, begins: Array, size: int) -> Array:
     taper = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
     taper /= taper.sum()
     tapered = taper * np.array([values[k : k + size] for k in begins])
-    # The mean of a segment, with the weights of the window.
+    # Weighted mean of a segment, with the weights of the window.
     tapered -= tapered.sum(axis=1, keepdims=True) * taper
     return np.asarray(np.median(2.0 * np.abs(rfft(tapered, c.SPECTRUM_PADDING * size)), axis=0))

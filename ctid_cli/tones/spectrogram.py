@@ -1,4 +1,4 @@
-"""The spectrogram of a signal, fine enough to tell its tones apart."""
+"""Spectrogram of a signal with a resolution that separates its tones."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from ctid_cli.arrays import Array
 from ctid_cli.tones.residual import without_spikes
 from ctid_cli.tones.track import Track
 
-#: Columns of the picture, and its most rows.
+#: Columns of the image, and its largest number of rows.
 COLUMNS, MOST_ROWS = 480, 360
-#: Distance of the closest tones in a segment, where the record is long enough [bins].
+#: Distance of the closest tones in a segment, if the record is long enough [bins].
 RESOLVED_BINS = 8.0
 #: Least and greatest number of samples in a segment.
 SHORTEST, LONGEST = 64, 2**15
@@ -28,7 +28,7 @@ def spectrogram(
     segments: dict[str, Any] = {"nperseg": size, "noverlap": size - step, "nfft": 2 * size}
     hertz, t, levels = signal.spectrogram(values, 1.0 / interval, "hann", mode="magnitude", **segments)
     levels = levels[: max(2, int(np.searchsorted(hertz, top, "right")))]
-    # Of neighbouring bins that share a row the strongest is shown.
+    # A row shows the strongest of its bins.
     together = -(-levels.shape[0] // MOST_ROWS)
     padded = np.pad(levels, ((0, -levels.shape[0] % together), (0, 0)))
     table = padded.reshape(-1, together, t.size).max(axis=1)
@@ -38,7 +38,7 @@ def spectrogram(
 
 
 def _segment(count: int, interval: float, track: Track) -> int:
-    """Return the samples of a segment: enough to tell the closest tones apart, not too many to see what moves."""
+    """Return the segment length [samples]: long enough to resolve the closest tones, short enough to show changes."""
     columns = [column[np.isfinite(column)] for column in track.omega.T]
     middles = [float(np.median(column)) for column in columns if column.size]
     apart = np.diff(np.sort([0.0, *middles, *(line.omega for line in track.missing)])) / (2.0 * np.pi)

@@ -1,4 +1,4 @@
-"""Each tone of a track over its valid rows."""
+"""Summary of each tone of a track over its valid rows."""
 
 import math
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from ctid_cli.tones.track import Track
 
 @dataclass(frozen=True)
 class ToneSummary:
-    """One tone over its valid rows, or over those that are only not accurate enough where none is; NaN if none is."""
+    """One tone over its valid rows; without any, over rows that are only too inaccurate; without these, NaN."""
 
     tone: int
     #: Median [Hz].
     frequency_hz: float = math.nan
-    #: Standard error of the mean frequency: how well it is known [Hz].
+    #: Standard error of the mean frequency [Hz].
     standard_error_hz: float = math.nan
-    #: Half the width of the central 68 %: how far the tone moves [Hz].
+    #: Half the width of the central 68 % of the frequencies: variation of the tone [Hz].
     spread_hz: float = math.nan
-    #: The median in rad/s.
+    #: Median [rad/s].
     omega: float = math.nan
     #: Median and standard error of the mean [signal unit].
     amplitude: float = math.nan
@@ -29,12 +29,12 @@ class ToneSummary:
     #: First and last instant of a row in which the tone has a frequency [s since the first sample].
     begins: float = math.nan
     ends: float = math.nan
-    #: Share of the rows in which the tone is there.
+    #: Share of the rows in which the tone is present.
     valid_percent: float = 0.0
 
 
 def summarise(track: Track) -> list[ToneSummary]:
-    """Return each tone over its valid rows."""
+    """Summarise each tone over its valid rows."""
     return [_tone(track, k) for k in range(track.omega.shape[1])]
 
 
@@ -64,10 +64,10 @@ def _median(values: Array) -> float:
 
 
 def _error_of_mean(track: Track, used: BoolArray, errors: Array, k: int) -> float:
-    """Return the standard error of the mean of some rows of a tone; those with common samples share their errors.
+    """Return the standard error of the mean over rows of a tone; overlapping windows have common errors.
 
-    Rows that are read from stretches of length L, every D seconds, have the errors of D/L as many rows without common
-    samples: the mean of N rows has the variance ``sum_i s_i^2 min(L_i/D, N)/N^2``.
+    Windows of length L, every D seconds, are equivalent to a share D/L of independent rows: the mean of N rows has the
+    variance ``sum_i s_i^2 min(L_i/D, N)/N^2``.
     """
     known = used & np.isfinite(errors) & np.isfinite(track.window[:, k])
     n = int(known.sum())

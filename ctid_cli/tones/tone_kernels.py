@@ -1,4 +1,4 @@
-"""Compiled loops over the samples of windows: the fit of decaying chirps, and changes within a window."""
+"""Compiled loops over the samples of windows: fit of decaying chirps, and tests for changes within a window."""
 
 import math
 
@@ -11,22 +11,22 @@ from ctid_cli.arrays import Array, BoolArray, ComplexArray, IndexArray
 #: Parameters of a tone over u in [-1, 1], the window: amplitudes a and b of ``exp(g u) (a cos + b sin)(w u + c u^2)``,
 #: then g, w and c.
 PARAMETERS = 5
-#: Products of tones this many bins apart sum up to nearly nothing and are left out of the normal equations.
+#: Products of tones at least this many bins apart are negligible and omitted from the normal equations.
 SEPARATE_BINS = 8.0
-#: Samples that are taken together, few enough for the nearest cache: the loops over them have no dependence.
+#: Samples processed together, few enough for the L1 cache: their loops have no dependence between iterations.
 CHUNK = 128
 #: Number of free parameters of each tone and most steps of each stage: amplitudes first, curvature last.
 STAGES = ((2, 1), (4, 4), (PARAMETERS, 60))
-#: Largest logarithmic growth over half a window, and phase that is bent over half a window [rad].
+#: Largest logarithmic growth, and largest quadratic phase, over half a window [rad].
 MOST_GROWTH = 4.0
 MOST_BEND = 1e4
 #: A stage ends when a step would lower the sum of squares by less than this share of one sample's, or changes no
 #: phase by more than this [rad] and no amplitude by more than this share.
 SMALL_GAIN = 1e-3
 SMALL_STEP = 1e-9
-#: Longest step of a phase over half a window [rad]; longer ones may end in any of the minima.
+#: Longest step of a phase over half a window [rad]; longer ones may end in another local minimum.
 LONGEST_STEP = 2.0
-#: Marquardt's damping in units of the diagonal: first value, factors, and where it gives up.
+#: Marquardt's damping in units of the diagonal: first value, factors, and largest value.
 DAMPING = 1e-4
 RAISED = 10.0
 LOWERED = 0.1
@@ -34,7 +34,7 @@ LEAST_DAMPING = 1e-12
 MOST_DAMPING = 1e6
 #: Added to the diagonal before a covariance is computed, as a share of it.
 RIDGE = 1e-13
-#: A change is looked for in the middle of the window, without this share at each end.
+#: Share of the window at each end in which no change is searched for.
 ENDS = 0.05
 
 
@@ -55,7 +55,7 @@ def _phasor(growth: float, angle: float) -> complex:
 
 @njit(cache=True, nogil=True)
 def _first_phasors(tone: Array, du: float, phasors: ComplexArray) -> complex:
-    """Fill in the phasors of the first chunk and their factors to the next one, and return the factor of those."""
+    """Fill in the phasors of the first chunk and their factors to the next one; return the factor of these factors."""
     growth, turn, bend = tone[2], tone[3], tone[4]
     chunk = phasors.shape[1]
     ahead = chunk * du
@@ -77,9 +77,9 @@ def _first_phasors(tone: Array, du: float, phasors: ComplexArray) -> complex:
 def _take_tone(
     tone: Array, phasors: ComplexArray, further: complex, there: Array, u: Array, rows: Array, left: Array
 ) -> None:
-    """Take a tone from what is left of a chunk, and turn its phasors into those of the next one.
+    """Subtract a tone from the residual of a chunk, and advance its phasors to the next chunk.
 
-    ``rows`` are its derivatives by its parameters. Short loops become vector instructions.
+    ``rows`` are its derivatives with respect to its parameters. Short loops compile to vector instructions.
     """
     now, leap = phasors[0], phasors[1]
     of_cosine, of_sine, of_growth, of_turn, of_bend = rows[0], rows[1], rows[2], rows[3], rows[4]
@@ -109,7 +109,7 @@ def _equations(
     rows: Array,
     phasors: ComplexArray,
 ) -> float:
-    """Normal equations ``gram step = right`` of all parameters, the constant last; what is left, and its squares.
+    """Compute the normal equations ``gram step = right`` of all parameters, the constant last; return the cost.
 
     ``rows`` and ``phasors`` are working memory for a chunk of samples.
     """
@@ -138,7 +138,7 @@ def _equations(
         total += _product(rest, rest, here)
         for a in range(last + 1):
             right[a] += _product(rows[a], rest, here)
-            # The tone that a parameter belongs to, and how far from it others matter; the constant is at zero.
+            # Frequency of the parameter's tone, and range within which others matter; the constant is at zero.
             k = min(a // PARAMETERS, n - 1)
             turn = tones[k, 3] if a < last else 0.0
             wide = SEPARATE_BINS * math.pi + (2.0 * abs(tones[k, 4]) if a < last else 0.0)
@@ -173,7 +173,7 @@ def _factorise(gram: Array, free: BoolArray, ridge: float, factor: Array, scales
             elif total > 4e-16 * n:
                 factor[i, i] = math.sqrt(total)
             else:
-                # What is left of a column that the others explain is rounding: not positive definite.
+                # The remainder of a linearly dependent column is rounding error: not positive definite.
                 return False
     return True
 
@@ -215,7 +215,7 @@ def _covariances(
 
 @njit(cache=True, nogil=True)
 def _set_free(tones: Array, right: Array, stage: int, free: BoolArray) -> None:
-    """Mark the parameters of a stage, the constant among them, without those that a step would move out of bounds."""
+    """Mark the free parameters of a stage and the constant, except those that a step would move out of bounds."""
     for k in range(tones.shape[0]):
         for j in range(PARAMETERS):
             i = PARAMETERS * k + j
@@ -237,10 +237,10 @@ def fit_windows(
     converged: BoolArray,
     residuals: Array,
 ) -> None:
-    """Fit the tones of some windows by Levenberg-Marquardt steps, starting from the parameters that they have.
+    """Fit the tones of windows by Levenberg-Marquardt steps, starting from ``parameters``.
 
     A stage takes at most ``most_steps``. ``parameters`` are of shape (R, n, 5), and their ``covariances``, in units of
-    the noise variance, (R, n, 5, 5); what is left goes to ``residuals``, shape (R, L).
+    the noise variance, (R, n, 5, 5); ``residuals`` are of shape (R, L).
     """
     most = PARAMETERS * parameters.shape[1] + 1
     gram, trial_gram = np.zeros((2, most, most))
@@ -293,7 +293,7 @@ def fit_windows(
                     elif turned < LONGEST_STEP:
                         lower = _equations(y, there, trial, level, trial_gram, trial_right, trial_left, rows, phasors)
                         if lower <= cost:
-                            # Nearly every step is taken: its equations are those of the next one.
+                            # Nearly every step is accepted, so its equations are those of the next step.
                             for k in range(n):
                                 for j in range(PARAMETERS):
                                     tones[k, j] = trial[k, j]
@@ -314,12 +314,12 @@ def fit_windows(
 
 @njit(cache=True, nogil=True)
 def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArray, energy: Array, cube: Array) -> None:
-    """Measure how much the tones of each window seem to change within it.
+    """Compute test statistics for changes of the tones within each window.
 
-    ``energy``, shape (R, n), is the largest sum of squares that a change of phase and amplitude at one instant would
-    take from a whitened residual, in units of the noise. Of noise, the sum of the demodulated residual up to an instant
-    has what the fitted polynomials (phase 1, u, u^2; amplitude 1, u) leave of it. ``cube``, shape (R, n), is the sum of
-    the demodulated residual's quadrature times ``P3(u)``.
+    ``energy``, shape (R, n), is the largest reduction of the sum of squares of the whitened residual by a change of
+    phase and amplitude at one instant, in units of the noise. The variance of the partial sums of a demodulated noise
+    residual is reduced by the fitted polynomials (phase 1, u, u^2; amplitude 1, u). ``cube``, shape (R, n), is the sum
+    of the demodulated residual's quadrature times ``P3(u)``.
     """
     length = white.shape[1]
     begin = max(1, int(ENDS * length))
@@ -361,11 +361,11 @@ def find_changes(white: Array, filters: Array, parameters: Array, used: IndexArr
 def keep_readings(
     readings: Array, bounds: IndexArray, reach: float, errors: float, agree: float, closed: BoolArray
 ) -> NDArray[np.bool_]:
-    """Return which readings of each instant are kept: none that is near to one of a longer, or nearer, window.
+    """Return which readings of each instant are kept: none that is close to one of a longer, or nearer, window.
 
     ``readings``, shape (5, N), are frequencies, their errors, relative errors of amplitudes, windows and their middles.
-    Readings of one window are of different tones. Where what is left of the longest window hides a tone, so that an
-    agreeing shorter one shows it twice as clearly and with a smaller error, that is kept instead.
+    Readings of one window are of different tones. If the residual of the longest window masks a tone, so that a
+    shorter one that agrees has half the relative error and a smaller standard error, the shorter one is kept.
     """
     omega, error, unclear, window, middle = readings
     kept = np.zeros(omega.size, np.bool_)

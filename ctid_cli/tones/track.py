@@ -20,11 +20,11 @@ from ctid_cli.tones.follow import paths_of, readings_at
 
 
 class Sampled(Protocol):
-    """A signal on a regular clock: what a record must have to be tracked."""
+    """Regularly sampled signal: the interface of records that can be tracked."""
 
     @property
     def samples(self) -> Array:
-        """Signal [signal unit]; NaN where a sample is missing, shape (N,)."""
+        """Signal [signal unit], shape (N,); NaN for a missing sample."""
 
     @property
     def interval(self) -> float:
@@ -32,19 +32,19 @@ class Sampled(Protocol):
 
 
 class MissingLine(NamedTuple):
-    """A line that the tones of a record leave over."""
+    """Spectral line in the residual of a record."""
 
     #: Frequency [rad/s].
     omega: float
-    #: Share of the rows in which it was left over.
+    #: Share of the rows whose residual contains it.
     share: float
-    #: Amplitude where it was left over, a median [signal unit].
+    #: Median amplitude in these rows [signal unit].
     amplitude: float
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Tones over time: a column is one tone from first to last, NaN where it is not there or where nothing is known.
+    """Tones over time: one column for each tone, NaN where it is absent or unknown.
 
     The frequencies of a row need not ascend.
 
@@ -63,19 +63,19 @@ class Track:
     rate : ndarray, shape (N, n)
         Rate of change of the frequency [rad/s^2].
     window : ndarray, shape (N, n)
-        Length of the stretch of signal that the row is read from [s].
+        Length of the window from which the row is estimated [s].
     flags : ndarray of uint16, shape (N, n)
         Bit fields of :class:`~ctid_cli.frequency.flags.Flag`.
     every : float
         Time from one row to the next [s].
     missing : tuple of MissingLine
-        Lines that are left over, the strongest first.
+        Lines of the residual, the strongest first.
     reasons, warnings : tuple of str
-        What was chosen and why, and what to know before believing the tones: sentences.
+        Choices with their reasons, and limitations of the tones, as sentences.
     fitted_interval : float
-        Interval of the samples that were fitted [s].
+        Sampling interval of the fitted signal [s].
     kept_of, filter_samples : int
-        One of how many samples was kept, after a filter of so many samples.
+        Decimation factor, and length of the decimation filter [samples].
     longest_window : float
         Longest window [s].
     """
@@ -109,7 +109,7 @@ class Track:
 
     @classmethod
     def of(cls, t: Array, omega: Array, flags: NDArray[np.uint16], every: float, **known: Any) -> Track:
-        """Return a track of which not everything is known.
+        """Return a track with some of its fields.
 
         Parameters
         ----------
@@ -118,11 +118,11 @@ class Track:
         omega : ndarray, shape (N, n)
             Frequencies [rad/s].
         flags : ndarray, shape (N, n) or (N,)
-            Flags of each tone, or those of all tones of a row.
+            Flags of each tone, or of each row.
         every : float
             Time from one row to the next [s].
         **known
-            Further fields; NaN where not given.
+            Further fields; NaN if not given.
 
         Returns
         -------
@@ -136,7 +136,7 @@ class Track:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Numbers of the method, for programs."""
+        """Settings of the method, for machine-readable output."""
         return {
             "interval": self.fitted_interval,
             "kept_of": self.kept_of,
@@ -146,16 +146,16 @@ class Track:
 
     @property
     def valid(self) -> BoolArray:
-        """Where no flag is set, shape (N, n)."""
+        """True where no flag is set, shape (N, n)."""
         return np.asarray(self.flags == 0)
 
     @property
     def there(self) -> BoolArray:
-        """Where a tone is there or may be, shape (N, n)."""
+        """True unless the tone is known to be absent, shape (N, n)."""
         return np.asarray((self.flags & int(Flag.ABSENT)) == 0)
 
     def of_accuracy(self, accuracy: float | None) -> Track:
-        """Return the track, not valid where a standard error exceeds an accuracy.
+        """Return the track with rows marked invalid if a standard error exceeds ``accuracy``.
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Track:
         Returns
         -------
         Track
-            The same with other flags.
+            Copy with changed flags.
         """
         limit = c.USUAL_ACCURACY * np.abs(self.omega) if accuracy is None else np.asarray(2.0 * np.pi * accuracy)
         with np.errstate(invalid="ignore"):
@@ -186,23 +186,23 @@ def track(
     """Follow the strongest tones of a recorded signal, or all of them.
 
     In windows of all lengths, doubled from 64 samples to the whole record, decaying chirps are fitted one by one until
-    the residual, whitened, shows no further line. At each instant each tone is read from the longest window in which
-    nothing speaks against it: no line left near it, no change within the window, no other tone too close.
+    the whitened residual contains no significant line. At each instant each tone is taken from the longest window with
+    no residual line near it, no change within the window, and no other tone too close.
 
     Parameters
     ----------
     record : Sampled
-        Signal on a regular clock: ``samples``, shape (N,), NaN where missing, and ``interval`` [s].
+        Regularly sampled signal: ``samples``, shape (N,), NaN if missing, and ``interval`` [s].
     tones : int, optional
-        Number of tones, at most 64; by default all that are found.
+        Number of tones, at most 64; by default all detected ones.
     accuracy : float, optional
-        Rows with a larger standard error are not valid [Hz]; by default .001 of the tone's frequency.
+        Rows with a larger standard error are invalid [Hz]; by default .001 of the tone's frequency.
     every : float, optional
         Time from row to row [s]; by default a thousandth of the record.
     window : float, optional
         Longest window [s]; by default the record.
     on_progress : callable, optional
-        Called with the number of window lengths that are done, and of all.
+        Called with the numbers of completed and of all window lengths.
 
     Returns
     -------
@@ -212,7 +212,7 @@ def track(
     Raises
     ------
     DataError
-        If the signal is too short, constant, or shows no tone.
+        If the signal is too short, constant, or contains no detectable tone.
 
     Examples
     --------
@@ -275,7 +275,7 @@ def _middle(found: Readings, path: IndexArray) -> float:
 
 
 def _longest(window: float | None, thin: float, count: int) -> int:
-    """Return the samples of the longest window."""
+    """Return the length of the longest window [samples]."""
     if window is None:
         return count
     length = round(min(window / thin, count + 1.0))
@@ -286,7 +286,7 @@ def _longest(window: float | None, thin: float, count: int) -> int:
 
 
 def _columns(found: Readings, paths: list[IndexArray], count: int, places: Array, ready: Conditioned) -> dict[str, Any]:
-    """Put what is known of the tones into columns, in units of the record."""
+    """Return the fields of the track, one column for each tone, in units of the record."""
     thin, scale = ready.interval, ready.scale
     gain = ready.gain(found.omega)
     values = {
@@ -294,7 +294,7 @@ def _columns(found: Readings, paths: list[IndexArray], count: int, places: Array
         "error": found.error / thin,
         "amplitudes": found.amplitude * scale / gain,
         "amplitude_error": found.amplitude_error * scale / gain,
-        # Readings are of cosines, tracks of sines.
+        # Readings use cosines, tracks use sines.
         "phase": np.angle(1j * np.exp(1j * found.phase)),
         "growth": found.growth / thin,
         "rate": found.rate / thin**2,
@@ -309,17 +309,17 @@ def _columns(found: Readings, paths: list[IndexArray], count: int, places: Array
         rows = found.row[path]
         for name, each in values.items():
             columns[name][rows, k] = each[path]
-        # Between its readings the tone is there, but no window is free of changes.
+        # Between its readings the tone exists, but no window is free of changes.
         flags[rows[0] : rows[-1] + 1, k] = int(Flag.CHANGE)
         flags[rows, k] = np.where(found.significant[path], 0, int(Flag.ABSENT))
         flags[rows, k] |= np.where(found.resolved[path], 0, int(Flag.UNRESOLVED)).astype(np.uint16)
-        # A tone may have done anything where there is no sample in a period of it.
+        # The tone is unknown where a gap is longer than one of its periods.
         flags[rows, k] |= np.where(alone[rows] * found.omega[path] > 2.0 * np.pi, int(Flag.GAP), 0).astype(np.uint16)
     return {**columns, "flags": flags}
 
 
 def _counted(found: int, count: int, tones: int | None) -> Iterator[str]:
-    """Say how many tones there are, and how that is known."""
+    """Yield a sentence on the number of tones and how it was determined."""
     if tones is None:
         more = f" The strongest {count} of {found} are followed." if found > count else ""
         how = "lines join until the whitened residual shows none, and stay if they are worth their numbers"
@@ -327,7 +327,7 @@ def _counted(found: int, count: int, tones: int | None) -> Iterator[str]:
 
 
 def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iterator[str]:
-    """Say from which windows the tones were read."""
+    """Yield a sentence on the windows from which the tones were estimated."""
     if paths:
         windows = found.window[np.concatenate(paths)] * thin
         low, middle, high = windows.min(), np.median(windows), windows.max()
@@ -337,7 +337,7 @@ def _windows_used(found: Readings, paths: list[IndexArray], thin: float) -> Iter
 
 
 def _doubts(found: int, tones: int | None, highest: float, nyquist: float) -> Iterator[str]:
-    """Say what the user should know before believing the tones [Hz]."""
+    """Yield warnings about the tones; ``highest`` and ``nyquist`` in Hz."""
     if tones is not None and found < tones:
         if found:
             yield f"Only {found} of {tones} tones stand out of the record: the other columns are empty."

@@ -1,4 +1,4 @@
-"""What a reader must know of a track before believing its numbers."""
+"""Warnings about the reliability of a track."""
 
 import math
 from collections.abc import Iterator
@@ -11,9 +11,9 @@ from ctid_cli.text import count, listed
 from ctid_cli.tones.constants import MOST_ASKED
 from ctid_cli.tones.track import MissingLine, Track
 
-#: A smaller share of valid rows is worth a warning.
+#: A smaller share of valid rows gives a warning.
 MOSTLY_VALID = 0.9
-#: Most frequent reasons for invalid rows, warnings of this kind, and missing lines that are named.
+#: Largest numbers of reasons for invalid rows, of such warnings, and of missing lines in the messages.
 MOST_REASONS = 3
 MOST_WARNINGS = 4
 MOST_LINES = 5
@@ -21,7 +21,7 @@ TURN = 2.0 * math.pi
 
 
 def track_warnings(track: Track) -> list[str]:
-    """Return warnings, each with what can be done."""
+    """Return warnings, each with a remedy."""
     if not track.omega.shape[1]:
         none = "No tone was asked for (--tones 0): there are no frequencies to report."
         return [*track.warnings, *_missing_lines(track), none]
@@ -29,7 +29,7 @@ def track_warnings(track: Track) -> list[str]:
 
 
 def _missing_lines(track: Track) -> Iterator[str]:
-    """Say which lines are left over, and what to type."""
+    """Yield messages about residual lines, with the command to use."""
     lines = track.missing
     if lines:
         named = listed([_line_words(line) for line in lines[:MOST_LINES]])
@@ -45,7 +45,7 @@ def _line_words(line: MissingLine) -> str:
 
 
 def _invalid_rows(track: Track) -> list[str]:
-    """Say how many rows are not valid, and why, once for tones with the same reasons."""
+    """Return messages on the share of invalid rows and the reasons, merged for tones with equal reasons."""
     found: dict[str, list[str]] = {}
     for k, (flags, there) in enumerate(zip(track.flags.T, track.there.T, strict=True)):
         if reasons := _reasons(flags[there]):
@@ -56,7 +56,7 @@ def _invalid_rows(track: Track) -> list[str]:
 
 
 def _reasons(flags: NDArray[np.uint16]) -> str:
-    """Return the share of rows that are not valid with the most frequent reasons; empty where nearly all are."""
+    """Return the share of invalid rows with the most frequent reasons; empty if nearly all are valid."""
     share = float(np.mean(flags == 0)) if flags.size else 0.0
     if share >= MOSTLY_VALID:
         return ""

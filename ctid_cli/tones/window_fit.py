@@ -1,4 +1,4 @@
-"""Decaying chirps fitted to windows: one line after the other joins until the residual is noise."""
+"""Fits of decaying chirps to windows: lines are added until the residual is noise."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ class WindowTones(NamedTuple):
     #: Middle of each window [samples], shape (R,).
     middle: Array
     #: At the middle: frequency [rad/sample], its standard error, amplitude, its standard error, phase [rad],
-    #: growth [1/sample], rate of change of frequency [rad/sample^2] and its error; NaN where there is no tone, (R, n).
+    #: growth [1/sample], rate of change of frequency [rad/sample^2] and its error; NaN without a tone, (R, n).
     omega: Array
     omega_error: Array
     amplitude: Array
@@ -31,13 +31,13 @@ class WindowTones(NamedTuple):
     growth_error: Array
     omega_with_rate: Array
     height_with_growth: Array
-    #: Error of omega that a curved frequency makes, estimated from what is left, and its standard error [rad/sample].
+    #: Error of omega due to curvature of the frequency, from the residual, and its standard error [rad/sample].
     bend: Array
     bend_error: Array
-    #: Chance of noise to change as much within the window, and the energy of the change in units of the noise, (R, n).
+    #: p-value of a change within the window, and the energy of the change in units of the noise, (R, n).
     change_chance: Array
     change_energy: Array
-    #: Chance of noise to show as strong a line as is left, where that stands [rad/sample], its energy, shape (R,).
+    #: p-value of the strongest line in the residual, its frequency [rad/sample] and its energy, shape (R,).
     line_chance: Array
     line: Array
     line_energy: Array
@@ -46,7 +46,7 @@ class WindowTones(NamedTuple):
 
 
 class _Fits(NamedTuple):
-    """Windows and the parameters of their tones, which the compiled fit changes."""
+    """Windows and the parameters of their tones, modified by the compiled fit."""
 
     first: IndexArray
     used: IndexArray
@@ -56,7 +56,7 @@ class _Fits(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Most lines of a window, rounds in which they join, and steps of a stage of each round."""
+    """Largest numbers of lines of a window, of rounds that add lines, and of steps of a stage in each round."""
 
     lines: int
     rounds: int
@@ -67,35 +67,35 @@ _STEADY = _Limits(c.STEADY_LINES, c.STEADY_ROUNDS, c.STEADY_STEPS)
 
 
 class _Tests(NamedTuple):
-    """What is left of windows, and what it shows."""
+    """Residuals of windows and the tests on them."""
 
     left: Left
     lines: Lines
-    #: Energy that a change would explain, and P3 in the phase that is left, shape (R, n).
+    #: Energy that a change would explain, and P3 component of the residual phase, shape (R, n).
     change: Array
     cube: Array
-    #: Lines that may join [rad/sample], the strongest first, NaN where there is none, shape (R, K).
+    #: Lines that may be added [rad/sample], the strongest first, NaN if missing, shape (R, K).
     joining: Array
 
 
 def fit_tones(
     samples: Array, length: int, first: IndexArray, most: int, shorter: WindowTones | None = None
 ) -> WindowTones:
-    """Fit the tones of windows of one length, starting with what was found in shorter windows."""
+    """Fit the tones of windows of one length, starting from those of shorter windows."""
     most = max(1, min(most, (length // c.SAMPLES_PER_PARAMETER - 1) // PARAMETERS))
     size = max(1, c.BLOCK_SAMPLES // length)
     parts = [first[k : k + size] for k in range(0, first.size, size)]
     blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
     tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
-    # An empty column is kept where there is one: windows without have no room left.
+    # One empty column is kept if possible: a window without one has the largest number of lines.
     kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
     return WindowTones._make(each[:, :kept] if each.ndim == 2 else each for each in tones)
 
 
 def fit_steady(samples: Array) -> WindowTones | None:
-    """Fit few tones to a record at once; None where windows of any length may show more than they are and noise.
+    """Fit few tones to the whole record; return None if the residual contains lines at any window length.
 
-    One that does not converge soon is left to shorter windows.
+    A fit that does not converge quickly is also None.
     """
     length = samples.size
     fits, tests, residuals = _fitted(samples, length, np.zeros(1, np.int64), _STEADY, None)
@@ -123,7 +123,7 @@ def _block(samples: Array, length: int, first: IndexArray, most: int, shorter: W
 def _fitted(
     samples: Array, length: int, first: IndexArray, limits: _Limits, shorter: WindowTones | None
 ) -> tuple[_Fits, _Tests, Array]:
-    """Return fits, what is left of them, and that itself, shape (R, L)."""
+    """Return fits, tests of their residuals, and the residuals, shape (R, L)."""
     most = limits.lines
     rows, shape = first.size, (first.size, most, PARAMETERS)
     fits = _Fits(
@@ -152,12 +152,12 @@ def _fitted(
 
 
 def nearest(middles: Array, places: Array) -> IndexArray:
-    """Return which of some middles, ascending, is the nearest to each place."""
+    """Return the index of the nearest of the ascending ``middles`` for each place."""
     return np.asarray(np.searchsorted(0.5 * (middles[1:] + middles[:-1]), places))
 
 
 def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
-    """Take over the tones of the shorter windows nearest to the middles, where nothing is wrong with them."""
+    """Start from the significant tones of the nearest shorter windows, if these fits passed all tests."""
     half = 0.5 * (length - 1)
     middle: Array = np.asarray(fits.first + half, dtype=np.float64)
     beginning = nearest(shorter.middle, middle)
@@ -173,7 +173,7 @@ def _start(fits: _Fits, length: int, shorter: WindowTones) -> None:
 
 
 def _join(fits: _Fits, rows: IndexArray, turns: Array) -> BoolArray:
-    """Add a line to some windows, and return where: where it is one, and there is room."""
+    """Add a line to each window that has a candidate and room for it; return the mask of these windows."""
     fits_in: BoolArray = np.isfinite(turns) & (fits.used[rows] < fits.parameters.shape[1])
     rows, turns = rows[fits_in], turns[fits_in]
     fits.parameters[rows, fits.used[rows]] = 0.0
@@ -194,7 +194,7 @@ def _tested(residuals: Array, fits: _Fits, rows: IndexArray) -> _Tests:
 
 
 def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
-    """Return tests with those of some windows replaced."""
+    """Return ``old`` with the tests of the windows ``rows`` replaced by ``new``."""
     for fields, values in zip((*old[:2], old[2:]), (*new[:2], new[2:]), strict=True):
         for field, value in zip(fields, values, strict=True):
             field[rows] = value
@@ -202,7 +202,7 @@ def _replaced(old: _Tests, rows: IndexArray, new: _Tests) -> _Tests:
 
 
 def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
-    """Turn parameters over the window into numbers per sample, with standard errors by the noise near each tone."""
+    """Convert parameters to units per sample, with standard errors from the noise near each tone."""
     half = 0.5 * (length - 1)
     empty = np.arange(fits.parameters.shape[1]) >= fits.used[:, None]
     cosine, sine, growth, turn, bend = np.where(empty, np.nan, fits.parameters.transpose(2, 0, 1))
@@ -211,7 +211,7 @@ def _tones(fits: _Fits, tests: _Tests, length: int) -> WindowTones:
     with np.errstate(invalid="ignore", divide="ignore"):
         covariances = noise[:, :, None, None] * fits.covariances
         errors = np.sqrt(np.diagonal(covariances, axis1=2, axis2=3))
-        # How the logarithm of the amplitude depends on both amplitudes.
+        # Gradient of the logarithm of the amplitude with respect to both amplitudes.
         weights = np.stack((cosine, sine), axis=2) / amplitude[:, :, None] ** 2
         height_with = np.einsum("rna,rnab->rnb", weights, covariances[:, :, :2])
         height_error = np.sqrt((height_with[:, :, :2] * weights).sum(axis=2))

@@ -1,1 +1,1 @@
-"""The least output error over a stated set of models."""
+"""Global minimum of the output error over a bounded set of models."""

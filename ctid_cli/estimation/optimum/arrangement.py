@@ -1,7 +1,7 @@
-"""Which fractions a model is a sum of: what drives each, which denominator it has, and where its states are.
+"""Fractions of which a model is the sum: the input, denominator and states of each.
 
-A transfer function is one fraction. A sum of submodels has several that one input drives; several inputs have one
-fraction each, with denominators of their own or all with one.
+A transfer function is one fraction. A sum of submodels has several fractions of one input; several inputs have one
+fraction each, with separate denominators or a common one.
 """
 
 from collections.abc import Sequence
@@ -16,22 +16,22 @@ from ctid_cli.models.additive import Term
 
 
 class Channel(NamedTuple):
-    """What one input drives: the blocks, which are denominators with their integrators, and where its states are."""
+    """Blocks of one input, which are denominators with their integrators, and the places of its states."""
 
     input: int
-    #: Degrees of the fraction of each block; several where the input drives a sum of submodels.
+    #: Degrees of the fraction of each block; several if the input drives a sum of submodels.
     terms: tuple[Term, ...]
-    #: The blocks, their states, and their searched poles, among those of the whole model.
+    #: Places of the blocks, their states and their searched poles in the whole model.
     blocks: slice
     states: slice
     poles: slice
-    #: Whether no channel before has the same blocks.
+    #: Whether no earlier channel has the same blocks.
     first: bool
-    #: Places of the states that span the strictly proper part of all ``B/A u``: of each fraction its last m + 1.
+    #: Places of the states that span the strictly proper part of all ``B/A u``: the last m + 1 of each fraction.
     spanning: IntArray
-    #: Which fraction has u itself besides, as one of degree n has; none where -1.
+    #: Index of the fraction with direct feedthrough, of relative degree 0; -1 if there is none.
     direct: int
-    #: Which states belong to poles that are searched, not to integrators.
+    #: Mask of the states of searched poles, not of integrators.
     searched: BoolArray
 
     @property
@@ -41,11 +41,11 @@ class Channel(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of coefficients of the numerators that can be told apart."""
+        """Number of identifiable coefficients of the numerators."""
         return self.spanning.size + (self.direct >= 0)
 
     def directs(self, weight: float) -> Array:
-        """Return the weight of u in each fraction."""
+        """Return the feedthrough of each fraction."""
         found = np.zeros(len(self.terms))
         if self.direct >= 0:
             found[self.direct] = weight
@@ -54,13 +54,13 @@ class Channel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Arrangement:
-    """The channels of a model."""
+    """Channels of a model."""
 
     channels: tuple[Channel, ...]
 
     @cached_property
     def owners(self) -> tuple[int, ...]:
-        """The first channel of each denominator, or of each sum."""
+        """First channel of each denominator, or of each sum."""
         return tuple(k for k, channel in enumerate(self.channels) if channel.first)
 
     @cached_property
@@ -75,7 +75,7 @@ class Arrangement:
 
 
 def _channel(number: int, terms: Sequence[Term], before: Channel | None, shared: bool) -> Channel:
-    """Return the channel of an input, behind that of the input before unless it shares its blocks."""
+    """Return the channel of an input, placed after that of the previous input unless they share blocks."""
     order, poles = sum(term.order for term in terms), sum(term.poles for term in terms)
     place = (0, 0, 0) if shared or before is None else (before.blocks.stop, before.states.stop, before.poles.stop)
     sizes = len(terms), order, poles
@@ -92,7 +92,7 @@ def _channel(number: int, terms: Sequence[Term], before: Channel | None, shared:
 
 @lru_cache(maxsize=1024)
 def with_one_denominator(poles: int, integrators: int, zeros: int, fewer: tuple[int, ...]) -> Arrangement:
-    """Return the arrangement of inputs that share a denominator; numerators may have fewer zeros than the most."""
+    """Return the arrangement of inputs with a common denominator; ``fewer`` zeros than ``zeros`` for each input."""
     channels: list[Channel] = []
     for k, less in enumerate(fewer):
         term = Term(poles, max(zeros - less, 0), integrators)
@@ -102,7 +102,7 @@ def with_one_denominator(poles: int, integrators: int, zeros: int, fewer: tuple[
 
 @lru_cache(maxsize=1024)
 def with_own_denominators(terms: tuple[Term, ...], inputs: tuple[int, ...]) -> Arrangement:
-    """Return the arrangement of fractions with denominators of their own, those of one input side by side."""
+    """Return the arrangement of fractions with separate denominators, grouped by input."""
     channels: list[Channel] = []
     for number in dict.fromkeys(inputs):
         own = [term for term, driver in zip(terms, inputs, strict=True) if driver == number]

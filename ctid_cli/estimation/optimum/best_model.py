@@ -1,4 +1,4 @@
-"""The best output-error model of a record within the stated set, and how far that may be trusted."""
+"""Best output-error model of a record within the admissible set, with diagnostics of the optimum."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -21,81 +21,81 @@ from ctid_cli.models.additive import AdditiveModel, Submodel
 from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 
-#: A model found from a part of the records is one of all of them if its mean squared error there is at most AS_GOOD
-#: times that in the part, and it explains at least the share EXPLAINED of the output's variance.
+#: A model found from a part of the records is accepted for all of them if its mean squared error on all is at most
+#: AS_GOOD times that on the part, and it explains at least the share EXPLAINED of the output's variance.
 AS_GOOD, EXPLAINED = 1.5, 0.05
-#: Records of more samples than the first number are long; a part of them has the second.
+#: Records with more samples than LONG are long; a part of them has PART samples.
 LONG, PART = 100_000, 20_000
 
 
-#: Where a search starts: a denominator, or of several the poles of one after the other; and a delay, or one of each
+#: Start of a search: a denominator, or the concatenated poles of several denominators; and the delay, or one for each
 #: input [s].
 Begin = tuple[Any, float | tuple[float, ...]]
 
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """The least output error that was found."""
+    """Model with the least output error found."""
 
-    #: Coefficients in descending powers: numerators of the fractions, and their monic denominators, a common one once.
+    #: Coefficients in descending powers: numerators, and monic denominators, of the fractions; a common one only once.
     numerators: tuple[Array, ...]
     denominators: tuple[Array, ...]
     #: Delay of each input [s].
     delays: tuple[float, ...]
-    #: Of each record, coefficients of C in the free responses ``C/A delta(t - t_s)``, descending powers, zeros without
-    #: them; and those of the powers of time.
+    #: For each record, coefficients of C in the free responses ``C/A delta(t - t_s)`` in descending powers, zeros
+    #: without free responses; and coefficients of the powers of time.
     free_responses: Array
     trends: Array
     squared_error: float
     ending: Ending
-    #: Fall of the squared error that Newton's step promises, as a fraction of it.
+    #: Predicted relative decrease of the squared error by a Newton step.
     promise: float
-    #: Poles of the structure that have run to infinity, where a smaller model has the least squared error.
+    #: Number of poles at infinity, if a smaller model has the least squared error.
     poles_at_infinity: int
-    #: Derivatives of ``a_1 ... a_n`` to the coordinates of the poles, or with known ones of those to directions that
-    #: keep them, where no bound of the set holds the poles; and the poles that are held.
+    #: Derivatives of ``a_1 ... a_n`` with respect to the coordinates of poles that are not at a bound, or to directions
+    #: that preserve known coefficients; and the poles at a bound.
     pole_slopes: Array
     held_poles: ComplexArray
-    #: Inputs whose delays would leave their bounds.
+    #: Inputs whose delays are held at a bound.
     delays_at_bound: tuple[int, ...]
-    #: Whether a delay sits in a kink of the cost, at a sample.
+    #: Whether a delay is at a kink of the cost, at a sample.
     pinned: bool
     tried: int
     agree: int
     evaluations: int
     box: Box = field(repr=False)
-    #: The input that drives each fraction, and which of the denominators it has.
+    #: Indices of the input and of the denominator of each fraction.
     drivers: tuple[tuple[int, int], ...] = ((0, 0),)
-    #: Poles at the origin of each fraction, which its denominator does not have.
+    #: Poles of each fraction at the origin, which its denominator does not contain.
     integrators: tuple[int, ...] = (0,)
-    #: The submodels, where the model is a sum of those.
+    #: Submodels, if the model is a sum of submodels.
     additive: AdditiveModel | None = None
 
     @property
     def numerator(self) -> Array:
-        """The numerator of the first fraction."""
+        """Numerator of the first fraction."""
         return self.numerators[0]
 
     @property
     def denominator(self) -> Array:
-        """The first denominator."""
+        """First denominator."""
         return self.denominators[0]
 
     @property
     def delay(self) -> float:
-        """The delay of the first input [s]."""
+        """Delay of the first input [s]."""
         return self.delays[0]
 
     @property
     def start(self) -> Begin:
-        """Where a search for this model may start."""
+        """Start of a search from this model."""
         if len(self.denominators) == 1 and self.additive is None:
             return self.denominators[0], self.delays
         return np.concatenate([np.roots(a) for a in self.denominators]).astype(complex), self.delays
 
     @property
     def fractions(self) -> tuple[TransferFunction, ...]:
-        """The transfer function of each input."""
+        """Transfer function of each input."""
         if self.additive is not None:
             whole = unfactored(self.additive)
             return (TransferFunction(_trimmed(whole.numerator), whole.denominator, self.delay),)
@@ -107,7 +107,7 @@ class Optimum:
 
     @property
     def model(self) -> TransferFunction:
-        """The first fraction: the model, where there is one input."""
+        """First fraction, which is the model of a single input."""
         return self.fractions[0]
 
 
@@ -130,14 +130,13 @@ def best_output_error(
     seed: int = 0,
     known: KnownCoefficients = NOTHING,
 ) -> Optimum:
-    """Return the least sum of squared output errors of a structure and of all that it contains.
+    """Return the least sum of squared output errors of a structure and of all nested ones.
 
-    Two equal delays [s] are a known one, which as many zeros as poles need. Searches start from denominators and delays
-    that other estimators have found. ``nested``: the smaller models that the structure contains are fitted too, and
-    their minima are starts; otherwise only the given starts are refined. ``fewer_poles``: the least of all is returned,
-    so that the cost never rises with the structure, though with fewer poles. ``random_starts``: this number of further
-    starts at random and as many again for each pole, also of the smaller models; without these only where the given
-    starts do not agree.
+    Equal bounds of the delay [s] fix it, which a model with equal degrees requires. Searches start from denominators
+    and delays of other estimators. ``nested``: the nested smaller models are fitted too, and their minima are starts;
+    otherwise only the given starts are refined. ``fewer_poles``: the least of all is returned, possibly with fewer
+    poles, so that the cost never increases with the structure. ``random_starts``: number of random starts, plus the
+    same number for each pole, also for the smaller models; not nested, only if the given starts disagree.
     """
     zeros, box = problem.zeros, box_of(problem, delays)
     if known.all_poles:
@@ -173,9 +172,9 @@ def best_output_error(
 def _with_known(
     free: StructureSearch, poles: int, points: list[Point], nested: bool, known: KnownCoefficients
 ) -> StructureSearch:
-    """Return the search of the models that have known coefficients, from points moved to where they hold.
+    """Return the search of models with known coefficients, from points projected onto the constraints.
 
-    If nested, these are also all that is found without the known coefficients, and points at random.
+    If nested, the points include all minima found without the constraints, and random points.
     """
     zeros, box = free.problem.zeros, free.box
     search = StructureSearch(free.problem, box, known=known)
@@ -195,7 +194,7 @@ def _with_known(
 
 
 def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Point]:
-    """Return points where the known coefficients have their values."""
+    """Return the points projected to the values of the known coefficients."""
     found = [point for point in (known.met(start, box) for start in points) if point is not None]
     if points and not found:
         values = known.denominator[known.places].tolist()
@@ -209,7 +208,7 @@ def _met(points: Sequence[Point], box: Box, known: KnownCoefficients) -> list[Po
 
 
 def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewer_poles: bool) -> Optimum | None:
-    """Return what the search of a part leads to; None where the whole records say more, or something else."""
+    """Return the optimum found from a part of the records; None if it does not fit the whole records."""
     problem, found = search.problem, []
     for one in (pilot, search):
         one.climb(poles, problem.zeros)
@@ -223,7 +222,7 @@ def _from_part(search: StructureSearch, pilot: StructureSearch, poles: int, fewe
 
 
 def best_of_orders(search: StructureSearch, poles: int, zeros: int) -> Optimum:
-    """Return the least squared error of one of many structures, which share a search, and of those in its closure."""
+    """Return the least squared error of one structure of a common search, and of those in its closure."""
     search.climb(poles, zeros)
     return _least(search, poles, zeros, True)
 
@@ -238,11 +237,11 @@ def best_sum(
     random_starts: int = 0,
     seed: int = 0,
 ) -> Optimum:
-    """Return the least sum of squared output errors of fractions with denominators of their own.
+    """Return the least sum of squared output errors of fractions with separate denominators.
 
-    Searches start from the poles of one denominator after the other, and delays. ``grown``: these are looked at over
-    the whole range of the delays, and so are the poles of submodels that are found term by term, and of inputs beside
-    what the others explain.
+    Searches start from the concatenated poles of the denominators, and delays. ``grown``: these poles are tried over
+    the whole range of the delays, and so are the poles of submodels found term by term, and of inputs fitted to the
+    residual of the others.
     """
     box, order, zeros = box_of(problem, delays), sum(problem.parts), problem.zeros
     if known.all_poles:
@@ -272,19 +271,19 @@ def best_sum(
 
 
 def best_near(search: StructureSearch, zeros: int, start: Begin) -> Optimum:
-    """Return the least squared error in the basin of denominators, without integrators, and delays."""
+    """Return the least squared error in the basin of given denominators, without integrators, and delays."""
     point = _point(start, search.box)
     search.refine(point.poles.size, zeros, [point])
     return _least(search, point.poles.size, zeros, False)
 
 
 def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -> Optimum:
-    """Return the least squared error that a search knows of a structure."""
-    # With a pole at infinity a model of one pole less, whatever its zeros, is in the closure of the structure.
+    """Return the least squared error of a structure found by a search."""
+    # With a pole at infinity, any model with one pole less is in the closure of the structure.
     fewest = max(zeros - search.most_zeros, int(not search.problem.integrators)) if fewer_poles else poles
     found = [search.settled(n, zeros) for n in range(poles, min(fewest, poles) - 1, -1)]
     errors = [local.squared_error for local in found]
-    # Such a pole costs nothing: a smaller model must be worse by more than rounding to lose.
+    # A smaller model is replaced only if its error is larger by more than rounding.
     lost = next(k for k, error in enumerate(errors) if error <= min(errors) * (1 + 1e-9))
     ends = np.array(search.ends(poles - lost, zeros))
     level = max(min(errors), float(ends.min()))
@@ -293,7 +292,7 @@ def _least(search: StructureSearch, poles: int, zeros: int, fewer_poles: bool) -
 
 
 def _optimum(best: Local, zeros: int, lost: int, tried: int, agree: int, search: StructureSearch) -> Optimum:
-    """Return the model in coefficients of polynomials."""
+    """Return the model with coefficients of polynomials."""
     assert best.ending is not None
     point, projected, problem = best.point, best.projected, search.descent(zeros).problem
     known, n = search.known, point.poles.size
@@ -332,7 +331,7 @@ def _optimum(best: Local, zeros: int, lost: int, tried: int, agree: int, search:
 
 
 def _fractions_of(problem: Problem, point: Point, projected: Projected) -> list[Array]:
-    """Return the numerators of all fractions over monic denominators, each of the degree that it can have."""
+    """Return the numerators of all fractions over monic denominators, each of its highest possible degree."""
     rows, found = problem.rows(point.speed, point.damping), []
     for k, channel in enumerate(problem.arranged(point.poles.size).channels):
         first, directs = 0, channel.directs(projected.directs[k]).tolist()
@@ -350,7 +349,7 @@ def _trimmed(b: Array) -> Array:
 
 
 def _put_known(known: KnownCoefficients, fractions: list[Array], denominators: list[Array]) -> None:
-    """Give coefficients their known values, which they have up to rounding."""
+    """Set known coefficients to their exact values, from which they differ by rounding."""
     whole, first = np.concatenate([a[1:] for a in denominators]), 0
     whole[known.places] = known.denominator[known.places]
     for a in denominators:
@@ -361,12 +360,12 @@ def _put_known(known: KnownCoefficients, fractions: list[Array], denominators: l
 
 
 def _sum_of(problem: Problem, known: KnownCoefficients, point: Point, fractions: Sequence[Array]) -> AdditiveModel:
-    """Return the submodels of a sum; a DataError says that they cannot be told apart."""
+    """Return the submodels of a sum; raise DataError if they are not identifiable."""
     each = zip(fractions, point.denominators, problem.terms, strict=True)
     model = AdditiveModel([Submodel(b, a, term.integrators) for b, a, term in each], point.delay.seconds)
     if known is NOTHING:
         return model
-    # The same up to rounding.
+    # Equal up to rounding.
     theta, structure = model.theta, SumStructure(problem.terms)
     theta[structure.denominators[known.places]] = known.denominator[known.places]
     given = np.isfinite(known.numerator)
@@ -375,15 +374,15 @@ def _sum_of(problem: Problem, known: KnownCoefficients, point: Point, fractions:
 
 
 def poles_of_submodels(model: AdditiveModel) -> ComplexArray:
-    """Return the poles of each submodel but its integrators, one submodel after the other."""
+    """Return the concatenated poles of the submodels, without integrators."""
     return np.concatenate([np.roots(submodel.denominator) for submodel in model.submodels]).astype(complex)
 
 
-# --- a part of long records, on which searches find out where to start on the whole -------------------
+# --- part of long records, which gives the starts for the whole records -------------------------------
 
 
 def part_of(problem: Problem, latest: float) -> Problem | None:
-    """The most active part of each record, with a free response; None where the records are not long.
+    """Return the most active part of each record, with a free response; None if the records are not long.
 
     The input of a part is known for delays up to ``latest`` [s].
     """
@@ -395,16 +394,16 @@ def part_of(problem: Problem, latest: float) -> Problem | None:
 
 
 def most_active_parts(records: Sequence[FilterData], latest: float) -> list[slice] | None:
-    """Samples of each record around which the input moves and the output varies most; None where none is long."""
+    """Return the samples of each record with the largest variation of input and output; None if none is long."""
     if sum(data.t.size for data in records) <= LONG or not all(data.common_clock for data in records):
         return None
-    # What comes before the latest delay tells nothing.
+    # Samples before the latest delay carry no information.
     sizes = [PART // len(records) + int(latest * data.t.size / (data.t[-1] - data.t[0])) for data in records]
     return [most_active(data.u, data.y, size) for data, size in zip(records, sizes, strict=True)]
 
 
 def most_active(u: Array, y: Array, size: int) -> slice:
-    """Return the samples, ``size`` of them, around which the input moves and the output varies most."""
+    """Return the ``size`` samples with the largest variation of input and output."""
     if y.size <= size:
         return slice(None)
     moves, spread = np.abs(np.diff(u, append=u[-1])), np.abs(y - y.mean())
@@ -415,7 +414,7 @@ def most_active(u: Array, y: Array, size: int) -> slice:
 
 
 def _cut(data: FilterData, part: slice, latest: float) -> FilterData:
-    """A part, whose samples do not count while the input is unknown."""
+    """Return a part whose samples are unused while the input is unknown."""
     if part == slice(None):
         return data
     t, y, u = (values[part].copy() for values in (data.t, data.y, data.u))

@@ -1,12 +1,11 @@
-r"""The stated set of admissible models, and the coordinates in which it is searched.
+r"""Set of admissible models, and the coordinates in which it is searched.
 
-``LIMITS`` has its bounds, with a reason for each. The delay lies between its own bounds. Without such a set an optimum
-need not exist: with a free initial state an undamped or a very slow pole fits noise, ever better.
+``LIMITS`` contains its bounds, with a reason for each. The delay has separate bounds. Without such a set an optimum
+need not exist: with a free initial state an undamped or very slow pole can fit noise without limit.
 
-A pair has the coordinates ln w and ln zeta, which pass a damping of 1 smoothly; so two real poles near each other are a
+A pair has the coordinates ln w and ln zeta, which are smooth at a damping of 1; therefore two close real poles form a
 section too. Real poles further apart, or at a bound of the set, have ln p each, and a pair with the greatest imaginary
-part has the logarithms of its real and imaginary part: in these coordinates the set is a box wherever its border is
-met.
+part has the logarithms of its real and imaginary part: in these coordinates the set is a box at every bound.
 """
 
 from collections.abc import Iterable, Sequence
@@ -32,30 +31,30 @@ from ctid_cli.estimation.optimum.projection import Problem
 from ctid_cli.estimation.optimum.triangle import Delay
 from ctid_cli.filtering.frequency_lines import FrequencyLines
 
-#: Least and greatest delay [s], or those of each input.
+#: Least and greatest delay [s], or one such pair for each input.
 Bounds = tuple[float, float] | tuple[tuple[float, float], ...]
 
 
 class Limit(NamedTuple):
     """A bound of the poles."""
 
-    #: What is bounded, and the unit of the values.
+    #: Bounded quantity, and unit of the values.
     what: str
     unit: str
-    #: The bound where the record begins at rest, where it repeats for ever, and where the state before is estimated.
+    #: Bounds for a record that begins at rest, for a periodic one, and for an estimated initial state.
     rest: float
     periodic: float
     estimated: float
-    #: Why the bound is where it is, and what a fit that ends there means.
+    #: Reason for the value, and meaning of a fit that ends at the bound.
     reason: str
     meaning: str
 
 
-#: Costs were compared with arithmetic of 40 digits on 200 samples, noise 80 dB below the output, for poles at several
-#: bounds at once. At rest: 3e-12 apart, relatively, down to a damping of 1e-6 and to poles of .0001 over the length.
+#: Costs were compared with 40-digit arithmetic on 200 samples, noise 80 dB below the output, for poles at several
+#: bounds at once. At rest: relative difference 3e-12 down to a damping of 1e-6 and to poles of .0001 over the length.
 #: Periodic: 1e-11 with pairs of a damping of 1e-6; 1e-7 with two poles of .01 over the length, 1e-4 with two of .001.
-#: An integrating drive at rest (``benchmarks/bench_optimum.py --likes``) costs 4811 times its optimum if poles end at 1
-#: over the length, .9 % more at .001 and .02 % more at .0001.
+#: For an integrating drive at rest (``benchmarks/bench_optimum.py --likes``) the cost is 4811 times its optimum if
+#: poles end at 1 over the length, .9 % higher at .001 and .02 % higher at .0001.
 LIMITS = {
     "slowest": Limit(
         "least magnitude of a pole",
@@ -98,11 +97,11 @@ LIMITS = {
         "a pair of poles oscillates as fast as the samples can show",
     ),
 }
-#: Real poles whose ratio is below this share a section.
+#: Two real poles with a ratio below this form one section.
 NEAR = 4.0
-#: What is just beyond an edge, as a fraction of the shortest interval; closer ones count as one instant.
+#: Tolerance of instants, as a fraction of the shortest interval; closer ones count as equal.
 JUST_BEYOND = 1e-6
-#: A coordinate this close to a bound is at it; after the roots of a polynomial, so close.
+#: Distance within which a coordinate is at a bound; the larger one after computing roots of a polynomial.
 TOUCH, CLOSE_TO_BOUND = 1e-9, 1e-6
 
 
@@ -115,21 +114,21 @@ class Box:
     #: Greatest imaginary part [rad/s].
     imaginary: float = np.inf
     delays: Bounds = (0.0, 0.0)
-    #: Sampling interval [s] where the cost has kinks at whole intervals of delay, else 0.
+    #: Sampling interval [s] if the cost has kinks at delays of whole intervals, else 0.
     cell: float = 0.0
-    #: Delay [s] that counts as a step of one, a quarter period of what the output holds.
+    #: Unit of the delay coordinate [s]: a quarter period of the output's RMS frequency.
     quarter: float = 1.0
     least_damping: float = LIMITS["least_damping"].estimated
-    #: Least delay [s] at which derivatives are taken on an irregular clock. Without a delay all samples may coincide
-    #: with edges of the input, where only what comes later counts.
+    #: Least delay [s] for derivatives on an irregular clock. Without a delay all samples may coincide with edges of the
+    #: input, where only the right-hand derivative exists.
     beyond_edges: float = 0.0
-    #: Slowest pole [rad/s] and least damping [-] between which starts are spread, whatever the set admits beyond, and
-    #: the greatest frequency that the data show [rad/s].
+    #: Slowest pole [rad/s] and least damping [-] of the starts, which may be narrower than the set, and the highest
+    #: frequency in the data [rad/s].
     slowest_spread: float = 0.0
     least_damping_spread: float = 0.0
     highest: float = np.inf
-    #: Number of poles of each of several denominators, empty for one; and whether known coefficients are those over
-    #: monic denominators, or with constant terms of 1.
+    #: Number of poles of each of several denominators, empty for one; and whether known coefficients refer to monic
+    #: denominators, or to constant terms of 1.
     parts: tuple[int, ...] = ()
     monic: bool = True
 
@@ -160,12 +159,12 @@ class Box:
 
     @property
     def middle(self) -> tuple[float, ...]:
-        """The middle of the range of each delay."""
+        """Middle of the range of each delay."""
         return tuple(0.5 * (low + high) for low, high in self.each_delay)
 
     @property
     def spread(self) -> tuple[float, float]:
-        """Slowest pole [rad/s] and least damping [-] of starts that are spread over the set."""
+        """Slowest pole [rad/s] and least damping [-] of starts."""
         return max(self.slowest, self.slowest_spread), max(self.least_damping, self.least_damping_spread)
 
     def met_by(self, pole: complex) -> tuple[str, ...]:
@@ -180,7 +179,7 @@ class Box:
         return tuple(name for name, at in met.items() if at)
 
     def limits_met(self, poles: Iterable[complex]) -> list[tuple[str, Limit, float]]:
-        """Return the bounds that poles are at: their names, their lines in ``LIMITS`` and their values."""
+        """Return the bounds reached by poles: their names, entries of ``LIMITS`` and values."""
         met = {name for pole in poles for name in self.met_by(pole)}
         return [(name, limit, getattr(self, name)) for name, limit in LIMITS.items() if name in met]
 
@@ -201,7 +200,7 @@ def each_bounds(delays: Bounds) -> tuple[tuple[float, float], ...]:
 
 
 def widened(box: Box, poles: ComplexArray) -> Box:
-    """Return a box that holds given stable poles inside its bounds, too."""
+    """Return a box enlarged to contain given stable poles inside its bounds."""
     sizes, pairs, more = np.abs(poles), poles[poles.imag > 0], 1.0 + JUST_BEYOND
     return replace(
         box,
@@ -212,13 +211,13 @@ def widened(box: Box, poles: ComplexArray) -> Box:
     )
 
 
-#: No bounds at all.
+#: Box without bounds.
 ANYWHERE = Box(0.0, np.inf, delays=(0.0, np.inf), least_damping=0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Sections, fastest first in each denominator, and the delay of each input."""
+    """Sections of each denominator, fastest first, and the delay of each input."""
 
     speed: Array
     #: Damping of a pair; -1 marks a real pole.
@@ -226,27 +225,27 @@ class Point:
     #: Whether the imaginary part of a pair is at its bound.
     edge: BoolArray
     delays: tuple[Delay, ...]
-    #: As in the box.
+    #: See :class:`Box`.
     parts: tuple[int, ...] = ()
     monic: bool = True
 
     @property
     def delay(self) -> Delay:
-        """The delay of the first input."""
+        """Delay of the first input."""
         return self.delays[0]
 
     @property
     def seconds(self) -> tuple[float, ...]:
-        """The delay of each input [s]."""
+        """Delay of each input [s]."""
         return tuple(delay.seconds for delay in self.delays)
 
     @cached_property
     def cells(self) -> tuple[int, ...]:
-        """The cell of each delay."""
+        """Cell of each delay."""
         return tuple(delay.cell for delay in self.delays)
 
     def with_delays(self, delays: Iterable[Delay]) -> "Point":
-        """Return the same poles at other delays."""
+        """Return a copy with other delays."""
         return replace(self, delays=tuple(delays))
 
     @property
@@ -266,7 +265,7 @@ class Point:
 
     @property
     def denominator(self) -> Array:
-        """The first of them."""
+        """First denominator."""
         return self.denominators[0]
 
     @property
@@ -277,7 +276,7 @@ class Point:
         return np.concatenate([a[-2::-1] / a[-1] for a in self.denominators])
 
     def jacobian(self) -> Array:
-        """Derivatives of ``ln w, ln zeta`` (or ln p) of all sections to the coordinates, block diagonal."""
+        """Return the block-diagonal Jacobian of ``ln w, ln zeta`` (or ln p) of all sections by the coordinates."""
         result, k = np.eye(order_of(self.damping)), 0
         for zeta, edge in zip(self.damping.tolist(), self.edge.tolist(), strict=True):
             if edge:
@@ -287,20 +286,20 @@ class Point:
         return result
 
     def coefficient_slopes(self) -> Array:
-        """Derivatives of the coefficients to the coordinates, shape (n, n)."""
+        """Return the derivatives of the coefficients with respect to the coordinates, shape (n, n)."""
         found = [polynomial_slopes(*own) for own in self.rows]
         if not self.monic:
             found = [_with_constant_one(a, own) for a, own in zip(self.denominators, found, strict=True)]
         return np.asarray(block_diagonal(found) @ self.jacobian())
 
     def whole_sections(self, chosen: BoolArray) -> BoolArray:
-        """All coordinates, or poles, of the sections of which one is chosen."""
+        """Return the mask of all coordinates, or poles, of the sections that contain a chosen one."""
         sizes = np.where(self.damping < 0, 1, 2)
         starts = np.cumsum(sizes) - sizes
         return np.repeat(np.logical_or.reduceat(chosen, starts), sizes)
 
     def shifted(self, step: Array) -> tuple[Array, Array]:
-        """Speeds and dampings a step away in the coordinates of the poles."""
+        """Return the speeds and dampings after a step in the coordinates of the poles."""
         speed, damping, k = self.speed.copy(), self.damping.copy(), 0
         for i, (w, zeta, edge) in enumerate(
             zip(self.speed.tolist(), self.damping.tolist(), self.edge.tolist(), strict=True)
@@ -327,13 +326,13 @@ def _with_constant_one(a: Array, slopes: Array) -> Array:
 
 
 def box_of(problem: Problem, delays: Bounds) -> Box:
-    """Return the set that records, or a frequency response, admit."""
+    """Return the admissible set for records, or for a frequency response."""
     if problem.lines is not None:
         return _box_of_lines(problem.lines, each_bounds(delays)[0])
     length, interval, rate, cells = 0.0, np.inf, 0.0, set()
     for data in problem.sampled:
         used, steps = data.t[data.use], np.diff(data.t)
-        # Of a record on the finer clock of its input the samples are some of the points.
+        # On the finer clock of the input the output samples are a subset of the points.
         points = max(1, round(float(np.diff(used).min()) / data.interval)) if data.interval > 0 and used.size > 1 else 1
         length, interval = max(length, float(used[-1] - used[0])), min(interval, points * float(np.median(steps)))
         # Root mean square frequency of the output, from its differences.
@@ -346,7 +345,7 @@ def box_of(problem: Problem, delays: Bounds) -> Box:
     state = "estimated" if problem.free_response else "periodic" if any(problem.periods) else "rest"
     bounds = {name: getattr(limit, state) for name, limit in LIMITS.items()}
     greatest = bounds["imaginary"] * np.pi / interval if min(cells) > 0 else np.inf
-    # Clocks of different intervals have their kinks all over the place.
+    # With different sampling intervals the kinks have no common grid.
     cell = cells.pop() if len(cells) == 1 else 0.0
     beyond = 0.0 if cell else JUST_BEYOND * min(float(np.diff(data.t).min()) for data in problem.sampled)
     return Box(
@@ -365,13 +364,13 @@ def box_of(problem: Problem, delays: Bounds) -> Box:
     )
 
 
-#: Slowest and fastest pole for a frequency response, over its least and its greatest frequency: at 80 dB the phase at
-#: the nearest line tells such a pole from none.
+#: Slowest and fastest pole for a frequency response, relative to its lowest and highest frequency: at 80 dB such a pole
+#: is detectable by the phase at the nearest line.
 SLOWEST_OF_LINES, FASTEST_OF_LINES = 1e-4, 1e2
 
 
 def _box_of_lines(lines: FrequencyLines, delays: tuple[float, float]) -> Box:
-    """Return the set that a frequency response admits: that of a record at rest, by its least and greatest lines."""
+    """Return the admissible set for a frequency response: that of a record at rest, from its range of lines."""
     power = np.abs(lines.weights * lines.response) ** 2
     rate = float(np.sqrt(np.sum(power * lines.frequencies**2) / max(float(power.sum()), 1e-300)))
     interval, fastest, greatest = lines.interval, FASTEST_OF_LINES * lines.highest, np.inf
@@ -394,14 +393,14 @@ def _box_of_lines(lines: FrequencyLines, delays: tuple[float, float]) -> Box:
 
 
 def admissible(pole: complex, box: Box) -> complex:
-    """A pole moved to the nearest admissible one."""
+    """Return the nearest admissible pole."""
     size = min(max(abs(pole), box.slowest), box.fastest)
     if pole.imag == 0:
         return complex(-size)
     damping = max(-pole.real / abs(pole), box.least_damping)
     real, imaginary = size * damping, size * sqrt(max(1 - damping * damping, 0.0))
     if imaginary > box.imaginary:
-        # At the greatest imaginary part the real part stays.
+        # At the greatest imaginary part the real part is kept.
         real, imaginary = max(real, box.imaginary * box.least_damping), box.imaginary
     return complex(-real, copysign(imaginary, pole.imag))
 
@@ -409,7 +408,7 @@ def admissible(pole: complex, box: Box) -> complex:
 def point_of(
     poles: ComplexArray, delays: float | Sequence[float], box: Box, cells: Sequence[int | None] | None = None
 ) -> Point:
-    """Admissible sections with given poles, those of several denominators one after the other."""
+    """Return admissible sections with given poles, concatenated for several denominators."""
     moved, units, first = [admissible(pole, box) for pole in poles.tolist()], [], 0
     for order in box.parts or (len(moved),):
         units += _units(moved[first : first + order], box)
@@ -432,16 +431,16 @@ def point_of(
 
 
 def _units(poles: list[complex], box: Box) -> list[tuple[float, float, bool]]:
-    """Sections of one denominator: speed, damping, and whether the imaginary part is at its bound."""
+    """Return the sections of one denominator: speed, damping, and whether the imaginary part is at its bound."""
     units = [(abs(p), -p.real / abs(p), p.imag >= box.imaginary * (1 - TOUCH)) for p in poles if p.imag > 0]
     units += _real_sections(sorted(-p.real for p in poles if p.imag == 0), box)
     return sorted(units, key=lambda unit: -unit[0])
 
 
 def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, bool]]:
-    """Sections of real poles, given in rising order: the nearest first share one, others have their own."""
+    """Return sections of real poles in ascending order: the closest are paired first, others stay single."""
     sections = []
-    # One at a bound stays alone, so that it can be frozen there.
+    # A pole at a bound stays single, so that it can be held there.
     while len(reals) > 1:
         ratios = [
             b / a if a > box.slowest * (1 + TOUCH) and b < box.fastest * (1 - TOUCH) else np.inf
@@ -457,7 +456,7 @@ def _real_sections(reals: list[float], box: Box) -> list[tuple[float, float, boo
 
 
 def moved_by(point: Point, step: Array, box: Box) -> Point:
-    """The point a step away, the free delays in quarter periods last, moved back to the set where it leaves it."""
+    """Return the point after a step, the free delays in quarter periods last, projected onto the admissible set."""
     speed, damping = point.shifted(step)
     poles = np.array(poles_of(speed, damping), dtype=complex)
     seconds, cells = list(point.seconds), [None if k in box.free_delays else -1 for k in range(len(point.delays))]
@@ -465,7 +464,7 @@ def moved_by(point: Point, step: Array, box: Box) -> Point:
         seconds[k] += step[place] * box.quarter
         if point.delays[k].cell < 0:
             continue
-        # In its own cell as long as it does not leave it; at a sample the cell tells which side is meant.
+        # The delay keeps its cell until it leaves it; at a sample the cell determines the side.
         low, high = point.delays[k].cell * box.cell, (point.delays[k].cell + 1) * box.cell
         for edge in (low, high):
             if abs(seconds[k] - edge) < TOUCH * box.cell:
@@ -475,13 +474,13 @@ def moved_by(point: Point, step: Array, box: Box) -> Point:
 
 
 def frozen(point: Point, gradient: Array, box: Box) -> BoolArray:
-    """Return which coordinates are at a bound with the descent pointing outward."""
+    """Return which coordinates are at a bound with an outward descent direction."""
     at_low, at_high = at_bounds(point, box)
     return (at_low & (gradient > 0)) | (at_high & (gradient < 0))
 
 
 def at_bounds(point: Point, box: Box) -> tuple[BoolArray, BoolArray]:
-    """Return which coordinates are at their lower and upper bound; for a delay the bounds of its cell count."""
+    """Return which coordinates are at their lower and upper bound; a delay is bounded by its cell."""
     at_low: list[bool] = []
     at_high: list[bool] = []
     for w, zeta, edge in zip(point.speed.tolist(), point.damping.tolist(), point.edge.tolist(), strict=True):

@@ -1,16 +1,16 @@
-r"""Sections in a row, fastest first, and the two ways to their signals: partial fractions and a state space.
+r"""Cascade of sections, fastest first, and two forms of their signals: partial fractions and a state space.
 
-Section i has unit static gain, ``p/(s + p)`` or ``w^2/(s^2 + 2 zeta w s + w^2)``, and is driven by the output of the
-section before it; an integrator, of speed 0, is ``1/s``. The state ``s/w`` times the output stands before the output
-itself, so that state i of n has, over the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states
-span all ``B/A u`` of degree m. Real poles may meet and become a pair.
+Section i has unit static gain, ``p/(s + p)`` or ``w^2/(s^2 + 2 zeta w s + w^2)``, and its input is the output of the
+previous section; an integrator, of speed 0, is ``1/s``. The state ``s/w`` times the output precedes the output, so that
+state i of n has, over the common denominator, a numerator of degree ``n-1-i``: the last m + 1 states span all ``B/A u``
+of degree m. Two real poles may merge into a pair.
 
-Submodels of a sum are rows of sections side by side: maps are then block diagonal, each with the blocks of its own
-sections, and nothing is divided by the difference of poles of two submodels.
+Submodels of a sum are parallel cascades: maps are then block diagonal, and there are no divisions by differences
+between poles of two submodels.
 
-The *rows* of a form are ``z``, from which one map leads to the states of the sections, and ``w``, from which with z
-another one leads to the derivatives of ``x = B/A u`` to the poles. Partial fractions are fast, and their rows do not
-depend on B; where poles are so close that these would amplify rounding, the state space takes over.
+The *rows* of a form are ``z``, which are mapped to the states of the sections, and ``w``, which are mapped together
+with z to the derivatives of ``x = B/A u`` with respect to the poles. Partial fractions are fast, and their rows do not
+depend on B; the state space is used if poles are so close that partial fractions would amplify rounding.
 """
 
 import cmath
@@ -31,32 +31,32 @@ from ctid_cli.filtering.frequency_lines import FrequencyLines
 from ctid_cli.filtering.realisation import exponential_minus_identity, transitions
 
 Number = TypeVar("Number", np.float64, np.complex128)
-#: Samples that are filtered at a time, which bounds the memory of a long record.
+#: Samples that are filtered at once, which limits the memory for a long record.
 PIECE = 4096
 
 
 class Record(NamedTuple):
-    """A record as a form filters it."""
+    """Input of a form: a record with its delay and period."""
 
     data: FilterData
     delay: Place
-    #: Period [s] of an input that repeats itself, else 0; and what leads through one up to where the data begin.
+    #: Period [s] of a periodic input, else 0; and the transition through one period up to the start of the data.
     period: float = 0.0
     once: FilterData | None = None
 
     @property
     def undelayed(self) -> Place:
-        """No delay."""
+        """Place without a delay."""
         return (0, 0.0) if self.data.interval > 0.0 else 0.0
 
 
 def order_of(damping: Array) -> int:
-    """Return the number of poles: a real pole, marked by a negative damping, has one, a pair two."""
+    """Return the number of poles: one for a real pole, marked by a negative damping, two for a pair."""
     return damping.size + int(np.count_nonzero(damping >= 0.0))
 
 
 def poles_of(speed: Array, damping: Array) -> list[complex]:
-    """Return the poles, those of a section side by side, the upper or the faster one first."""
+    """Return the poles section by section, the upper or the faster one first."""
     poles: list[complex] = []
     for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
         if zeta < 0.0:
@@ -66,7 +66,7 @@ def poles_of(speed: Array, damping: Array) -> list[complex]:
                 w * complex(-zeta, swing) for swing in ((1.0 - zeta * zeta) ** 0.5, -((1.0 - zeta * zeta) ** 0.5))
             ]
         else:
-            # The product of both is w^2: the slow one without cancellation.
+            # The product of both poles is w^2, which gives the slow one without cancellation.
             fast = w * (zeta + (zeta * zeta - 1.0) ** 0.5)
             poles += [complex(-fast), complex(-w * w / fast)]
     return poles
@@ -92,7 +92,7 @@ def chain_dynamics(speed: Array, damping: Array) -> tuple[Array, Array]:
 
 
 def polynomial(speed: Array, damping: Array) -> Array:
-    """Monic product of the sections, descending powers."""
+    """Return the monic product of the sections, descending powers."""
     product = np.ones(1)
     for w, zeta in zip(speed.tolist(), damping.tolist(), strict=True):
         product = np.convolve(product, [1.0, w] if zeta < 0 else [1.0, 2.0 * zeta * w, w * w])
@@ -100,7 +100,7 @@ def polynomial(speed: Array, damping: Array) -> Array:
 
 
 def polynomial_slopes(speed: Array, damping: Array) -> Array:
-    """Derivatives of its coefficients ``a_1 ... a_n`` to ln w and ln zeta, or ln p, of each section, shape (n, n)."""
+    """Return the derivatives of ``a_1 ... a_n`` by ln w and ln zeta, or ln p, of each section, shape (n, n)."""
     columns = []
     for i, (w, zeta) in enumerate(zip(speed.tolist(), damping.tolist(), strict=True)):
         others = polynomial(np.delete(speed, i), np.delete(damping, i))
@@ -111,7 +111,7 @@ def polynomial_slopes(speed: Array, damping: Array) -> Array:
 
 
 def numerators(speed: Array, damping: Array) -> Array:
-    """Numerators of the states over the monic polynomial, descending powers, shape (n, n)."""
+    """Return the numerators of the states over the monic polynomial, descending powers, shape (n, n)."""
     n = order_of(damping)
     result = np.zeros((n, n))
     gain, row = 1.0, 0
@@ -126,7 +126,7 @@ def numerators(speed: Array, damping: Array) -> Array:
     return result
 
 
-#: Speeds and dampings of the sections of each submodel; of a transfer function there is one.
+#: Speeds and dampings of the sections of each submodel; a transfer function has one.
 Rows = Sequence[tuple[Array, Array]]
 
 
@@ -151,12 +151,12 @@ def block_diagonal(blocks: Sequence[NDArray[Number]]) -> NDArray[Number]:
 
 
 def submodels_of(rows: Rows) -> IntArray:
-    """Return the submodel that each state belongs to, shape (n,)."""
+    """Return the submodel index of each state, shape (n,)."""
     return np.repeat(np.arange(len(rows)), [order_of(damping) for _, damping in rows])
 
 
 def chains_dynamics(rows: Rows) -> tuple[Array, Array]:
-    """Return dynamics F and gain g of all rows of sections side by side."""
+    """Return dynamics F and gain g of all parallel cascades."""
     each = [chain_dynamics(*own) for own in rows]
     return block_diagonal([F for F, _ in each]), np.concatenate([g for _, g in each])
 
@@ -167,7 +167,7 @@ def all_numerators(rows: Rows) -> Array:
 
 
 def forms_of(rows: Rows, channels: Sequence[slice], length: float) -> list["Form"]:
-    """Return the form of the sections that each channel drives; one kind of all, so that they pass records together."""
+    """Return the form of the sections of each channel; all of one kind, so that one pass of the records serves all."""
     modal = all(_apart(poles_of(*own), length) for own in rows)
     made = dict[int, Form]()
     for own in channels:
@@ -177,11 +177,11 @@ def forms_of(rows: Rows, channels: Sequence[slice], length: float) -> list["Form
 
 
 def _apart(poles: list[complex], length: float) -> bool:
-    """Whether poles are so far apart that partial fractions keep their digits."""
+    """Return whether poles are far enough apart for accurate partial fractions."""
     worst = 1.0
     for i, pole in enumerate(poles):
-        # Poles whose resonances, or whose responses within the record, overlap nearly cancel each other: each such pair
-        # amplifies rounding by this factor, and by its square where the denominator is squared.
+        # Residues of poles with overlapping resonances, or responses within the record, nearly cancel: each such pair
+        # amplifies rounding by this factor, and by its square if the denominator is squared.
         product = 1.0
         for other in poles[:i] + poles[i + 1 :]:
             apart = abs(pole - other)
@@ -201,14 +201,14 @@ def _both_of_pairs(pairs: tuple[bool, ...]) -> ComplexArray:
 
 @dataclass(frozen=True, eq=False)
 class Fractions:
-    """Fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
+    """Partial fractions: z is ``1/(s - p) u`` of each pole and w is ``1/(s - p)^2 u``, real and imaginary parts."""
 
-    #: The modes of a pass, one of each pair.
+    #: Modes to be filtered, one of each pair.
     modes: Modes
 
     @staticmethod
     def modes_of(poles: ComplexArray) -> Modes:
-        """Return modes that have no output."""
+        """Return modes without an output."""
         count = poles.size
         return Modes(poles, np.zeros(count, np.int64), np.zeros((count, 2), complex), np.zeros(1))
 
@@ -230,7 +230,7 @@ class Fractions:
         for values in both if second else both[:1]:
             upper, lower = values[:, : poles.size], values[:, : poles.size].copy()
             lower[:, pairs] = values[:, poles.size :]
-            # Real and imaginary part in time: half the sum and half the difference of a mode and its conjugate.
+            # Real and imaginary parts in time are half the sum and half the difference of a mode and its conjugate.
             of_z = np.stack((0.5 * (upper + lower), -0.5j * (upper - lower)), axis=2)
             columns.append(
                 of_z.reshape(len(values), -1)[:, np.column_stack((np.full(poles.size, True), pairs)).ravel()]
@@ -256,8 +256,8 @@ class Fractions:
 
 
 def _residues(speed: Array, damping: Array, poles: list[complex]) -> ComplexArray:
-    """Return the states of sections in the modes of their poles, shape (n, n)."""
-    # A state is its gain over the product of s - pole up to the end of its section, the first one of a pair times s/w.
+    """Return the residues of the states of sections at their poles, shape (n, n)."""
+    # A state is its gain over the product of s - pole up to the end of its section; the first of a pair is times s/w.
     n, gain, first = len(poles), 1.0, 0
     weights = np.zeros((n, n), dtype=complex)
     products = [1.0 + 0.0j] * n
@@ -282,11 +282,11 @@ class Modal(Fractions):
     #: Damping of all sections.
     damping: Array
     poles: ComplexArray
-    #: The submodel of each pole, shape (n,).
+    #: Submodel index of each pole, shape (n,).
     submodel: IntArray
-    #: From z to the modes of all poles, shape (n, n).
+    #: Map from z to the modes of all poles, shape (n, n).
     whole: ComplexArray
-    #: States of the sections from the modes of all poles, and from z, shape (n, n).
+    #: Maps from the modes of all poles, and from z, to the states of the sections, shape (n, n).
     weights: ComplexArray
     states: Array
 
@@ -302,7 +302,7 @@ class Modal(Fractions):
         return cls(modes, damping, np.array(poles), submodels_of(rows), whole, weights, states)
 
     def driving(self, output: Array, direct: Array, free: Array) -> "Modal":
-        """Return the form whose w serves ``x = output z + direct u`` of each submodel and its free response."""
+        """Return the form with w for ``x = output z + direct u`` of each submodel and its free response."""
         return self
 
     def rate(self, output: Array) -> tuple[Array, float]:
@@ -335,18 +335,18 @@ class Modal(Fractions):
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A state space: z are the states of the sections, and w those of a second chain that x drives."""
+    """State space: z are the states of the sections, and w those of a second chain with input x."""
 
     rows: Rows
     dynamics: Array
     gain: Array
-    #: Those of the free response.
+    #: Gains of the free response.
     free_dynamics: Array
     free_gain: Array
 
     @classmethod
     def of(cls, rows: Rows) -> "Chain":
-        """Return the state space of rows of sections that nothing drives a second time."""
+        """Return the state space of sections without a second chain."""
         F, g = chains_dynamics(rows)
         return cls(rows, F, g, F, g)
 
@@ -356,9 +356,9 @@ class Chain:
         return np.eye(sum(order_of(damping) for _, damping in self.rows))
 
     def driving(self, output: Array, direct: Array, free: Array) -> "Chain":
-        """Return the form whose w is driven by ``x = output z + direct u`` of each submodel, and by its free response.
+        """Return the form whose w has the input ``x = output z + direct u`` of each submodel, and its free response.
 
-        Each submodel drives a second chain of its own.
+        Each submodel has a separate second chain.
         """
         F, g, submodel = self.dynamics, self.gain, submodels_of(self.rows)
         own = np.where(submodel[:, None] == submodel, g[:, None], 0.0)
@@ -376,8 +376,8 @@ class Chain:
         """Yield ``[z, w, u, y]`` of the used samples."""
         initial = np.zeros(self.gain.size)
         if record.once is not None:
-            # From rest to the end of a period x_N is left over: x0 = x_N + Phi^N x0. With X = Phi^N - I, which the
-            # exponential gives without cancellation, X x0 = -x_N.
+            # x_N is the state after one period from rest: x0 = x_N + Phi^N x0. With X = Phi^N - I, computed by the
+            # exponential without cancellation, X x0 = -x_N.
             end = chain_states(self.dynamics, self.gain, 1.0, record.once, record.undelayed)[-1, :-1]
             initial = np.asarray(np.linalg.solve(exponential_minus_identity(self.dynamics * record.period), -end))
         data = record.data
@@ -406,12 +406,12 @@ class Chain:
         return np.vstack((np.zeros_like(table), -np.linalg.solve(table.T, slopes)))
 
 
-#: A form of the sections.
+#: Either form of the sections.
 Form = Modal | Chain
 
 
 def pieces(data: FilterData, delay: Place) -> Iterator[tuple[FilterData, Place]]:
-    """Yield the pieces of a record, each with the input from the break on that its states stand at."""
+    """Yield the pieces of a record, each with the input from the break at which its states are given."""
     count, begin = data.t.size, 0
     if count <= PIECE:
         yield data, delay

@@ -1,9 +1,9 @@
-r"""Known coefficients of a model: those of the denominator as constraints on the poles.
+r"""Known coefficients of a model; those of the denominator are constraints on the poles.
 
 With all poles in the left half-plane every coefficient ``a_i`` is positive, and in the logarithms of speeds and
-dampings ``ln a_i`` is convex and nearly linear. So ``ln a_i = ln v_i`` is met by a few Newton steps from almost
-anywhere, and searches move along the surface where it holds. Known coefficients of the numerator do not constrain the
-poles: they are eliminated with the others (:mod:`~ctid_cli.estimation.optimum.projection`).
+dampings ``ln a_i`` is convex and nearly linear. A few Newton steps therefore solve ``ln a_i = ln v_i`` from almost any
+point, and searches move along this surface. Known coefficients of the numerator do not constrain the poles: they are
+eliminated with the others (:mod:`~ctid_cli.estimation.optimum.projection`).
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from ctid_cli.estimation.optimum.box import Box, Point, at_bounds, moved_by
 from ctid_cli.inference.sensitivities import SumStructure
 from ctid_cli.models.additive import Term
 
-#: Newton steps back to the constraint at most, and the error in ``ln a_i`` at which it holds, up to rounding.
+#: Largest number of Newton steps to the constraint, and its tolerance in ``ln a_i``.
 MOST_STEPS, MET, ROUNDED = 50, 1e-14, 1e-11
 #: Multipliers of bounds and singular values of constraints below this fraction of the largest are zero.
 ZERO = 1e-12
@@ -25,15 +25,15 @@ ZERO = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class KnownCoefficients:
-    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for those that are free.
+    """Values of ``a_1 ... a_n`` and ``b_0 ... b_m``, NaN for free coefficients.
 
-    Those of several denominators, and of several numerators, stand one after the other.
+    Those of several denominators, and of several numerators, are concatenated.
     """
 
     denominator: Array
     numerator: Array
-    #: Number of poles of each of several denominators, and whether they are monic or have constant terms of 1. In both
-    #: cases the coefficients of numerators are in descending powers.
+    #: Number of poles of each of several denominators, and whether these are monic or have constant terms of 1.
+    #: Numerators are always in descending powers.
     parts: tuple[int, ...] = ()
     monic: bool = True
 
@@ -41,14 +41,14 @@ class KnownCoefficients:
     def of(
         cls, poles: int, zeros: int, values: Mapping[int, float], parts: tuple[int, ...] = ()
     ) -> "KnownCoefficients":
-        """Return them from values by places in ``a_1 ... a_n, b_0 ... b_m``."""
+        """Return the known coefficients from values indexed by ``a_1 ... a_n, b_0 ... b_m``."""
         theta = np.full(poles + zeros + 1, np.nan)
         theta[list(values)] = list(values.values())
         return cls(theta[:poles], theta[poles:], parts)
 
     @classmethod
     def of_sum(cls, terms: tuple[Term, ...], values: Mapping[int, float]) -> "KnownCoefficients":
-        """Return them from values by places among the parameters of a sum."""
+        """Return the known coefficients from values indexed by the parameters of a sum."""
         structure = SumStructure(terms)
         theta = np.full(structure.size, np.nan)
         theta[list(values)] = list(values.values())
@@ -62,28 +62,28 @@ class KnownCoefficients:
 
     @property
     def given(self) -> BoolArray:
-        """Which of ``a_1 ... a_n, b_0 ... b_m`` are known."""
+        """Mask of the known coefficients among ``a_1 ... a_n, b_0 ... b_m``."""
         return np.isfinite(np.concatenate((self.denominator, self.numerator)))
 
     @cached_property
     def places(self) -> IntArray:
-        """Places of the known coefficients of the denominator."""
+        """Indices of the known coefficients of the denominator."""
         return np.flatnonzero(np.isfinite(self.denominator))
 
     @property
     def poles(self) -> ComplexArray:
-        """The poles, where all coefficients of the denominators are known."""
+        """Poles, if all coefficients of the denominators are known."""
         each = np.split(self.denominator, np.cumsum(self.parts)[:-1]) if self.parts else [self.denominator]
         whole = [np.append(1.0, a) if self.monic else np.append(a[::-1], 1.0) for a in each]
         return np.concatenate([np.roots(a) for a in whole]).astype(complex)
 
     @property
     def all_poles(self) -> bool:
-        """Whether all denominators are known: their poles do not move, however ill-conditioned they are."""
+        """Whether all denominators are known, so that their poles are constant, even if ill-conditioned."""
         return self.places.size == self.denominator.size > 0
 
     def slopes(self, point: Point, size: int) -> Array:
-        """Return the derivatives of ``ln a_i`` to the coordinates, shape (k, size), size with that of the delay."""
+        """Return the derivatives of ``ln a_i`` by the coordinates, including the delay, shape (k, size)."""
         n, slopes = point.poles.size, np.zeros((self.places.size, size))
         if self.all_poles:
             slopes[:, :n] = np.eye(n)
@@ -93,7 +93,7 @@ class KnownCoefficients:
         return slopes
 
     def met(self, point: Point, box: Box) -> Point | None:
-        """Return the point nearby, in logarithms, where the denominator has its values; None where none is found."""
+        """Return the closest point, in logarithms, with the known denominator coefficients; None if not found."""
         if not self.places.size or self.all_poles:
             return point
         values, last = np.log(self.denominator[self.places]), np.inf
@@ -111,7 +111,7 @@ class KnownCoefficients:
         return None
 
     def _least_step(self, point: Point, error: Array, box: Box) -> Array:
-        """Return the least Newton step to the constraint; what it would push out of the set stays at its bound."""
+        """Return the least-norm Newton step to the constraint; coordinates that would leave the set stay at a bound."""
         n = point.poles.size
         slopes, (low, high) = self.slopes(point, n), at_bounds(point, box)
         free, step = np.ones(n, dtype=bool), np.zeros(n)
@@ -125,10 +125,10 @@ class KnownCoefficients:
         return step * free
 
     def held(self, slope: Array, slopes: Array, low: BoolArray, high: BoolArray) -> BoolArray:
-        """Return which coordinates at a bound are held there: those whose multiplier is positive.
+        """Return which coordinates at a bound are held there, that is those with a positive multiplier.
 
-        ``slope + slopes' l = mu_low - mu_high`` with nonnegative ``mu``, by least squares: what is left is the steepest
-        descent that neither the constraint nor a bound forbids.
+        ``slope + slopes' l = mu_low - mu_high`` with nonnegative ``mu``, by least squares: the residual is the steepest
+        descent that satisfies the constraint and the bounds.
         """
         if not self.places.size:
             return (low & (slope > 0)) | (high & (slope < 0))
@@ -146,7 +146,7 @@ class KnownCoefficients:
 
 
 def null_space(slopes: Array) -> Array:
-    """Return an orthonormal basis of the directions in which nothing changes, shape (f, r)."""
+    """Return an orthonormal basis of the null space, shape (f, r)."""
     if not slopes.size:
         return np.eye(slopes.shape[1])
     _, values, right = np.linalg.svd(slopes)
@@ -154,5 +154,5 @@ def null_space(slopes: Array) -> Array:
     return np.asarray(right[rank:].T)
 
 
-#: Nothing is known.
+#: No known coefficients.
 NOTHING = KnownCoefficients(np.zeros(0), np.zeros(0))

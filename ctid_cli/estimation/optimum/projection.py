@@ -4,11 +4,10 @@ r"""Variable projection: the squared output error over the denominator and the d
 
 For given poles and delay B, C, c and d follow by linear least squares. With Phi their columns and P the projection on
 them, Kaufman's Jacobian of the residual is ``-(I - P) dPhi/dalpha c``; since ``r`` is orthogonal to Phi its gradient is
-exact. Known coefficients of B leave Phi, and their part of the response leaves y. The derivatives of ``B/A u`` at a
-fixed B are the same, so that nothing else changes.
+exact. Columns of known coefficients of B are removed from Phi, and their response is subtracted from y. The derivatives
+of ``B/A u`` at a fixed B do not change.
 
-A sum of fractions, be it of submodels or of the responses to several inputs, has columns of each of them in the place
-of those of ``B/A u``, and everything else in common.
+A sum of fractions, for submodels or for several inputs, has the columns of all fractions instead of those of ``B/A u``.
 
 References
 ----------
@@ -43,38 +42,38 @@ from ctid_cli.models.additive import Term
 
 #: Singular values of the scaled columns below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-11
-#: Models times samples whose squared errors are found together: what fits into the second cache of a processor.
+#: Models times samples whose squared errors are computed together, which fit into the L2 cache.
 TOGETHER = 12_000
 
 
 class Problem(NamedTuple):
-    """Records, or a frequency response in their place, and what is eliminated with them."""
+    """Records, or a frequency response instead, and the terms that are eliminated."""
 
     records: tuple[FilterData | FrequencyLines, ...]
-    #: Degree of the numerator; of several inputs that share a denominator, the highest.
+    #: Degree of the numerator; the highest one for inputs with a common denominator.
     zeros: int
     free_response: bool
     #: Powers of time that are eliminated for each record.
     trend: tuple[int, ...]
-    #: Period [s] of each record that repeats for ever, else 0.
+    #: Period [s] of each periodic record, else 0.
     periods: tuple[float, ...]
-    #: Known coefficients of the numerators in descending powers, NaN for those that are free; empty where all are. In a
-    #: sum of submodels they belong to denominators with the constant term 1.
+    #: Known coefficients of the numerators in descending powers, NaN for free ones; empty if all are free. In a sum of
+    #: submodels they belong to denominators with the constant term 1.
     numerator: Array = np.zeros(0)
-    #: Poles at 0 that the model has besides. The lowest powers of time are then part of a free response.
+    #: Additional poles at 0. The lowest powers of time are then part of a free response.
     integrators: int = 0
-    #: The noise by whose innovations errors count, of each record; empty where that is white.
+    #: Noise model that whitens the errors of each record; empty for white noise.
     noises: tuple[SampledNoise, ...] = ()
-    #: Zeros that the numerator of each input has less than the highest, where inputs share a denominator.
+    #: Difference of the numerator degree of each input from the highest, for inputs with a common denominator.
     fewer_zeros: tuple[int, ...] = (0,)
-    #: Fractions with denominators of their own, which then say what ``zeros`` and ``integrators`` say of one; and the
-    #: input that drives each, by default the only one.
+    #: Fractions with separate denominators, which replace ``zeros`` and ``integrators``; and the input of each, by
+    #: default the only one.
     terms: tuple[Term, ...] = ()
     inputs: tuple[int, ...] = ()
 
     @property
     def laid_out(self) -> Iterator[tuple[FilterData | FrequencyLines, float, SampledNoise | None]]:
-        """Each record, its period and its noise."""
+        """Yield each record, its period and its noise."""
         return zip(self.records, self.periods, self.noises or (None,) * len(self.records), strict=True)
 
     @property
@@ -84,22 +83,22 @@ class Problem(NamedTuple):
 
     @property
     def sampled(self) -> tuple[FilterData, ...]:
-        """The records in time."""
+        """Records in the time domain."""
         return tuple(data for data in self.records if isinstance(data, FilterData))
 
     @property
     def lines(self) -> FrequencyLines | None:
-        """The frequency response, if there is one in their place."""
+        """Frequency response, if it replaces the records."""
         return next((data for data in self.records if isinstance(data, FrequencyLines)), None)
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """Number of poles of each of several denominators, integrators not among them; empty for one."""
+        """Number of poles of each of several denominators, without integrators; empty for one."""
         return tuple(term.poles for term in self.terms)
 
     @property
     def monic(self) -> bool:
-        """Whether known coefficients are those over monic denominators: unless one input drives several."""
+        """Whether known coefficients refer to monic denominators, which is false for a sum of submodels."""
         return not self.terms or len(set(self.inputs)) > 1
 
     @property
@@ -115,13 +114,13 @@ class Problem(NamedTuple):
         return tuple(term.integrators for term in self.terms) or (self.integrators,)
 
     def arranged(self, poles: int) -> Arrangement:
-        """Return the channels of a model with a number of poles, integrators not among them."""
+        """Return the channels of a model with a number of poles, without integrators."""
         if self.terms:
             return with_own_denominators(self.terms, self.inputs or (0,) * len(self.terms))
         return with_one_denominator(poles, self.integrators, self.zeros, self.fewer_zeros)
 
     def rows(self, speed: Array, damping: Array) -> Rows:
-        """Return the sections of each denominator with its integrators behind them."""
+        """Return the sections of each denominator, followed by its integrators."""
         if not self.terms:
             return [_integrating(speed, damping, self.integrators)]
         each = zip(split(speed, damping, self.parts), self.terms, strict=True)
@@ -129,21 +128,21 @@ class Problem(NamedTuple):
 
 
 def _integrating(speed: Array, damping: Array, integrators: int) -> tuple[Array, Array]:
-    """Return sections with integrators behind them."""
+    """Return sections followed by integrators."""
     if not integrators:
         return speed, damping
     return np.append(speed, np.zeros(integrators)), np.append(damping, -np.ones(integrators))
 
 
 class Weights(NamedTuple):
-    """What the weights of the states, and of u itself, can be: a given part, and the span of a basis."""
+    """Affine set of the weights of the states and of u: a given vector plus the span of a basis."""
 
     basis: Array
     given: Array
 
 
 class Triangles(NamedTuple):
-    """The rows of all records in one form of each channel."""
+    """Rows of all records in one form of each channel."""
 
     arrangement: Arrangement
     forms: Sequence[Form]
@@ -154,7 +153,7 @@ class Triangles(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Derivatives of half the squared error to the logarithmic coordinates and, last, the free delays [1/s]."""
+    """Derivatives of half the squared error by the logarithmic coordinates and, last, the free delays [1/s]."""
 
     squared_error: float
     gradient: Array
@@ -163,9 +162,9 @@ class Slopes(NamedTuple):
 
 
 def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None:
-    """Weights of the states with which the numerator has its known coefficients; None where all are free.
+    """Return the weights of the states that give the known numerator coefficients; None if all are free.
 
-    With ``b = T'w``, T the numerators of the states (and, last, A for u itself), the known ones ask ``T_k'w = b_k``.
+    With ``b = T'w``, T the numerators of the states (and, last, A for u itself), the constraint is ``T_k'w = b_k``.
     """
     known = np.isfinite(problem.numerator)
     if not known.any():
@@ -194,7 +193,7 @@ def weights_of(problem: Problem, speed: Array, damping: Array) -> Weights | None
 
 
 def _columns(problem: Problem, triangles: Triangles, states: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the columns Phi, and y, from the triangles of all records; further axes in front are further models.
+    """Return the columns Phi, and y, from the triangles of all records; leading axes are several models.
 
     ``states``: the map from z to the states of the sections of each channel.
     """
@@ -202,7 +201,7 @@ def _columns(problem: Problem, triangles: Triangles, states: Sequence[Array]) ->
     *many, records, q, _ = rows.shape
     shared, trend = sum(channel.size for channel in arrangement.channels), len(columns.trend)
     own = arrangement.order * problem.free_response + trend
-    # The numerators are common to all records; a free response and a trend are zero outside their own.
+    # The numerators are common to all records; a free response and a trend are zero in other records.
     phi = np.zeros((*many, records, q, shared + records * own))
     to_states, place = [np.swapaxes(one, -1, -2) for one in states], 0
     for k, channel in enumerate(arrangement.channels):
@@ -222,7 +221,7 @@ def _columns(problem: Problem, triangles: Triangles, states: Sequence[Array]) ->
 
 
 class Span:
-    """What is eliminated, and what it leaves of the output, in the triangles of all records."""
+    """Eliminated columns, and the residual of the output, in the triangles of all records."""
 
     def __init__(self, problem: Problem, triangles: Triangles, weights: Weights | None) -> None:
         self.triangles, self.weights = triangles, weights
@@ -231,7 +230,7 @@ class Span:
         if weights is not None:
             both = phi[:, : self.shared]
             phi, y = np.hstack((both @ weights.basis, phi[:, self.shared :])), y - both @ weights.given
-        # Columns of length one: the rank then does not depend on the units of input, output and time.
+        # Columns are scaled to length one, so that the rank does not depend on the units of input, output and time.
         lengths = np.sqrt(np.einsum("ij,ij->j", phi, phi))
         self.lengths = np.where(lengths > 0.0, lengths, 1.0)
         left, values, right = np.linalg.svd(phi / self.lengths, full_matrices=False)
@@ -241,9 +240,9 @@ class Span:
         self.residual = y - self.left @ self.along
 
     def solution(self) -> tuple[Array, Array]:
-        """Return the weights of the states and of u, and the coefficients of each record's own columns, row by row.
+        """Return the weights of the states and of u, and the coefficients of the columns of each record, row by row.
 
-        Directions of no length are left out, which is the solution of least norm.
+        Null directions are omitted, which gives the solution of least norm.
         """
         found = (self.right.T @ (self.along / self.values)) / self.lengths
         if self.weights is None:
@@ -253,10 +252,10 @@ class Span:
 
 
 class Projected(NamedTuple):
-    """The least squares for given poles and delays."""
+    """Linear least-squares solution for given poles and delays."""
 
     squared_error: float
-    #: Of each channel the weights of its states, and of its input itself.
+    #: Weights of the states, and of the input, of each channel.
     outputs: list[Array]
     directs: list[float]
     #: Weights of the states of the free responses, and of the powers of time, of each record: shapes (K, n) and (K, q).
@@ -268,7 +267,7 @@ class Projected(NamedTuple):
 def project(problem: Problem, speed: Array, damping: Array, delays: Delays, *, slopes_too: bool = False) -> Projected:
     """Eliminate numerators, free responses and trends for given sections, fastest first in each denominator.
 
-    Where :func:`slopes` will follow, one pass over the records can serve both.
+    With ``slopes_too`` one pass over the records also serves :func:`slopes`.
     """
     arrangement = problem.arranged(order_of(damping))
     forms = forms_of(problem.rows(speed, damping), [one.blocks for one in arrangement.channels], problem.length)
@@ -311,7 +310,7 @@ def responses(problem: Problem, projected: Projected) -> list[Array]:
 
 
 def squared_errors(problem: Problem, sections: Sequence[tuple[Array, Array]], delays: Delays) -> Array:
-    """Return the squared errors of many sections of one order at given delays, to compare starts."""
+    """Return the squared errors of many models of one order at given delays, to compare starts."""
     arrangement = problem.arranged(order_of(sections[0][1]))
     blocks = [channel.blocks for channel in arrangement.channels]
     candidates = [forms_of(problem.rows(*own), blocks, problem.length) for own in sections]
@@ -354,9 +353,9 @@ def slopes(
     projected: Projected,
     free_delays: Sequence[int] = (),
 ) -> Slopes:
-    """Exact gradient, and Kaufman's J'J, at what :func:`project` gave for the same sections and delays.
+    """Return the exact gradient, and Kaufman's J'J, at the result of :func:`project` for these sections and delays.
 
-    ``free_delays``: the inputs along whose delays derivatives are taken, too.
+    ``free_delays``: inputs with derivatives by their delays, too.
     """
     span, directs = projected.span, projected.directs
     triangles, arrangement = span.triangles, span.triangles.arrangement
@@ -390,7 +389,7 @@ def slopes(
         maps = np.stack([form.slopes(free[channel.states], none)[:, channel.searched] for free in projected.free])
         psi[:, :, channel.poles] += rows[:, :, columns.free_states(number)] @ maps
     psi = psi.reshape(span.residual.size, -1)
-    # (I - P): what the eliminated coefficients would follow is no effect of the poles.
+    # I - P removes the part that the eliminated coefficients compensate.
     psi -= span.left @ (span.left.T @ psi)
     residual = span.residual
     return Slopes(float(residual @ residual), -(psi.T @ residual), psi.T @ psi)
@@ -399,7 +398,7 @@ def slopes(
 def _of_constants(
     problem: Problem, speed: Array, damping: Array, projected: Projected, triangles: Triangles, k: int
 ) -> Array:
-    """Return what the constant terms of the denominators do to the output if known numerators keep their values."""
+    """Return the effect of the constant terms of the denominators on the output at fixed known numerators."""
     found, first = [], 0
     channel, form = triangles.arrangement.channels[k], triangles.forms[k]
     columns, rows = triangles.columns, triangles.rows

@@ -1,4 +1,4 @@
-"""Descent to a local minimum of the projected squared error, and what kind of minimum it is."""
+"""Descent to a local minimum of the projected squared error, and classification of the minimum."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,37 +25,37 @@ from ctid_cli.estimation.optimum.known import NOTHING, KnownCoefficients, null_s
 from ctid_cli.estimation.optimum.projection import Problem, Projected, project, slopes, squared_errors
 from ctid_cli.estimation.optimum.triangle import Delay
 
-#: Fall of the squared error that Newton's step may promise, as a fraction of it, at a minimum; what Newton's steps aim
-#: at, and where a descent leaves the rest to them.
+#: Predicted relative decrease of the squared error by a Newton step: largest value at a minimum, target of Newton
+#: steps, and value at which a descent ends and Newton steps begin.
 CONVERGED, AIM, NEAR = 1e-8, 1e-12, 1e-8
-#: Residuals of this fraction of the output are rounding, for which no relative fall means anything.
+#: Residuals below this fraction of the output are rounding, for which relative decreases are meaningless.
 ROUNDING = 1e-10
-#: Steps of a descent, consecutive rejections, and steps of Newton's method at its end.
+#: Largest numbers of steps of a descent, of consecutive rejections, and of final Newton steps.
 MOST_STEPS, MOST_REJECTIONS, MOST_NEWTON = 60, 12, 15
-#: Places that differ by less than this fraction in poles, dampings and squared error are on the way to one minimum.
+#: Points that differ by less than this fraction in poles, dampings and squared error converge to one minimum.
 CLOSE = 0.01
-#: The same for the delay on an irregular clock, as a fraction of a quarter period.
+#: Corresponding difference of the delay on an irregular clock, as a fraction of a quarter period.
 CLOSE_BETWEEN_KINKS = 1e-3
-#: A search is given up for a lower known minimum after FIRST_STEPS steps if the next one promises less than 1/HOPELESS
-#: of the fall to that minimum, and after PATIENCE steps if the squared error is still more than FAR times as high.
+#: A search ends for a lower known minimum after FIRST_STEPS steps if the predicted decrease is less than 1/HOPELESS of
+#: the distance to that minimum, and after PATIENCE steps if the squared error is still more than FAR times as high.
 HOPELESS, FIRST_STEPS, PATIENCE, FAR = 30.0, 3, 12, 4.0
-#: Step of the differences of the gradient; eigenvalues below this fraction of the largest have no sign.
+#: Step of the differences of the gradient; eigenvalues below this fraction of the largest count as zero.
 DIFFERENCE, FLAT = 1e-4, 1e-9
-#: Differences to one side will do where the least eigenvalue exceeds their error by this factor.
+#: One-sided differences suffice if the least eigenvalue exceeds their error by this factor.
 SURE = 10.0
-#: Least way to the border of the set that a ridge has, in logarithms: a factor of two.
+#: Least length of a ridge, in logarithms: a factor of two.
 RIDGE = float(np.log(2.0))
-#: A kink is looked for where a step of Newton's method gives less than this fraction of the fall that it promises, from
-#: this many decades below the length of that step on.
+#: A kink is searched for if a Newton step achieves less than this fraction of the predicted decrease, starting this
+#: number of decades below the length of the step.
 CROSSED, NEIGHBOURS = 0.01, 8
-#: Least first step along negative curvature, and longest one over which second derivatives are kept.
+#: Least step along negative curvature, and longest step after which second derivatives are reused.
 SADDLE, SHORT = 0.1, 0.01
-#: No delay is held.
+#: No delay is at a kink.
 NO_DELAYS: Mapping[int, int] = {}
 
 
 class Ending(Enum):
-    """What a local search has come to."""
+    """Outcome of a local search."""
 
     CONVERGED = "A local minimum of the output-error cost."
     AT_BOUND = "A minimum of the output-error cost within the stated set of models, at its border."
@@ -64,13 +64,13 @@ class Ending(Enum):
 
     @property
     def optimal(self) -> bool:
-        """Whether no admissible model nearby is better."""
+        """Whether the point is a local minimum over the admissible models."""
         return self is not Ending.STALLED
 
 
 @dataclass(frozen=True, eq=False)
 class Local:
-    """Where a search is: the point, the least squares there, gradient and curvature of half the squared error.
+    """State of a search: the point, its least-squares solution, gradient and curvature of half the squared error.
 
     The fields from ``ending`` on are those of a settled minimum.
     """
@@ -80,11 +80,11 @@ class Local:
     gradient: Array
     curvature: Array
     ending: Ending | None = None
-    #: Fall that Newton's step promises, as a fraction of the squared error.
+    #: Predicted relative decrease of the squared error by a Newton step.
     promise: float = np.inf
-    #: Coordinates held at a bound.
+    #: Mask of the coordinates held at a bound.
     held: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    #: Whether a delay sits in a kink of the cost, at a sample; and inputs whose delays would leave their bounds.
+    #: Whether a delay is at a kink of the cost, at a sample; and inputs whose delays are held at a bound.
     pinned: bool = False
     delays_at_bound: tuple[int, ...] = ()
 
@@ -95,10 +95,10 @@ class Local:
 
 
 class Freedom(NamedTuple):
-    """Where a search can go: coordinates that no bound holds, and directions in them that keep what is known."""
+    """Feasible directions: free coordinates, and directions in them that preserve known coefficients."""
 
     free: BoolArray
-    #: Lengths of the free coordinates, and an orthonormal basis in these units, shape (f, r).
+    #: Scales of the free coordinates, and an orthonormal basis in these units, shape (f, r).
     unit: Array
     basis: Array
 
@@ -116,7 +116,7 @@ class Freedom(NamedTuple):
 
 
 class Descent:
-    """Local searches on records, among models with the known coefficients."""
+    """Local search on records, over models with the known coefficients."""
 
     def __init__(self, problem: Problem, box: Box, known: KnownCoefficients = NOTHING) -> None:
         self.problem, self.box, self.known = problem._replace(numerator=known.numerator), box, known
@@ -126,7 +126,7 @@ class Descent:
         self.floor = ROUNDING**2 * float(used @ used)
 
     def value(self, point: Point, *, slopes_too: bool = False) -> Projected:
-        """Least squares for the poles and delay of a point, from where derivatives may be asked for, too."""
+        """Return the least-squares solution at a point, optionally prepared for derivatives."""
         self.evaluations += 1
         return project(self.problem, point.speed, point.damping, point.delays, slopes_too=slopes_too)
 
@@ -142,11 +142,11 @@ class Descent:
         return errors
 
     def sorted(self, points: Sequence[Point]) -> list[Point]:
-        """Return points by rising squared error."""
+        """Return points in order of ascending squared error."""
         return [points[k] for k in np.argsort(self.squared_errors(points), kind="stable")]
 
     def local(self, point: Point, projected: Projected | None = None) -> Local:
-        """Gradient and curvature at a point; delays count in quarter periods."""
+        """Return gradient and curvature at a point, with delays in quarter periods."""
         projected = self.value(point, slopes_too=True) if projected is None else projected
         self.evaluations += 1
         free, edge = self.box.free_delays, self.box.beyond_edges
@@ -161,7 +161,7 @@ class Descent:
         return Local(point, projected, inner.T @ found.gradient, inner.T @ found.curvature @ inner)
 
     def at_its_delay(self, point: Point) -> Point:
-        """Return a point after one Gauss-Newton step of everything but its delays."""
+        """Return a point after one Gauss-Newton step at constant delays."""
         here = self.local(point)
         ways = self._freedom(here, _lengths(here), kinked=self.box.delay_places)
         scaled, slope = ways.reduced(here.gradient, here.curvature)
@@ -171,7 +171,7 @@ class Descent:
         return point if moved is None else moved
 
     def _freedom(self, here: Local, lengths: Array, kinked: Mapping[int, int] = NO_DELAYS) -> Freedom:
-        """Return where a search can go, coordinates measured in given lengths; not along delays in a kink."""
+        """Return the feasible directions in scaled coordinates, excluding delays at a kink."""
         slopes = self.known.slopes(here.point, lengths.size)
         free = ~self.known.held(here.gradient / lengths, slopes / lengths, *at_bounds(here.point, self.box))
         if kinked:
@@ -179,11 +179,11 @@ class Descent:
         return Freedom(free, lengths[free], null_space(slopes[:, free] / lengths[free]))
 
     def _moved(self, point: Point, step: Array) -> Point | None:
-        """Return the admissible point a step away that has the known coefficients; None where there is none."""
+        """Return the admissible point after a step, with the known coefficients; None if there is none."""
         return self.known.met(moved_by(point, step, self.box), self.box)
 
     def _faced(self, here: Local) -> Local:
-        """Where a delay is at a sample, the side of it that goes downhill, if any."""
+        """Return the point with each delay at a sample moved to the cell with a descent direction, if any."""
         if not self.box.cell:
             return here
         for k, place in self.box.delay_places.items():
@@ -191,7 +191,7 @@ class Descent:
         return here
 
     def _one_faced(self, here: Local, k: int, place: int) -> Local:
-        """The side of a sample that goes downhill along one delay."""
+        """Return the point with one delay at a sample moved to the cell with a descent direction."""
         delay, cell = here.point.delays[k], self.box.cell
         if delay.cell < 0 or not frozen(here.point, here.gradient, self.box)[place]:
             return here
@@ -209,10 +209,10 @@ class Descent:
     def descend(
         self, start: Point, known: Sequence[Local] = (), near: float = NEAR, most_steps: int = MOST_STEPS
     ) -> Local:
-        """Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates frozen.
+        """Descend by Levenberg-Marquardt steps: Moré's scaling, Nielsen's damping, held coordinates constant.
 
-        A search that comes close to a minimum that is known ends there, any where a step promises but ``near``, and
-        one that will not come down to the lowest known one where that shows.
+        A search ends close to a known minimum, at a predicted relative decrease below ``near``, or if it is not
+        expected to reach the lowest known minimum.
         """
         here = self.local(start)
         lowest = min((other.squared_error for other in known), default=np.inf)
@@ -249,7 +249,7 @@ class Descent:
             here = self.local(trial, found)
             if not same:
                 scale = np.zeros(here.gradient.size)
-            # What is left is a narrow valley, which second derivatives see and Gauss-Newton steps do not.
+            # A narrow valley requires second derivatives, not Gauss-Newton steps.
             if slow == 3:
                 break
         return here
@@ -264,10 +264,10 @@ class Descent:
         return np.asarray(np.linalg.lstsq(slopes[:, free].T, -(here.gradient / lengths)[free])[0])
 
     def hessian(self, here: Local) -> Array:
-        """Second derivatives of half the squared error, by differences of its exact gradient.
+        """Return second derivatives of half the squared error, by differences of its exact gradient.
 
-        With known coefficients of the denominator those of the Lagrangian, which count along the constraint. To one
-        side first: how far that is from symmetric tells its error, and whether the other side is needed.
+        With known coefficients of the denominator these are derivatives of the Lagrangian along the constraint.
+        One-sided differences come first: their asymmetry shows their error, and whether central ones are needed.
         """
         size = here.gradient.size
         forces = self._forces(here)
@@ -277,7 +277,7 @@ class Descent:
         rows, widths, unit = np.zeros((size, size)), np.zeros(size), _lengths(here)
         for side in (1.0, -1.0):
             for i in range(size):
-                # Across a sample the delay has other derivatives: stay in its cell.
+                # The derivatives by the delay change at a sample: stay in its cell.
                 beyond = _unbounded(here.point, side * steps[i] * np.eye(size)[i], self.box)
                 if beyond is not None:
                     change = self.local(beyond).gradient - here.gradient
@@ -294,7 +294,7 @@ class Descent:
         return 0.5 * (whole + whole.T)
 
     def settle(self, here: Local) -> Local:
-        """Newton's steps to the minimum itself, along negative curvature where there is any, and its kind."""
+        """Converge to the minimum by Newton steps, also along negative curvature, and classify it."""
         kinked: dict[int, int] = {}
         second: Array | None = None
         for _ in range(MOST_NEWTON):
@@ -314,12 +314,12 @@ class Descent:
                 return self._judged(here, free, promise, modes)
             step = ways.whole(_newton_step(values, vectors, slope))
             length = float(np.abs(step).max())
-            # At a saddle the gradient says nothing about how far to go.
+            # At a saddle the gradient does not determine the step length.
             step *= (min(max(length, SADDLE), 1.0) if saddle else min(length, 1.0)) / max(length, 1e-300)
             lower = self._lower_along(here, step, saddle)
             fall = 0.0
             if lower is not None:
-                # After a short step the second derivatives are still good enough to tell that it was the last.
+                # After a short step the second derivatives are accurate enough for the test of convergence.
                 same = np.array_equal(lower[1].damping < 0, here.point.damping < 0)
                 short = float(np.abs(lower[0]).max()) < SHORT
                 fall = 1.0 - lower[2].squared_error / here.squared_error
@@ -328,7 +328,7 @@ class Descent:
             elif not fresh:
                 second = None
                 continue
-            # A step that gives next to nothing of what it promises has crossed a kink.
+            # A step with much less than the predicted decrease has crossed a kink.
             if lower is None or fall < CROSSED * promise < np.inf:
                 kink = self._in_kink(here, step, free)
                 if kink is not None:
@@ -340,7 +340,7 @@ class Descent:
         return self._judged(here, free, promise, modes)
 
     def _lower_along(self, here: Local, step: Array, both: bool) -> tuple[Array, Point, Projected] | None:
-        """The longest part of a step that lowers the squared error; backwards too where its sign means nothing."""
+        """Return the longest fraction of a step that reduces the squared error, with ``both`` in either direction."""
         for length in 0.4 ** np.arange(MOST_REJECTIONS):
             whole = self._whole_and_to_edge(here.point, length * step)
             lower = self._lower(here, [*whole, -length * step] if both else whole)
@@ -349,7 +349,7 @@ class Descent:
         return None
 
     def _lower(self, here: Local, steps: Sequence[Array]) -> tuple[Array, Point, Projected] | None:
-        """The first of several steps that lowers the squared error, with where it leads."""
+        """Return the first of several steps that reduces the squared error, with its point and projection."""
         for step in steps:
             trial = self._moved(here.point, step)
             if trial is None:
@@ -360,7 +360,7 @@ class Descent:
         return None
 
     def _whole_and_to_edge(self, point: Point, step: Array) -> list[Array]:
-        """A step, and where it crosses a sample its part up to there: a minimum may be in the kink itself."""
+        """Return a step, and its parts up to the samples that it crosses: a minimum may be at the kink."""
         parts = []
         for k, place in self.box.delay_places.items():
             delay, cell = point.delays[k], self.box.cell
@@ -370,7 +370,7 @@ class Descent:
         return [step, *(part * step for part in sorted(parts, reverse=True) if 0.0 < part < 1.0)]
 
     def _in_kink(self, here: Local, step: Array, free: BoolArray) -> tuple[Local, int, int] | None:
-        """The nearest kink along a delay, on a clock where any delay may be one, its input, and its coordinate."""
+        """Return the nearest kink along a delay on an irregular clock, its input, and its coordinate."""
         for k, place in self.box.delay_places.items():
             if free[place]:
                 found = self._in_kink_along(here, k, place, float(abs(step[place])))
@@ -379,10 +379,10 @@ class Descent:
         return None
 
     def _in_kink_along(self, here: Local, k: int, place: int, reach: float) -> Local | None:
-        """The nearest kink along one delay; None where there is none.
+        """Return the nearest kink along one delay; None if there is none.
 
-        The slope along the delay changes sign in it. The next kink may be nearer than a step reaches, so neighbours are
-        compared from the closest on; halving then leaves nothing to be gained between the two sides.
+        The slope along the delay changes sign at the kink. The next kink may be closer than the step, so distances are
+        tried in ascending order; bisection follows until no decrease is possible between the two sides.
         """
         if here.point.delays[k].cell >= 0 or not reach > 0:
             return None
@@ -426,13 +426,13 @@ class Descent:
         return replace(here, ending=ending, promise=promise, held=held, pinned=pinned, delays_at_bound=tuple(at_bound))
 
     def _on_ridge(self, here: Local, free: BoolArray, values: Array, vectors: Array) -> bool:
-        """Whether the squared error moves by less than the residual's variance as far as the set reaches.
+        """Return whether the squared error changes by less than the residual's variance up to the limit of the set.
 
-        The border must be a factor of two away: next to it a direction is short, not flat.
+        The limit must be at least a factor of two away: closer to it, a direction is short, not flat.
         """
         variance = here.squared_error / max(self.count - free.size - self.problem.coefficients, 1)
         direction = vectors[:, 0] / np.abs(vectors[:, 0]).max()
-        # What the curvature promises over a factor of two.
+        # Change of the squared error predicted by the curvature over a factor of two.
         expected = values[0] * (RIDGE / np.abs(vectors[:, 0]).max()) ** 2
         if expected > 4.0 * variance or here.squared_error <= self.floor:
             return False
@@ -443,7 +443,7 @@ class Descent:
                 if trial is None or last is None:
                     break
                 if _same(trial, last):
-                    # At the border of the set.
+                    # At a bound of the set.
                     if length > RIDGE:
                         return True
                     break
@@ -462,9 +462,9 @@ def local_minimum(
     box: Box | None = None,
     known: KnownCoefficients = NOTHING,
 ) -> Local:
-    """Descent from given poles, which agree with what is known, and delay, which stays within its bounds.
+    """Descend from given poles, which satisfy the known coefficients, and delay, which stays within its bounds.
 
-    Costs that are compared need one ``box``: by default that of the problem, which depends on its free response.
+    Comparable costs require one ``box``; the default is that of the problem, which depends on its free response.
     """
     box = box or box_of(problem, delays)
     if known.all_poles:
@@ -473,7 +473,7 @@ def local_minimum(
 
 
 def _same(one: Point, other: Point) -> bool:
-    """Whether two points are one, up to rounding."""
+    """Return whether two points are equal up to rounding."""
     return (
         one.speed.size == other.speed.size
         and np.allclose(one.speed, other.speed, rtol=1e-9)
@@ -482,7 +482,7 @@ def _same(one: Point, other: Point) -> bool:
 
 
 def _alike(here: Local, other: Local, box: Box) -> bool:
-    """Whether two places are so close that one minimum must be meant."""
+    """Return whether two points are close enough to converge to one minimum."""
     if here.squared_error >= (1 + CLOSE) * other.squared_error:
         return False
     if here.point.cells != other.point.cells or not np.array_equal(here.point.damping < 0, other.point.damping < 0):
@@ -490,19 +490,19 @@ def _alike(here: Local, other: Local, box: Box) -> bool:
     away = np.concatenate((here.point.speed / other.point.speed - 1, here.point.damping / other.point.damping - 1))
     each = zip(here.point.seconds, other.point.seconds, strict=True)
     later = max(abs(one - two) for one, two in each) / box.quarter
-    # On an irregular clock minima lie closer along the delay.
+    # On an irregular clock minima are closer along the delay.
     nearest = CLOSE if box.cell > 0 else CLOSE_BETWEEN_KINKS
     return bool(np.abs(away).max(initial=0.0) < CLOSE and later < nearest)
 
 
 def _hopeless(taken: int, squared_error: float, promise: float, lowest: float) -> bool:
-    """Whether a search will not come down to the lowest known minimum."""
+    """Return whether a search is not expected to reach the lowest known minimum."""
     too_flat = taken >= FIRST_STEPS and squared_error - HOPELESS * promise > lowest
     return too_flat or (taken >= PATIENCE and squared_error > FAR * lowest)
 
 
 def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
-    """``-H^-1 g`` with the eigenvalues of H made positive; along a negative one a step of one at least."""
+    """Return ``-H^-1 g`` with absolute eigenvalues of H; along a negative one the step is at least one."""
     along = vectors.T @ gradient
     flat = FLAT * max(float(np.abs(values).max(initial=0.0)), 1e-300)
     parts = -along / np.maximum(np.abs(values), flat)
@@ -513,13 +513,13 @@ def _newton_step(values: Array, vectors: Array, gradient: Array) -> Array:
 
 
 def _lengths(here: Local) -> Array:
-    """Lengths of the columns of the Jacobian; what has no effect at all gets the least that can be told from none."""
+    """Return the norms of the columns of the Jacobian, at least the smallest significant one."""
     lengths: Array = np.sqrt(np.maximum(np.diag(here.curvature), 0.0))
     return np.maximum(lengths, max(1e-9 * float(lengths.max(initial=0.0)), 1e-150))
 
 
 def _promise(curvature: Array, gradient: Array) -> tuple[float, Array, Array]:
-    """``g'H^-1 g`` over the directions that curve, with the eigenvalues and vectors of H."""
+    """Return ``g'H^-1 g`` over the directions of nonzero curvature, with the eigenvalues and vectors of H."""
     values, vectors = np.linalg.eigh(curvature)
     curved = values > FLAT * max(float(np.abs(values).max(initial=0.0)), 1e-300)
     along = (vectors.T @ gradient)[curved]
@@ -527,7 +527,7 @@ def _promise(curvature: Array, gradient: Array) -> tuple[float, Array, Array]:
 
 
 def _unbounded(point: Point, step: Array, box: Box) -> Point | None:
-    """The point a small step away, in the same coordinates, admissible or not; none across a sample."""
+    """Return the point after a small step in the same coordinates, admissible or not; None across a sample."""
     speed, damping = point.shifted(step)
     delays = list(point.delays)
     for k, place in box.delay_places.items():

@@ -1,4 +1,4 @@
-"""Where searches start: from the optima of the smaller models, from given estimates, and at random."""
+"""Starts of searches: optima of smaller models, given estimates, and random points."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -15,23 +15,23 @@ from ctid_cli.estimation.optimum.projection import Problem, responses
 from ctid_cli.estimation.optimum.search import Descent, Local
 from ctid_cli.models.additive import Term
 
-#: Evaluations times samples that are spent on pairs of the least damping: up to 1,000 samples all frequencies that
-#: these resolve. The best of them, and delays, that are looked at together.
+#: Largest product of evaluations and samples for pairs of the least damping: all resolved frequencies up to 1,000
+#: samples. Number of the best pairs, and of delays, that are compared together.
 RESOLVED, LOOKED_AT = 1_000_000, 16
-#: Delays tried on both sides of the best one, in sampling intervals: there is a kink for every sample, and minima lie
-#: as little as a two-hundredth of an interval apart.
+#: Delays tried on both sides of the best one, in sampling intervals: every sample has a kink, and minima may be a
+#: two-hundredth of an interval apart.
 CLOSE_DELAYS = 0.5 ** np.arange(1, 9)
-#: Optima kept of each structure, and how far the best of what is not yet one may lie above and still be refined.
+#: Number of optima kept for each structure.
 KEPT = 3
-#: Squared errors that differ by less than this fraction are those of one minimum.
+#: Squared errors that differ by less than this fraction belong to one minimum.
 SAME = 1e-6
-#: Starts whose poles differ by less than this in logarithms are one.
+#: Starts whose poles differ by less than this in logarithms count as equal.
 APART = 0.7
-#: Poles are fast whose magnitude times the sampling interval exceeds this.
+#: Poles are fast if their magnitude times the sampling interval exceeds this.
 FAST = 0.25
-#: Starts of all fractions of a sum that are refined together.
+#: Number of starts of a whole sum of fractions that are refined.
 REFINED_TOGETHER = 6
-#: Most delays of a profile.
+#: Largest number of delays of a profile.
 MOST_DELAYS = 100
 
 
@@ -39,30 +39,30 @@ T = TypeVar("T")
 
 
 class Effort(NamedTuple):
-    """What is tried for a structure."""
+    """Numbers of starts for a structure."""
 
-    #: Frequencies of a pole, and of a pair, that is added to a smaller model; dampings of a pair.
+    #: Numbers of frequencies of a pole, and of a pair, added to a smaller model; dampings of a pair.
     poles: int
     pairs: int
     dampings: tuple[float, ...]
-    #: How many of these are looked at, and how many of all are refined beside what the structure contains.
+    #: Number of these that are kept, and number refined in addition to models nested in the structure.
     looked_at: int
     refined: int
-    #: How many poles by themselves are looked at, and how many times more frequencies these have: a pair has a minimum
-    #: at every peak of the noise.
+    #: Number of starts with one pole or pair only, and factor of their number of frequencies: a pair has a minimum at
+    #: every peak of the noise.
     alone: int
     denser: int
-    #: Greatest number of poles for which the whole range of the delay is looked at.
+    #: Greatest number of poles for which the whole range of the delay is searched.
     along_delay: float
 
 
-#: For one structure; and for a range of them, where each has been found from many others.
+#: For one structure; and for a range of structures, where each has starts from many others.
 THOROUGH = Effort(24, 24, (0.02, 0.1, 0.5), looked_at=3, refined=3, alone=6, denser=4, along_delay=np.inf)
 QUICK = Effort(12, 20, (0.03, 0.3), looked_at=1, refined=2, alone=3, denser=1, along_delay=2)
 
 
 class StructureSearch:
-    """The lowest minima of structures, each found from those of the smaller ones that it contains."""
+    """Lowest minima of structures, each found from those of its nested smaller structures."""
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class StructureSearch:
     ) -> None:
         self.problem, self.box, self.random_starts, self.seed = problem, box, random_starts, seed
         self.effort = effort
-        #: Known coefficients; with these only the one structure is searched that has them.
+        #: Known coefficients; with any, only the requested structure is searched.
         self.known = known
-        #: The search of a part of the records, from whose minima this one starts.
+        #: Search of a part of the records, whose minima are starts.
         self.pilot = pilot
         self._given_delays = first_delays
         self._descents: dict[int, Descent] = {}
@@ -100,11 +100,11 @@ class StructureSearch:
 
     @property
     def most_zeros(self) -> int:
-        """Degree of the numerator less the number of searched poles, at most."""
+        """Largest difference of the numerator degree and the number of searched poles."""
         return self.problem.integrators - int(self.box.delay_free)
 
     def climb(self, poles: int, zeros: int) -> None:
-        """Search a structure and all that it contains, the smallest first."""
+        """Search a structure and all nested ones, the smallest first."""
         for n in range(min(poles, int(not self.problem.integrators)), poles + 1):
             for m in range(min(zeros, n + self.most_zeros) + 1):
                 if (n, m) in self._minima:
@@ -112,34 +112,34 @@ class StructureSearch:
                 if self.pilot is not None:
                     self.refine(n, m, self._from_pilot(self.pilot, n, m))
                 else:
-                    # A larger structure must meet whatever this one finds by itself, at random too.
+                    # Random starts too, so that a larger structure starts from all minima of this one.
                     self.refine(n, m, self.from_below(n, m) + self.random_points(n))
 
     def minima(self, poles: int, zeros: int) -> list[Local]:
-        """Return the lowest minima of a structure that are known, the lowest first."""
+        """Return the known minima of a structure, the lowest first."""
         return self._minima.get((poles, zeros), [])
 
     def best(self, poles: int, zeros: int) -> Point:
-        """Return where the lowest minimum of a structure is."""
+        """Return the point of the lowest minimum of a structure."""
         return self._minima[poles, zeros][0].point
 
     def put_first(self, poles: int, zeros: int, point: Point) -> None:
-        """Have the lowest minimum of a structure at another point of equal cost."""
+        """Replace the lowest minimum of a structure by another point of equal cost."""
         self._minima[poles, zeros][0] = self.descent(zeros).local(point)
 
     def ends(self, poles: int, zeros: int) -> list[float]:
-        """Return the squared errors at which the searches for a structure have ended."""
+        """Return the final squared errors of the searches for a structure."""
         return self._ends[poles, zeros]
 
     def settled(self, poles: int, zeros: int) -> Local:
-        """Return the lowest minimum of a structure to all digits, and its kind."""
+        """Return the fully converged and classified lowest minimum of a structure."""
         minima = self._minima[poles, zeros]
         if minima[0].ending is None:
             minima[0] = self.descent(zeros).settle(minima[0])
         return minima[0]
 
     def refine(self, poles: int, zeros: int, points: Iterable[Point]) -> None:
-        """Search from points, and keep the lowest minima."""
+        """Search from points and keep the lowest minima."""
         descent, kept = self.descent(zeros), self._minima.setdefault((poles, zeros), [])
         ends = self._ends.setdefault((poles, zeros), [])
         queue, cells = list(points), set[tuple[int, int]]()
@@ -157,7 +157,7 @@ class StructureSearch:
         self._minima[poles, zeros] = distinct[:KEPT]
 
     def _from_pilot(self, pilot: "StructureSearch", poles: int, zeros: int) -> list[Point]:
-        """Return what a part of the records says, and the models that the structure contains exactly."""
+        """Return starts from the optimum of a part of the records, and from nested models."""
         there = pilot.best(poles, zeros)
         points = [point_of(there.poles, there.seconds, self.box)]
         if zeros > 0:
@@ -169,15 +169,15 @@ class StructureSearch:
         return points
 
     def _alone(self, zeros: int, poles: int) -> list[Point]:
-        """Return the best single poles, or single pairs."""
+        """Return the best models with one pole, or one pair."""
         delay = self.best(1, 0).seconds if poles > 1 else self.first_delays
         return self._extended(zeros, np.zeros(0, dtype=complex), delay, poles, self.effort.alone, self.effort.denser)
 
     def _beside(self, point: Point, cells: set[tuple[int, int]]) -> list[Point]:
-        """Starts in the cells of each delay beside that of a minimum, where they are not yet among these cells.
+        """Return starts in the delay cells adjacent to that of a minimum, except ``cells`` already visited.
 
-        Beside a fast pole each cell has a smooth cost of its own, and a minimum in one says nothing of the next. With
-        several inputs that was seen beside slow poles too.
+        With a fast pole the cost is smooth only within each cell, and a minimum in one does not determine the next.
+        With several inputs this was observed with slow poles too.
         """
         width, points = self.box.cell, list[Point]()
         slow = len(self.box.each_delay) < 2 and float(point.speed.max(initial=0.0)) * width < FAST
@@ -189,7 +189,7 @@ class StructureSearch:
             for cell in (own - 1, own + 1):
                 if (k, cell) not in cells and (cell + 1) * width > low and cell * width < high:
                     cells.add((k, cell))
-                    # From the middle a step may jump into the cell of the minimum: once more from the border, inwards.
+                    # From the middle a step may jump into the cell of the minimum: also start at the common border.
                     border = max(own, cell) * width
                     for tau in ((cell + 0.5) * width, border):
                         seconds, within = list(point.seconds), [delay.cell for delay in point.delays]
@@ -199,7 +199,7 @@ class StructureSearch:
 
     @cached_property
     def first_delays(self) -> tuple[float, ...]:
-        """Delays to start from: the middle of the range; of several inputs those of a pole of its own for each."""
+        """Initial delays: the middle of the range; for several inputs from a fit of one pole for each."""
         problem, count = self.problem, len(self.problem.fewer_zeros)
         if self._given_delays is not None or count < 2:
             return self._given_delays or self.box.middle
@@ -207,7 +207,7 @@ class StructureSearch:
         return block_starts(apart, replace(self.box, parts=apart.parts), 0, self.seed)[0].seconds
 
     def from_below(self, poles: int, zeros: int) -> list[Point]:
-        """Return starts from smaller models, and along the delay."""
+        """Return starts from smaller models and along the delay."""
         if poles == 0:
             middle = point_of(np.zeros(0, dtype=complex), self.first_delays, self.box)
             return self.along_delay(zeros, [middle])
@@ -216,7 +216,7 @@ class StructureSearch:
         if zeros > 0:
             contained.append(self.best(poles, zeros - 1))
         if poles > 1 and zeros > 0:
-            # Contained in this structure whatever the added pole is, as is the one before.
+            # Nested in this structure for any added pole, as is the previous one.
             grown = self._grown(poles - 1, zeros - 1, zeros, 1)
             contained, others = contained + grown[:1], grown[1:]
         for n, m in ((poles - 1, zeros), (poles - 2, zeros - 2), (poles - 2, zeros)):
@@ -227,13 +227,13 @@ class StructureSearch:
         return self.along_delay(zeros, points) if poles <= self.effort.along_delay else points
 
     def resonances(self, poles: int, zeros: int) -> list[Point]:
-        """Return starts with a pair of the least damping, beside the poles of a smaller model.
+        """Return starts with a pair of the least damping, added to the poles of a smaller model.
 
-        Such a pair follows one frequency of the noise, and the cost has a minimum at every frequency that the record
-        resolves: all are tried by elimination alone, the best of them at delays of the whole range.
+        Such a pair fits one frequency of the noise, and the cost has a minimum at every frequency that the record
+        resolves: all are tried by elimination only, the best of them at delays of the whole range.
         """
         samples = sum(data.count for data in self.problem.records)
-        # Half of what separates two frequencies.
+        # Half the frequency resolution.
         resolution, highest = (
             0.5 * np.pi * self.box.spread[0],
             min(self.box.imaginary, self.box.fastest, self.box.highest),
@@ -258,7 +258,7 @@ class StructureSearch:
             lowest.setdefault(w, point)
         found = list(lowest.values())[: LOOKED_AT // 2]
         if self.box.imaginary < self.box.fastest:
-            # A pair that alternates with the samples is another one at every delay.
+            # The response of a pair at the Nyquist frequency differs at every delay.
             places = [(self.box.imaginary, damping, tau) for damping in (zeta, *self.effort.dampings) for tau in delays]
             edge = sorted(self._with_pairs(zeros, roots, places), key=lambda entry: entry[0])
             found += [point for _, _, point in edge[: self.effort.refined]]
@@ -267,7 +267,7 @@ class StructureSearch:
     def _with_pairs(
         self, zeros: int, roots: ComplexArray, places: Iterable[tuple[float, float, tuple[float, ...]]]
     ) -> list[tuple[float, float, Point]]:
-        """Squared errors, frequencies and points with a pair of each imaginary part and damping, at each delay."""
+        """Return squared errors, frequencies and points with a pair of each frequency, damping and delay."""
         frequencies, points = [], []
         for w, zeta, tau in places:
             pair = w * complex(-zeta, 1.0)
@@ -279,7 +279,7 @@ class StructureSearch:
     def close_delays(self, poles: int, zeros: int) -> list[Point]:
         """Return starts with the best poles at delays within half a sampling interval of the best one.
 
-        On an irregular clock the cost has a kink wherever a sample meets an edge of the input, and minima between them.
+        On an irregular clock the cost has a kink if a sample coincides with an edge of the input, and minima between.
         """
         if not self.box.beyond_edges or not self.box.delay_free:
             return []
@@ -294,19 +294,19 @@ class StructureSearch:
         return [self.descent(zeros).at_its_delay(point) for point in points]
 
     def _grown(self, poles: int, zeros: int, new_zeros: int, added: int) -> list[Point]:
-        """The best of a smaller structure with poles added, for another numerator."""
+        """Return the best starts from a smaller structure with added poles, for another numerator."""
         point = self.best(poles, zeros)
         return self._extended(new_zeros, point.poles, point.seconds, added, self.effort.looked_at)
 
     def _extended(
         self, zeros: int, roots: ComplexArray, delay: tuple[float, ...], added: int, most: int, denser: int = 1
     ) -> list[Point]:
-        """The best few of all poles, or pairs, added to given ones, by elimination alone."""
+        """Return the best poles, or pairs, added to given ones, by elimination only."""
         effort, box = self.effort, self.box
         slowest, count = box.spread[0], denser * (effort.poles if added == 1 else effort.pairs)
         frequencies = np.geomspace(slowest, box.fastest, count + 2)[1:-1]
         if added == 1 and box.slowest < slowest:
-            # One for all that are next to integrators.
+            # One frequency for all poles close to integrators.
             frequencies = np.append(frequencies, np.sqrt(box.slowest * slowest))
         where, points = [], []
         for w in frequencies.tolist():
@@ -323,9 +323,9 @@ class StructureSearch:
         return [points[k] for k in chosen]
 
     def along_delay(self, zeros: int, points: list[Point]) -> list[Point]:
-        """Return also starts at the minima of the profile over each delay, for the poles of the best start.
+        """Return the points, and starts at the minima of the profile over each delay for the poles of the best point.
 
-        Of several delays one after the other is moved to its best place, twice.
+        Several delays are optimised cyclically, twice.
         """
         if not points:
             return points
@@ -339,7 +339,7 @@ class StructureSearch:
         return points + found[-KEPT * len(free) :]
 
     def delays(self, most: int, k: int = 0) -> list[float]:
-        """Delays of an input that are spread over its range, at most one for each of its cells."""
+        """Return delays of an input spread over its range, at most one for each cell."""
         low, high = self.box.each_delay[k]
         spacing = max(self.box.cell or 0.25 * self.box.quarter, (high - low) / most)
         count = int(np.ceil((high - low) / spacing))
@@ -347,7 +347,7 @@ class StructureSearch:
         return delays
 
     def random_points(self, poles: int) -> list[Point]:
-        """Return starts drawn uniformly: logarithms of frequencies and dampings in their spread, delays."""
+        """Return starts with uniformly distributed delays and logarithms of frequencies and dampings."""
         rng, box, points = np.random.default_rng(self.seed), self.box, []
         for _ in range(self.random_starts * (1 + poles)):
             roots = [self._random_poles(rng, order) for order in box.parts or (poles,)]
@@ -356,7 +356,7 @@ class StructureSearch:
         return points
 
     def _random_poles(self, rng: np.random.Generator, poles: int) -> ComplexArray:
-        """Return the poles of one denominator."""
+        """Return random poles of one denominator."""
         slowest, least_damping = self.box.spread
         pairs = int(rng.integers(0, poles // 2 + 1))
         w = np.exp(rng.uniform(np.log(slowest), np.log(self.box.fastest), poles - pairs))
@@ -366,25 +366,25 @@ class StructureSearch:
 
 
 def _at(values: tuple[T, ...], k: int, value: T) -> tuple[T, ...]:
-    """Return values of which one is another."""
+    """Return ``values`` with element ``k`` replaced."""
     return (*values[:k], value, *values[k + 1 :])
 
 
 def lowest_minima(values: Array, most: int) -> list[int]:
-    """Return the places of the lowest local minima, the lowest first."""
+    """Return the indices of the lowest local minima, the lowest first."""
     padded = np.concatenate(([np.inf], values, [np.inf]))
     minima = np.flatnonzero((values <= padded[:-2]) & (values < padded[2:]))
     return [int(k) for k in minima[np.argsort(values[minima])[:most]]]
 
 
-# --- several denominators: the fractions of each are searched beside what the others leave ------------
+# --- several denominators: each is fitted to the residual of the others -------------------------------
 
 
 def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> list[Point]:
-    """Return starts of a sum of fractions with several denominators, the most likely first.
+    """Return starts of a sum of fractions with several denominators, in order of ascending squared error.
 
-    The search of one denominator sees the output less the response of the others, as they are known by then: twice,
-    from the first denominator on and from the last one on. The lowest minima of each are combined.
+    Each denominator is fitted to the output minus the current response of the others, in two sweeps in ascending and
+    two in descending order. The lowest minima of all denominators are combined.
     """
     blocks, found = range(len(problem.terms)), list[Point]()
     for order in (blocks, blocks[::-1]):
@@ -408,7 +408,7 @@ def block_starts(problem: Problem, box: Box, random_starts: int, seed: int) -> l
 
 
 def _alone(problem: Problem, box: Box, block: int, others: Sequence[list[Array]]) -> tuple[Problem, Box]:
-    """Return the problem of one denominator, its output without what the others explain, and its box."""
+    """Return the problem of one denominator, with the response of the others subtracted, and its box."""
     driver, term, records = problem.inputs[block], problem.terms[block], []
     for k, data in enumerate(problem.sampled):
         y = data.y.copy()

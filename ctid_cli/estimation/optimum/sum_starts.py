@@ -1,4 +1,4 @@
-"""Where searches for sums of submodels start: at sums that grow term by term."""
+"""Starts of searches for sums of submodels: sums extended term by term."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,34 +13,34 @@ from ctid_cli.estimation.optimum.search import Descent, Local
 from ctid_cli.estimation.optimum.starts import APART, StructureSearch
 from ctid_cli.models.additive import Term
 
-#: Frequencies of an added pole or pair, and dampings of a pair.
+#: Number of frequencies of an added pole or pair, and dampings of a pair.
 FREQUENCIES, DAMPINGS = 24, (0.005, 0.05, 0.5)
-#: Sums that are kept of each step, places at which each grows, and orders in which terms are added.
+#: Largest numbers of sums kept after each step, of extensions of each, and of orders in which terms are added.
 KEPT, PLACES, MOST_ORDERS = 2, 2, 3
-#: Delays at which the first term is looked for.
+#: Number of delays in the search for the first term.
 FIRST_DELAYS = 10
 
 
 class SumGrowth:
-    """Sums that grow: the first term over the whole range of the delay, each other one beside the best so far."""
+    """Extension of sums: the first term over the whole range of the delay, each further one added to the best sums."""
 
     def __init__(self, problem: Problem, box: Box) -> None:
         self.problem, self.box = problem, box
 
     def points(self) -> list[Point]:
-        """Return the best sums of all terms, in several orders of growth where terms differ."""
+        """Return the best sums of all terms, in several orders of extension if terms differ."""
         terms = self.problem.terms
         distinct = dict.fromkeys(tuple(terms[k] for k in order) for order in permutations(range(min(len(terms), 6))))
-        # Of many terms only the given order is tried.
+        # For many terms only the given order is tried.
         orders = list(distinct)[:MOST_ORDERS] if len(terms) <= 6 else [terms]
         return [_rearranged(local.point, order, terms, self.box) for order in orders for local in self._grown(order)]
 
     def _grown(self, order: tuple[Term, ...]) -> list[Local]:
-        """Return the lowest minima of a sum whose terms are added in an order."""
+        """Return the lowest minima of a sum whose terms are added in a given order."""
         best: list[Local] = []
         for count in range(1, len(order) + 1):
             term = order[count - 1]
-            # A term of many poles grows pair by pair.
+            # A term of many poles is extended pair by pair.
             for poles in sorted({term.poles, *range(2 - term.poles % 2, term.poles, 2)} - {0}) or [0]:
                 zeros = min(term.zeros, poles + term.integrators)
                 terms = (*order[: count - 1], Term(poles, zeros, term.integrators))
@@ -48,14 +48,14 @@ class SumGrowth:
         return best
 
     def _added(self, terms: tuple[Term, ...], known: Sequence[Local]) -> list[Local]:
-        """Return the lowest minima of a sum, from those that have fewer poles in the last term."""
+        """Return the lowest minima of a sum, from those with fewer poles in the last term."""
         problem = replace_terms(self.problem, terms)
         box = replace(self.box, parts=problem.parts)
         search = StructureSearch(problem, box)
         descent, order = search.descent(problem.zeros), sum(term.poles for term in terms)
         found: list[Local] = []
         bases = [(local.point.poles, local.point.delay.seconds) for local in known]
-        # The whole range of the delay for what comes first.
+        # The first term is searched over the whole range of the delay.
         delays = search.delays(FIRST_DELAYS) or [box.each_delay[0][0]]
         bases = bases or [(np.zeros(0, dtype=complex), delay) for delay in delays]
         starts: list[Point] = []
@@ -65,7 +65,7 @@ class SumGrowth:
         if not known:
             starts = descent.sorted(starts)[: PLACES * KEPT]
         for start in starts:
-            # What moves the squared error by less than the variance of the noise is not seen.
+            # Changes of the squared error below the variance of the noise are not significant.
             found.append(descent.descend(start, found, near=1.0 / descent.count))
         found.sort(key=lambda local: local.squared_error)
         distinct = [one for k, one in enumerate(found) if one not in found[:k]]
@@ -73,7 +73,7 @@ class SumGrowth:
 
 
 def _extended(descent: Descent, box: Box, base: tuple[ComplexArray, float], added: int) -> list[Point]:
-    """Return the best few of all poles, or pairs, added to the last submodel of a sum, by elimination alone."""
+    """Return the best poles, or pairs, added to the last submodel of a sum, by elimination only."""
     roots, delay = base
     if not added:
         return [point_of(roots, delay, box)]
@@ -92,12 +92,12 @@ def _extended(descent: Descent, box: Box, base: tuple[ComplexArray, float], adde
 
 
 def replace_terms(problem: Problem, terms: tuple[Term, ...]) -> Problem:
-    """Return the same records for another sum."""
+    """Return the problem of the same records for another sum."""
     return problem._replace(terms=terms)
 
 
 def _rearranged(point: Point, order: Sequence[Term], terms: Sequence[Term], box: Box) -> Point:
-    """Return a point of terms in an order as one of the same terms in another."""
+    """Return a point with its terms permuted from ``order`` to ``terms``."""
     groups = _groups(point.poles, [term.poles for term in order])
     left = list(zip(order, groups, strict=True))
     found = [left.pop(next(k for k, (own, _) in enumerate(left) if own == term))[1] for term in terms]
@@ -105,7 +105,7 @@ def _rearranged(point: Point, order: Sequence[Term], terms: Sequence[Term], box:
 
 
 def in_order(point: Point, terms: Sequence[Term], box: Box) -> Point:
-    """Return the same sum with submodels of one structure by rising natural frequency."""
+    """Return the sum with submodels of equal structure sorted by natural frequency."""
     groups = _groups(point.poles, [term.poles for term in terms])
     rising = sorted(range(len(groups)), key=lambda k: float(np.abs(groups[k]).min(initial=np.inf)))
     alike = {term: iter([groups[k] for k in rising if terms[k] == term]) for term in terms}

@@ -1,9 +1,8 @@
-r"""The rows of all used samples of a record, reduced by orthogonal transformations to a triangle.
+r"""QR decomposition of the rows of all used samples of a record.
 
-With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples (z, w and u of each input where there
-are several), ``Z = Q R``: whatever is asked of linear maps of these rows (projections, residuals, sums of squares) is
-asked of the same maps of R. Second moments would square the condition; this costs little more, so that one route serves
-the search and its end.
+With Z the rows ``[z, w, u, y, free z, free w, 1, t - t_0]`` of all used samples (z, w and u of each of several inputs),
+``Z = Q R``: projections, residuals and sums of squares of linear maps of these rows are those of the same maps of R.
+Second moments would square the condition number; QR costs little more, so that it serves the search and its end.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,15 +23,15 @@ from ctid_cli.inference.innovations import SampledNoise, Whitener
 
 
 class Delay(NamedTuple):
-    """A delay, and on a regular clock the cell between two samples that it is read in, -1 for that of the delay."""
+    """Delay, and on a regular clock the index of its cell between two samples, -1 for the cell of the delay itself."""
 
     seconds: float
     cell: int
 
     def place(self, interval: float) -> Place:
-        """Return the breaks by which the read-out lags, and the fraction, 0 to 1, of an interval read beyond that.
+        """Return the lag of the output in breaks, and the additional fraction, 0 to 1, of an interval.
 
-        At a sample a cell is closed on both sides: each has its own slope there. Without an interval, the delay.
+        Cells include both end points, since the one-sided slopes at a sample differ. Without an interval, the delay.
         """
         if not interval:
             return self.seconds
@@ -41,7 +40,7 @@ class Delay(NamedTuple):
         return self.cell + 1, min(max(self.cell + 1 - self.seconds / interval, 0.0), 1.0)
 
 
-#: A delay, or one of each input.
+#: A delay, or one for each input.
 Delays = Delay | tuple[Delay, ...]
 
 
@@ -52,65 +51,65 @@ def each_delay(delays: Delays) -> tuple[Delay, ...]:
 
 @dataclass(frozen=True)
 class Columns:
-    """Where the rows have what: z, w and u of each channel, y, z and w of each free response, powers of time."""
+    """Layout of the rows: z, w and u of each channel, y, z and w of each free response, powers of time."""
 
-    #: Number of states of each channel, and which input drives it.
+    #: Number of states, and input, of each channel.
     orders: tuple[int, ...]
     inputs: tuple[int, ...]
-    #: The channels whose states have free responses.
+    #: Channels whose states have free responses.
     free: tuple[int, ...]
-    #: Whether there is w.
+    #: Whether the rows contain w.
     second: bool
     trend: tuple[int, ...]
 
     @staticmethod
     @lru_cache(maxsize=1024)
     def of(arrangement: Arrangement, second: bool, free: bool, trend: tuple[int, ...]) -> "Columns":
-        """Return the columns of the channels of a model, with or without w and free responses."""
+        """Return the layout for the channels of a model, with or without w and free responses."""
         channels = arrangement.channels
         orders, inputs = (tuple(each) for each in zip(*((one.order, one.input) for one in channels), strict=True))
         return Columns(orders, inputs, arrangement.owners if free else (), second, trend)
 
     @cached_property
     def _first(self) -> list[int]:
-        """First row of each channel, and the row of the output behind them."""
+        """First row of each channel, and the row of the output after them."""
         return list(accumulate(((1 + self.second) * order + 1 for order in self.orders), initial=0))
 
     @cached_property
     def _first_free(self) -> list[int]:
-        """First row of each free response, and what comes behind them."""
+        """First row of each free response, and the first row after them."""
         widths = ((1 + self.second) * self.orders[k] for k in self.free)
         return list(accumulate(widths, initial=self.y + 1))
 
     def z(self, k: int = 0) -> slice:
-        """Z of a channel."""
+        """Return the slice of z of a channel."""
         return slice(self._first[k], self._first[k] + self.orders[k])
 
     def states(self, k: int = 0) -> slice:
-        """Z and w of a channel."""
+        """Return the slice of z and w of a channel."""
         return slice(self._first[k], self._first[k + 1] - 1)
 
     def u(self, k: int = 0) -> int:
-        """The input of a channel."""
+        """Return the index of the input of a channel."""
         return self._first[k + 1] - 1
 
     @property
     def y(self) -> int:
-        """The output."""
+        """Index of the output."""
         return self._first[-1]
 
     def free_states(self, place: int = 0) -> slice:
-        """Z and w of a free response."""
+        """Return the slice of z and w of a free response."""
         return slice(self._first_free[place], self._first_free[place + 1])
 
     def free_z(self, place: int = 0) -> slice:
-        """Z of a free response."""
+        """Return the slice of z of a free response."""
         first = self._first_free[place]
         return slice(first, first + self.orders[self.free[place]])
 
     @property
     def powers(self) -> slice:
-        """Powers of the time since the first instant."""
+        """Slice of the powers of the time since the first instant."""
         return slice(self._first_free[-1], self.size)
 
     @property
@@ -127,9 +126,9 @@ def rows_of(
     period: float,
     noise: SampledNoise | None = None,
 ) -> Iterator[Array]:
-    """Yield the rows of the used samples, transposed, piece by piece; whitened where a noise is given.
+    """Yield the rows of the used samples, transposed, piece by piece; whitened if a noise model is given.
 
-    There is a form for each channel.
+    Each channel has one form.
     """
     each = each_delay(delays)
     if isinstance(data, FrequencyLines):
@@ -150,7 +149,7 @@ def rows_of(
             continue
         rows = np.empty((columns.size, count))
         for k, part in enumerate(parts):
-            # The output comes behind the input, and behind the last one it stays.
+            # The output row follows the last input row.
             rows[columns.states(k).start : columns.u(k) + 2] = part.T
         for place, k in enumerate(columns.free):
             own = forms[k].free(elapsed[done : done + count] - elapsed[0], second)
@@ -164,11 +163,11 @@ def rows_of(
 
 
 def _reduced(triangle: Array | None, rows: Array) -> Array:
-    """Return the triangle of rows, transposed and overwritten, below another triangle: R <- qr[R; rows]."""
+    """Return the triangle of rows, transposed and overwritten, appended to another triangle: R <- qr[R; rows]."""
     from scipy.linalg.lapack import dgeqrf  # slow to import
 
     q, whole = len(rows), rows if triangle is None else np.hstack((triangle.T, rows))
-    # The transpose has the order of LAPACK: nothing is copied, unlike in ``numpy.linalg.qr``.
+    # The transpose has LAPACK's memory order, so that nothing is copied, unlike in ``numpy.linalg.qr``.
     factors = dgeqrf(whole.T, lwork=32 * q, overwrite_a=True)[0][:q]
     result = np.zeros((q, q))
     result[: len(factors)] = np.triu(factors)
@@ -184,7 +183,7 @@ def triangle_of(
     noise: SampledNoise | None = None,
 ) -> Array:
     """Return a triangle with the second moments of the rows of all used samples."""
-    # Memory is that of one piece, however long the record.
+    # Memory is limited to one piece for any length of the record.
     triangle: Array | None = None
     for rows in rows_of(forms, columns, delays, data, period, noise):
         triangle = _reduced(triangle, rows)
@@ -200,13 +199,13 @@ def triangles_of(
     period: float,
     noise: SampledNoise | None = None,
 ) -> Array:
-    """Return the triangles of models of one arrangement without w, from one pass of all their modes: (K, q, q)."""
+    """Return the triangles of K models of one arrangement without w, from one pass of all modes: (K, q, q)."""
     shared, chosen, count = list[Fractions](), list[IntArray](), len(candidates)
     for forms in zip(*candidates, strict=True):
         poles, places = np.unique(np.concatenate([form.modes.poles for form in forms]), return_inverse=True)
         widths = np.where(poles.imag > 0.0, 2, 1)
         last = np.cumsum(widths)
-        # Of each model the rows among those of all modes.
+        # Indices of the rows of each model among those of all modes.
         each = [np.arange(last[place] - widths[place], last[place]) for place in places]
         shared.append(Fractions(Fractions.modes_of(poles)))
         chosen.append(np.concatenate(each).reshape(count, -1) if each else np.zeros((count, 0), dtype=np.int64))
@@ -223,13 +222,13 @@ def triangles_of(
 
 
 def _record(delay: Delay, data: FilterData, period: float) -> Record:
-    """Return a record as it is filtered; one whose input repeats itself begins with the period before its samples."""
+    """Return the record to be filtered; with a periodic input it begins one period before its samples."""
     if not period:
         return Record(data, delay.place(data.interval))
     place = delay.place(data.interval)
     if isinstance(place, tuple):
         shift, fraction = place
-        # The last interval leads back to the first break, where the next slope begins.
+        # The last interval ends at the first break of the next period.
         count, u = data.u.size, np.roll(data.u, shift)
         u = np.append(u, u[0])
         once = data._replace(u=u, t=np.zeros(count + 1), y=np.zeros(count), use=np.zeros(count, dtype=bool))
