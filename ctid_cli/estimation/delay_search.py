@@ -86,7 +86,7 @@ class DelayCost(Protocol):
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay included."""
+        """Number of parameters, including the delay."""
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:
         """Return the least cost at a delay from given starts, shape (K, n + m + 2), and with ``own`` least squares."""
@@ -143,7 +143,7 @@ class SampledCost:
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay included."""
+        """Number of parameters, including the delay."""
         return self.problem.free + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:

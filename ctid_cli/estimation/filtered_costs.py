@@ -57,7 +57,7 @@ class FilteredCost:
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay included."""
+        """Number of parameters, including the delay."""
         return self.structure.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:

@@ -94,7 +94,7 @@ class LoopProblem:
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay included."""
+        """Number of parameters, including the delay."""
         return self.response.poles + self.response.zeros + 2
 
     @property

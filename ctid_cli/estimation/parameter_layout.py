@@ -186,7 +186,7 @@ class SumDegrees:
 
     @property
     def poles(self) -> int:
-        """Number of poles, integrators included."""
+        """Number of poles, including integrators."""
         return self.structure.poles
 
     @property
@@ -277,7 +277,7 @@ class Layout:
 
     def theta(self, model: AnyModel | AdditiveModel) -> Array:
         """Return the parameters of a model of these degrees, and zeros for those of the experiments."""
-        own = self.degrees.theta_of(model)  # type: ignore[arg-type]  # each has the models of its own kind
+        own = self.degrees.theta_of(model)  # type: ignore[arg-type]  # each has models of one kind
         return np.concatenate((own, np.zeros(self.experiments * self.own)))
 
     def own_of(self, theta: Array, experiment: int) -> tuple[Array, float]:

@@ -80,7 +80,7 @@ class RecordsCost:
 
     @property
     def size(self) -> int:
-        """Number of parameters, the delay included."""
+        """Number of parameters, including the delay."""
         return self.coefficients.size + 1
 
     def minimise(self, delay: float, starts: Array, own: bool) -> Minimum:

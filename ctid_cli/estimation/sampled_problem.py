@@ -27,7 +27,7 @@ def is_hurwitz(a: Array) -> bool:
     # Positive coefficients are necessary, and sufficient for n <= 2; the test also rejects NaN.
     if not all(c > 0.0 for c in coefficients):
         return False
-    # The first two rows of Routh's array hold the even and the odd coefficients.
+    # The first two rows of Routh's array are the even and the odd coefficients.
     upper, lower = coefficients[0::2], coefficients[1::2]
     # Each new row replaces the older of its two predecessors; without sign changes in the first column it is stable.
     while len(lower) > 0 and len(upper) > 1:
@@ -43,7 +43,7 @@ def reflect_unstable(a: Array) -> Array:
     """Return a monic polynomial with its right-half-plane roots reflected into the left half-plane."""
     if is_hurwitz(a):
         return a
-    # In the polynomial's own unit of time, where its coefficients neither overflow nor vanish.
+    # With scaled time the coefficients neither overflow nor underflow.
     w0, roots = scaled_roots(a)
     least = OFF_THE_AXIS * (float(np.abs(roots).max()) or 1.0)
     mirrored = -np.maximum(np.abs(roots.real), least) + 1j * roots.imag

@@ -226,7 +226,7 @@ class MultiInputFit(MeasuredFit):
         As in :class:`MeasuredFit`.
     """
 
-    model: MultiInputModel  # type: ignore[assignment]  # what asks for one transfer function asks for that of an input
+    model: MultiInputModel  # type: ignore[assignment]  # callers that need one transfer function use that of an input
 
     @property
     def coefficients(self) -> dict[str, float]:

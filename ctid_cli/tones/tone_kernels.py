@@ -48,7 +48,7 @@ def _product(one: Array, other: Array, count: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _phasor(growth: float, angle: float) -> complex:
-    """Return ``exp(growth + i angle)``; that of cmath takes longer to compile."""
+    """Return ``exp(growth + i angle)``, which compiles faster than cmath.exp."""
     size = math.exp(growth)
     return complex(size * math.cos(angle), size * math.sin(angle))
 

@@ -87,7 +87,7 @@ def fit_tones(
     parts = [first[k : k + size] for k in range(0, first.size, size)]
     blocks = in_threads(lambda part: _block(samples, length, part, most, shorter), parts)
     tones = WindowTones(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
-    # One empty column is kept if possible: a window without one has the largest number of lines.
+    # One empty column is kept if possible: windows without one are full.
     kept = int(np.isfinite(tones.omega).sum(axis=1).max()) + 1
     return WindowTones._make(each[:, :kept] if each.ndim == 2 else each for each in tones)
 
