@@ -72,7 +72,7 @@ class RunSummary:
     #: Duration [s].
     seconds: float
     stopped_by: str | None
-    #: Settings of the run before, as in its plan; None without results of one.
+    #: Settings of the previous run, as in its plan; None if there are no earlier results.
     former: dict[str, Any] | None = None
     #: Precision of each data cell; empty if the number of data sets was given.
     precision: tuple[CellPrecision, ...] = ()

@@ -37,7 +37,7 @@ def test_only_exponential_growth_diverges(grown, diverges):
     t = np.linspace(0.0, 12.0, 600)
     y, u = grown(t), np.sin(3 * t)
     assert growth_time(t, y, u) == (pytest.approx(1.0, rel=0.05) if diverges else pytest.approx(np.nan, nan_ok=True))
-    # An input that pauses does not grow when it goes on.
+    # An input that resumes after a pause does not count as growing.
     pausing = np.where((t > 7.5) & (t < 9.0), 0.0, u)
     assert np.isfinite(growth_time(t, y, pausing)) == diverges
     # Growth of the input explains growth of the output.
