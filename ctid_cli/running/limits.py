@@ -138,7 +138,7 @@ def advice(reason: str) -> str:
     return next((text for pattern, text in _ADVICE if re.search(pattern, reason)), _ANY)
 
 
-# --- when a run is to stop --------------------------------------------------------------------------------------------
+# --- requests to stop a run -------------------------------------------------------------------------------------------
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

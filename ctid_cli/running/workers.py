@@ -1,8 +1,8 @@
-"""Worker processes: jobs go through joblib's loky, and what a process died of is computed again, alone in a process.
+"""Worker processes of joblib's loky, and separate processes for the jobs of dead workers.
 
-loky gives up a whole set of workers when one of them dies. Each worker keeps a record of its job, a file that says
-which estimates it has begun and finished, so that nothing is lost with it and the suspects are known: one for each
-worker. Every suspect is computed again in a process of its own, whose exit code decides.
+loky gives up all workers when one of them dies. Each worker keeps a record of its job, a file with the begun and
+finished estimates, so that no results are lost and the suspects are known: one for each worker. Every suspect is
+computed again in a separate process, whose exit code decides.
 """
 
 from __future__ import annotations
@@ -33,46 +33,46 @@ from ctid_cli.running.limits import Limits, StopRequest
 from ctid_cli.signals.files import COPIES
 from ctid_cli.storage.manifest import Key, Outcome
 
-#: How often the caller gets a chance to do something else while nothing is finished [s].
+#: Longest wait for a finished job before the caller regains control [s].
 TICK = 0.1
 #: Time beyond one and a half times its limit after which a process is killed that its own watchdog has not ended [s].
 GRACE = 3.0
-#: How long workers without a job live [s].
+#: Lifetime of idle workers [s].
 IDLE = 300.0
-#: File beside the folders of jobs that tells workers to begin nothing more.
+#: File next to the folders of jobs that tells workers to begin no further jobs.
 _STOP = "stop"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB_MAXIMUM", "NUMBA", "NUMEXPR")
-#: With more threads, linear algebra has other last bits.
+#: With more threads, the last bits of linear algebra differ.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in _LIBRARIES}
 _PR_SET_PDEATHSIG = 1
 
 
 class Task(NamedTuple):
-    """A job on its way to another process."""
+    """A job in the form sent to another process."""
 
     keys: tuple[Key, ...]
     content: bytes
 
 
 class Ending(NamedTuple):
-    """What came of a job, and how its process ended."""
+    """Results of a job, and how its process ended."""
 
-    #: What was begun and finished, in this order.
+    #: Begun and finished estimates, in order.
     entries: list[Entry]
-    #: Empty where the job is over; else a signal, an exit code, or why there is neither.
+    #: Empty if the job is complete; otherwise a signal, an exit code, or the reason why there is neither.
     how: str = ""
-    #: Whether the limit of wall time ended it, and the processor time that it had since the last beginning [s].
+    #: Whether the wall time limit ended it, and its processor time since the last beginning [s].
     late: bool = False
     processor: float = 0.0
 
     @property
     def begun(self) -> tuple[Key, ...]:
-        """The estimates that were in work last."""
+        """The estimates that were last in progress."""
         return next((entry.keys for entry in reversed(self.entries) if isinstance(entry, Begun)), ())
 
 
-#: Jobs that are over, in any order; None where nothing has come for a while.
+#: Finished jobs in any order; None after a while without one.
 Results = Generator[tuple[Job, Ending] | None]
 
 
@@ -106,7 +106,7 @@ def _end_with(parent: int) -> None:
 
 
 def compute(task: Task, record: Path, limits: Limits) -> list[Entry]:
-    """Compute the estimates of a job under limits, and keep a record of what is begun and finished."""
+    """Compute the estimates of a job under limits, and keep a record of those begun and finished."""
     found: list[Entry] = []
     in_work = task.keys
     # The traceback of a process that dies would garble the terminal; loky has asked for it.
@@ -139,7 +139,7 @@ def compute_unless_stopped(task: Task, limits: Limits, folder: Path) -> Ending:
 
 
 def main() -> None:
-    """Call the function that a file holds, and write what it returns to another: a process of its own does this."""
+    """Call a function read from a file, and write its result to another: the main program of a separate process."""
     folder, parent = Path(sys.argv[1]), int(sys.argv[2])
     initialise(parent)
     function, given = unpacked((folder / "call").read_bytes())
@@ -151,7 +151,7 @@ def main() -> None:
 
 
 def packed(*content: Any) -> bytes:
-    """Return content for another process, after the custom code that it needs to read it and the files it was sent."""
+    """Return content for another process, preceded by the custom code and files needed to read it."""
     return pickle.dumps((custom_code.served(), COPIES, pickle.dumps(content)))
 
 
@@ -164,9 +164,9 @@ def unpacked(data: bytes) -> list[Any]:
 
 
 def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple[Any, str, float]:
-    """Call a function in a process of its own, through files in a folder; waits for it.
+    """Call a function in a separate process, by files in a folder, and wait for it.
 
-    Returns what it returned, or how the process ended before that, and the processor time [s].
+    Returns the result, or how the process ended without one, and the processor time [s].
     """
     folder.mkdir(exist_ok=True)
     (folder / "call").write_bytes(packed(function, given))
@@ -189,7 +189,7 @@ def call_alone(folder: Path, function: Callable[..., Any], *given: Any) -> tuple
 
 
 def compute_alone(task: Task, limits: Limits, folder: Path) -> Ending:
-    """Compute a job in a process of its own, which is told how it ended."""
+    """Compute a job in a separate process; return its results and how the process ended."""
     record = folder / "record"
     try:
         found, how, used = call_alone(folder, compute, task, record, limits)
@@ -199,20 +199,20 @@ def compute_alone(task: Task, limits: Limits, folder: Path) -> Ending:
 
 
 def _remains(record: Path, how: str, used: float = 0.0) -> Ending:
-    """Return what the record of a dead process says."""
+    """Return the content of the record of a dead process."""
     entries, late = _read(record)[1:], _late(record)
     since = next((entry.since for entry in reversed(entries) if isinstance(entry, Begun)), 0.0)
     return Ending(entries, how, late.exists() and late.stat().st_size > 0, used - since)
 
 
 def _late(record: Path) -> Path:
-    """Return the file that is not empty where a job has exceeded its wall time."""
+    """Return the file that is not empty if a job has exceeded its wall time."""
     return record.with_suffix(".late")
 
 
 def _read(record: Path) -> list[Any]:
     entries = []
-    # A worker may have died in the midst of an entry, or before the first.
+    # A worker may have died while writing an entry, or before the first.
     with suppress(OSError, EOFError, pickle.UnpicklingError), record.open("rb") as file:
         while True:
             entries.append(pickle.load(file))
@@ -225,7 +225,7 @@ def in_parallel(
     at_once: Callable[[], int],
     died: Callable[[Job, Exception], Ending],
 ) -> Results:
-    """Keep a number of jobs in work, and yield each with what came of it; None where nothing has ended for a while."""
+    """Keep a number of jobs in progress, and yield each with its result; None after a while without one."""
     in_work: dict[Future[Ending], Job] = {}
     while True:
         while len(in_work) < at_once() and (job := next(jobs, None)) is not None:
@@ -249,7 +249,7 @@ def in_parallel(
 
 
 def task_of(job: Job) -> Task | Ending:
-    """Return what is sent of a job, or what comes of it where it cannot be sent."""
+    """Return a job in the form to send, or its ending if it cannot be sent."""
     try:
         return Task(job.keys, packed(job))
     except Exception as error:
@@ -266,7 +266,7 @@ def _loky_thread(process: int) -> ThreadPoolExecutor:
 
 
 def _submit_to_loky(count: int, *call: Any) -> Future[Ending]:
-    """Give a call to the workers of this process, which are started if they are not there."""
+    """Submit a call to the workers of this process, which are started if necessary."""
     from joblib.externals.loky import get_reusable_executor
 
     start = {"initializer": initialise, "initargs": (os.getpid(),), "env": _ONE_THREAD}
@@ -275,16 +275,16 @@ def _submit_to_loky(count: int, *call: Any) -> Future[Ending]:
 
 
 class LocalWorkers:
-    """Worker processes on this machine; loky keeps them for the next run."""
+    """Worker processes on this machine, which loky keeps for the next run."""
 
     def __init__(self, count: int, limits: Limits) -> None:
         self.count, self._limits = count, limits
-        #: Why the last workers ended before all was done.
+        #: Why the last workers ended early.
         self.trouble = ""
         self._made = TemporaryDirectory(prefix="ctid-", ignore_cleanup_errors=True)
         self._folder = Path(self._made.name)
         self._numbers = itertools.count()
-        #: The records of what is in work, and what will come of it.
+        #: Records and futures of the jobs in progress.
         self._at_work: dict[Job, tuple[Path, Future[Ending]]] = {}
 
     def results(self, jobs: Iterator[Job], stopping: StopRequest) -> Results:
@@ -320,7 +320,7 @@ class LocalWorkers:
         yield from self._computed(jobs, compute_unless_stopped, submit, at_once, died, stopping)
 
     def alone(self, jobs: Iterator[Job], at_once: int, stopping: StopRequest) -> Results:
-        """Compute jobs each in a process of its own, some at the same time."""
+        """Compute each job in a separate process, several at a time."""
 
         def died(job: Job, error: Exception) -> Ending:
             raise error
