@@ -27,7 +27,7 @@ from ctid_cli.models.factoring import unfactored
 from ctid_cli.models.transfer_function import TransferFunction
 from ctid_cli.signals.record import Record, named
 
-#: Largest growth of an unstable loop over a record that is simulated.
+#: Largest growth over a record at which an unstable loop is simulated.
 LARGEST_GROWTH = 1e20
 #: Impulse response of the input to the reference: most lags, fewest samples per lag, and regularisation.
 MOST_LAGS, SAMPLES_PER_LAG, RIDGE = 300, 10, 1e-9

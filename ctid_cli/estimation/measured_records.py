@@ -364,7 +364,7 @@ class MeasuredRecords:
             return best_sum(self.problem, self.treatment.delay_bounds, starts, grown=False, known=self.known)
         poles, delays = starts[0][0].size - 1, self.treatment.delay_bounds
         found = best_output_error(self.problem, poles, delays, starts, nested=False, random_starts=0, known=self.known)
-        # Starts may be without the poles that have run to infinity.
+        # Starts may omit poles at infinity.
         return replace(found, poles_at_infinity=self.degrees.poles - self.problem.integrators - poles)
 
     def model(self, found: Optimum) -> AnyModel:
