@@ -204,7 +204,7 @@ def test_a_pole_at_the_border_is_held_and_the_others_have_standard_errors():
     assert all(item.status == "free" for item in result.estimates[:4])
     held = min(rows.values(), key=lambda row: abs(row.estimate + slow))
     assert np.isnan(held.standard_error)
-    assert "held" in held.reason
+    assert "bound" in held.reason
     assert sum("Held at the border" in warning for warning in result.warnings) == 1
 
 
