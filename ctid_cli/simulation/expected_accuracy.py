@@ -74,7 +74,7 @@ def _unbiased(source: SimulatedSource, estimator: Any) -> EstimatedForm:
     """Return the system in the estimator's parametrisation, and raise a BiasedError if the estimator is biased."""
     system, loop, sampling, noise = source.system, source.loop, source.sampling, source.noise
     if isinstance(system, MultiInputModel):
-        raise DataError("there is no theory here of several inputs; compare standard errors with the scatter instead")
+        raise DataError("the theory here does not cover several inputs; compare with the scatter instead")
     if (
         not isinstance(system, TransferFunction | AdditiveModel)
         or isinstance(estimator, CustomEstimation)

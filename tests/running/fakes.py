@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -122,7 +122,7 @@ class ToySpec:
     folder: Path = Path()
     data: None = None
     sampling: None = None
-    generator: None = None
+    generators: dict[str, Any] = field(default_factory=dict)
     monte_carlo: None = None
 
     def canonical(self) -> dict[str, Any]:
