@@ -18,6 +18,8 @@ from ctid_cli.models.several_inputs import delays_of
 from ctid_cli.signals.record import Record
 from ctid_cli.text import count, listed, probability
 
+#: Why residuals may depend on inputs that are still to come.
+AHEAD = "the delay is too long, the output was recorded ahead of the input, or a loop acts"
 #: Sentences that are printed.
 MOST = 5
 #: Below this fit something may be missing [%].
@@ -133,7 +135,9 @@ def _dependence(found: Identification, least: float = 0.05) -> str:
         return ""
     of = f" of experiment {record + 1}" * (len(found.records) > 1)
     which = f" {names[name]}" * (len(names) > 1)
-    return f"The residuals{of} depend on the input{which}{', most on later values' * later} ({probability(p)})"
+    if later:
+        return f"The residuals{of} depend most on later values of the input{which} ({probability(p)})"
+    return f"The residuals{of} depend on the input{which} ({probability(p)})"
 
 
 def _outliers(found: Identification, time_unit: str) -> str:
@@ -183,13 +187,14 @@ def _of_validation(found: Identification) -> Iterator[FitWarning]:
 def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> Iterator[str]:
     """What residuals and record show beside the model."""
     if not mended & {"structure", "delay", "hold"} and (what := _dependence(found, DEPENDENT)):
-        yield f"{what}: the model misses a part of the response"
+        yield f"{what}: {AHEAD if 'later values' in what else 'the model misses a part of the response'}"
     outliers = _outliers(found, time_unit)
     if outliers and "loss" not in mended:
         yield outliers
     share = max(saturated(record.y[record.valid]) for record in found.records)
     if share:
-        yield f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value, as at a limit"
+        where = f"{100 * share:.2g} % of the output samples lie exactly at the least or greatest value"
+        yield f"{where}: if a limit of the sensor or the actuator cut them off, parameters and intervals are biased"
     fit, noisy = found.fit.linear, found.fit.noise is not None
     # Of residuals with outliers nothing else is told.
     for k, (record, use) in enumerate(_used(found) if not outliers else ()):
@@ -208,7 +213,8 @@ def _of_residuals(found: Identification, mended: set[Kind], time_unit: str) -> I
         # Dynamics that are missed may leave something for later inputs to tell.
         if seen.feedback_p_value < min(FED_BACK, seen.pole_p_value):
             what = "The input follows earlier residuals" if acting is record else "The reference follows the output"
-            yield f"{what} ({probability(seen.feedback_p_value)}), as in a loop, where noise biases the estimate"
+            where = f"{what} ({probability(seen.feedback_p_value)})"
+            yield f"{where}, as in a loop, where noise biases the estimate, or as if the output is ahead of the input"
 
 
 def _of_fit(fit: MeasuredFit, tried: Trials) -> Iterator[str]:
