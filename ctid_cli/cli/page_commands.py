@@ -1,4 +1,4 @@
-"""``ctid figure`` and ``ctid report``: results as drawings and as pages."""
+"""``ctid figure`` and ``ctid report``: figures and pages of results."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def figure(
 def _draw_experiment(
     name: str, out: Path, file: Path | None, style: Form | None, chosen: tuple[str | None, str | None, str | None]
 ) -> None:
-    """Draw a figure of an experiment; the name of its file says which it is."""
+    """Draw a figure of an experiment, to a file named after its kind."""
     from ctid_cli.reporting.figures.experiment_plot import chosen_kind, experiment_drawing
     from ctid_cli.reporting.results import read_results
 
@@ -80,7 +80,7 @@ def _form_of(file: Path | None) -> Form:
 
 
 def _write(content: bytes, usual: Path, out: Path, file: Path | None) -> None:
-    """Write a file to its usual place within the results folder, or where the user says, and print its path."""
+    """Write a file to its default place in the results folder, or to the user's path, and print its path."""
     path = usual if file is None else file
     write_files({path: content}, out if file is None else None)
     typer.echo(path)
@@ -130,7 +130,7 @@ def report(
 
 
 def _page_of_file(path: Path, records: list[Path], validate: Path | None) -> str:
-    """Return the page of a fit or a track, of which the file says which it is."""
+    """Return the page of a fit or a track, whose file contains its kind."""
     from ctid_cli.reporting.fit_result import FitResult
     from ctid_cli.reporting.records import Records
     from ctid_cli.reporting.track_result import TrackResult

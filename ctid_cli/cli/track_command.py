@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SignalOptions:
-    """Which column and which part of a recorded signal is used, and its clock."""
+    """Column and part of a recorded signal to use, and its clock."""
 
     time: TimeColumn = None
     signal: Annotated[str | None, flag("--signal", "Column or channel to use.", "NAME")] = None
@@ -31,7 +31,7 @@ class SignalOptions:
     stop: To = None
 
     def reading(self) -> Reading:
-        """Return how the signal is read from its file."""
+        """Return the options for reading the signal from its file."""
         from ctid_cli.storage.track_file import Reading
 
         if self.interval is not None and self.rate is not None:
@@ -42,7 +42,7 @@ class SignalOptions:
 
 @dataclass(frozen=True)
 class ToneOptions:
-    """How tones are followed; None where it is chosen from the record."""
+    """Options for following tones; what is None is chosen from the record."""
 
     tones: Annotated[str, flag("--tones", "Number of sinusoids, or auto.", "N")] = "auto"
     every: Annotated[
@@ -109,7 +109,7 @@ def track(
 
 
 def _require_part(record: SampledSignal, reading: Reading) -> None:
-    """Refuse a part that is too short, which is often one in another unit of time."""
+    """Refuse a part that is too short, often because of another unit of time."""
     from ctid_cli.tones.constants import FEWEST
 
     if record.samples.size < FEWEST and not (reading.start is None and reading.stop is None):

@@ -160,7 +160,7 @@ def _is_named(frame: pd.DataFrame) -> bool:
 
 
 def aligned_lines(section: Section) -> tuple[list[list[str]], str]:
-    """Return header and rows of a table as texts, and the alignment of each column: text left (l), numbers right (r)."""
+    """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
     assert section.frame is not None
     frame = section.frame.reset_index() if _is_named(section.frame) else section.frame
     columns, sides = [], ""
