@@ -160,7 +160,7 @@ class FrequencyFitResult(FitResult):
 
 
 def frequency_fit_drawing(fit: FrequencyDomainFit, units: Units) -> Drawing:
-    """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
+    """Return a figure of gain and phase of values and model, and the residuals with the standard errors."""
     data, seen = fit.data, fit.data.frequencies > 0.0
     w, values, model = data.frequencies[seen], data.response[seen], fit.answers(data.frequencies)[seen]
     angle = np.unwrap(np.angle(model))

@@ -160,7 +160,7 @@ class Overview(Result):
 
 
 def _running(progress: Mapping[str, Any]) -> str:
-    """Return header and rows of a table as texts, and the side of each column: texts left (l), numbers right (r)."""
+    """Return who runs the experiment, since when, its progress, and its expected end."""
     if progress["pid"] is None:
         return "running now"
     words = [f"running now: process {progress['pid']} on {progress['host']}"]
