@@ -6,9 +6,9 @@ Signals of 1000 to 8000 samples: none to five tones over 60 dB, a quarter of the
 drifting, decaying or with a step of phase, frequency or amplitude, some with harmonics; white or coloured noise 10 to
 60 dB below the strongest, some with spikes or a gap. A valid row is wrong if its frequency differs from the nearest
 true one by more than 3.3 of its standard errors and more than .001 of the frequency. A row could be right if the
-Cramer-Rao bound for the stretch between two events of the signal (rate of change unknown) is below the accuracy, and
-its tone has at least six standard errors of its amplitude and three bins of the stretch to any other. All rows that
-could be right count, found or not; with one tone too few, only wrong rows count.
+Cramer-Rao bound for the stretch between two events of the signal (rate of change unknown) is below the accuracy, its
+amplitude is at least six of its standard errors, and any other tone at least three bins of the stretch away. All rows
+that could be right count, found or not; with one tone too few, only wrong rows count.
 
 Then: named cases, in which no valid row may be off by more than .02 Hz or 3.3 of its standard errors, whichever is
 larger; and coverage of the standard errors and their size relative to the bound, for one to three steady tones in white
