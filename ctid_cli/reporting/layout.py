@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from ctid_cli.text import count as count  # for those who draw
+from ctid_cli.text import count as count  # re-exported for figures
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], sides: str) -> str:
