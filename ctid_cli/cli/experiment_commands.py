@@ -280,7 +280,7 @@ def _changed(plan: Plan, summary: RunSummary) -> str:
 def validate(configs: Configs, spec: SpecOptions, form: FormatOptions) -> None:
     """Check experiment files without running them.
 
-    Prints every mistake with its place in the file, or how much work the experiment asks for.
+    Prints every mistake with its place in the file, or the amount of work of the experiment.
     """
     from ctid_cli.reporting.status_result import ValidationResult
 
@@ -325,10 +325,10 @@ def accuracy(
 
     No data are needed.
 
-    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with the
-    formula that it comes from. White Gaussian excitation on a regular clock has a limit for long records; otherwise
-    the sensitivities of the experiment's first data sets count. Where the experiment has results in OUT, what is
-    unexpected about them comes last.
+    For every estimator and the swept numbers of samples: the standard error of each parameter by theory, with its
+    formula. White Gaussian excitation on a regular clock has a limit for long records; otherwise the sensitivities of
+    the experiment's first data sets are used. If the experiment has results in OUT, their deviations from theory come
+    last.
     """
     from ctid_cli.reporting.accuracy_result import AccuracyResult
     from ctid_cli.reporting.results import find_results
@@ -357,7 +357,7 @@ def init(
 ) -> None:
     """Write commented experiment files to begin with.
 
-    They go into the current folder. Each runs as it is, in seconds, and says what every line of it means.
+    They go into the current folder. Each runs unchanged, in seconds, and explains every line.
     """
     wanted = kinds or list(TEMPLATES)
     for kind in wanted:

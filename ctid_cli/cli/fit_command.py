@@ -96,10 +96,9 @@ def fit(
 ) -> None:
     """Fit a transfer function to records or a frequency response.
 
-    Prints the parameters with their standard errors and what tells whether to believe them, and writes fit.json and
-    fit.svg. Poles, zeros, integrators, the range of the delay, the hold of the input, and the treatment of state and
-    offset are chosen by one criterion where they are not given. A table of a frequency response, such as ctid frf
-    writes, needs --poles.
+    Prints the parameters with their standard errors and diagnostics, and writes fit.json and fit.svg. Poles, zeros,
+    integrators, the range of the delay, the hold of the input, and the treatment of state and offset are chosen by one
+    criterion unless they are given. A table of a frequency response, such as ctid frf writes, needs --poles.
     """
     asked = Asked(model, treatment, loop.use, columns.names)
     read = [*files, *([judging.validate] if judging.validate else [])]

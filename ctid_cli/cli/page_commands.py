@@ -31,7 +31,7 @@ def figure(
     """Draw figures of experiments and of studies.
 
     Of an experiment: measure, a percentage or another measure over all that was swept; box, the errors of each
-    parameter. Both with 95 % intervals; without --kind the one that tells most. It goes to OUT/<experiment>/figures,
+    parameter. Both with 95 % intervals; without --kind the most informative one. It goes to OUT/<experiment>/figures,
     and its path is printed.
 
     Of a study, as SVG: most are computed from the study's specifications and need no results: all of useful-redundancy,
@@ -108,11 +108,10 @@ def report(
 ) -> None:
     """Write a page about a fit, a track, an experiment or a study.
 
-    To read, print or send: one HTML file that opens anywhere and loads nothing. Of a fit: data, model, what it
-    does, its residuals, and what to know before using it. Of a track: the signal, its spectrogram, its tones, and
-    the spectrum of what these leave. Of an experiment or study: the question, tables, figures, differences of the
-    estimators on the same data sets, what went wrong and the commands that show it, how all of it was computed. And
-    how to cite it.
+    One self-contained HTML file, to read, print or send. For a fit: data, model, responses, residuals, and warnings.
+    For a track: the signal, its spectrogram, its tones, and the spectrum of the residual. For an experiment or study:
+    the question, tables, figures, differences of the estimators on the same data sets, failures with the commands that
+    show them, and provenance. Also how to cite it.
     """
     path = Path(name)
     if path.suffix.lower() == ".json" or path.is_file():

@@ -31,7 +31,7 @@ def check(
     """State facts on a measured record, and the fit to begin with.
 
     Clock, gaps, input, saturation, outliers; signal-to-noise ratio, response time, delay; offset, drift, start from
-    rest and feedback, tested beside the response to the input in noise of any colour. Columns are found by their usual
+    rest and feedback, tested with the response to the input in noise of any colour. Columns are found by their usual
     names (t, u, y) unless named.
     """
     from ctid_cli.identification.choice import Given
@@ -137,9 +137,9 @@ def frf(
 ) -> None:
     """Estimate the frequency response of measured records.
 
-    No model is fitted. An input that repeats itself is averaged over its periods, which gives the variance by the
-    noise and, from lines without input or from several records, the level of nonlinear distortions. Any other
-    record is taken by local polynomials. Writes frf.csv and frf.svg.
+    No model is fitted. A periodic input is averaged over its periods, which gives the variance of the noise and,
+    from lines without input or from several records, the level of nonlinear distortions. Other records are analysed by
+    local polynomials. Writes frf.csv and frf.svg.
     """
     from ctid_cli.inference.frequency_response import estimate_frequency_response
     from ctid_cli.reporting.column_file import frame_bytes

@@ -70,8 +70,8 @@ def table(
     frequency [rad/s]. An experiment without a success rule shows bias and rmse, or what `measures` of its specification
     names.
 
-    Without a name: all tables of the useful-redundancy study. Cells that were not run say so; where the folder results
-    holds nothing of a table, as in a fresh clone, the committed results are printed.
+    Without a name: all tables of the useful-redundancy study. Cells that were not run say so; if the folder results
+    contains nothing of a table, as in a fresh clone, the committed results are printed.
     """
     from ctid_cli.reporting.paired_result import compare_estimators
     from ctid_cli.reporting.study_table import build_tables, experiments
@@ -179,8 +179,8 @@ def merge(
 ) -> None:
     """Merge the shards of experiments into one folder of results.
 
-    `ctid run --shard K/N` computes one of N shards. Merged in whatever order, they give the runs.h5 of a single run,
-    byte for byte. The folders of the shards stay as they are.
+    `ctid run --shard K/N` computes one of N shards. Merged in any order, they give the runs.h5 of a single run,
+    byte for byte. The folders of the shards are not changed.
     """
     from ctid_cli.reporting.status_result import MergeResult
     from ctid_cli.storage.merge import find_sources, merge_all

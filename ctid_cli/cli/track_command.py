@@ -83,9 +83,9 @@ def track(
 ) -> None:
     """Follow the frequencies of a recorded sum of sinusoids.
 
-    Prints the frequency of each tone, how well it is known, how far it moves, and for how much of the time it can be
-    trusted; writes everything over time to track.csv (or track.h5), track.svg and track.json, which ctid report makes
-    a page of. All the rest is chosen from the record, and printed.
+    Prints the frequency of each tone, its standard error, its variation, and the share of time in which it is valid;
+    writes all values over time to track.csv (or track.h5), track.svg and track.json, from which ctid report makes a
+    page. Other settings are chosen from the record, and printed.
     """
     reading = part.reading()
     written = [out / f"track.{'h5' if hdf5 else 'csv'}", out / "track.svg", out / "track.json"]
