@@ -149,7 +149,6 @@ def compare(
     """Compare cells of tables with committed ones and with the article.
 
     Cells are the same if experiment, method, initial delay and swept fields are. Each pair of counts is tested with
-    Cells are the same if experiment, method, initial delay and swept fields are. Each pair of counts is tested with
     Fisher's exact test, conditional on the sum of successes, which holds its level for any number of data sets. Holm's
     correction limits the probability of any false difference among all decisive cells to 1 %, however they depend on
     each other. With the same seed both sides share their data, and agree even better than assumed. The comparisons for

@@ -81,7 +81,7 @@ class StudyFigure:
 
     @property
     def caption(self) -> str:
-        """First line of the docstring of its function."""
+        """Caption, the first line of its function's docstring."""
         return (self._draw.__doc__ or "").partition("\n")[0].rstrip(".")
 
     @property
